@@ -1,0 +1,42 @@
+"""The Mitsuba variant: which one is used, and what has to be in place before it starts."""
+
+import importlib
+import sys
+
+from data_gen.llvm import use_llvm
+from ngpt.errors import NgptError
+
+DEFAULT_VARIANT = "llvm_ad_rgb"
+
+
+def use_variant(name: str = DEFAULT_VARIANT) -> None:
+    """Makes ``name`` the current Mitsuba variant and registers our integrators with it.
+
+    Any JIT variant will do (``llvm_*`` runs on the CPU, ``cuda_*`` on an NVIDIA GPU). Raises NgptError when Mitsuba is
+    not installed, the variant does not exist or is not a JIT variant, or its machinery (LLVM, CUDA driver) is absent.
+    """
+    try:
+        import mitsuba as mi
+    except ModuleNotFoundError as error:
+        raise NgptError(
+            "rendering needs Mitsuba 3, which is not installed; `pip install 'ngpt-recon[render]'`"
+        ) from error
+    jit_variants = [v for v in mi.variants() if not v.startswith("scalar")]
+    if name not in jit_variants:
+        raise NgptError(
+            f"variant '{name}' is not one this Mitsuba can vectorise; choose one of: {', '.join(jit_variants)}"
+        )
+    if name.startswith("llvm"):
+        use_llvm()
+    try:
+        mi.set_variant(name)
+        # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
+        for module in ("data_gen.integrators.gpt_basic",):
+            if module in sys.modules:
+                importlib.reload(sys.modules[module])
+            else:
+                importlib.import_module(module)
+    except (ImportError, RuntimeError) as error:
+        raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
+    # Without this, every scene loaded prints its timings.
+    mi.set_log_level(mi.LogLevel.Error)

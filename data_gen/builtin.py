@@ -1,0 +1,158 @@
+"""The scenes that come with ngpt: small, made in code, one for each kind of transport the demo shows.
+
+Each function returns a Mitsuba scene dictionary, without its film size: units are metres, +y is up.
+"""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+
+def _transform():
+    return mi.ScalarTransform4f()
+
+
+def _rgb(*value: float) -> dict:
+    return {"type": "rgb", "value": list(value)}
+
+
+def _diffuse(*value: float) -> dict:
+    return {"type": "diffuse", "reflectance": _rgb(*value)}
+
+
+def _camera(origin, target, fov: float, **extra) -> dict:
+    return {
+        "type": "perspective",
+        "fov": fov,
+        "fov_axis": "larger",
+        "to_world": _transform().look_at(origin=origin, target=target, up=[0, 1, 0]),
+        "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"},
+    } | extra
+
+
+def _wall(center, normal, size: tuple[float, float], bsdf: dict) -> dict:
+    """A rectangle of ``size`` metres whose front faces along ``normal``."""
+    up = [0, 0, 1] if abs(normal[1]) > 0.5 else [0, 1, 0]
+    target = [c + n for c, n in zip(center, normal, strict=True)]
+    to_world = _transform().look_at(origin=center, target=target, up=up).scale([size[0] / 2, size[1] / 2, 1])
+    return {"type": "rectangle", "to_world": to_world, "bsdf": bsdf}
+
+
+def _box(center, size, angle: float, bsdf: dict) -> dict:
+    to_world = _transform().translate(center).rotate([0, 1, 0], angle).scale([s / 2 for s in size])
+    return {"type": "cube", "to_world": to_world, "bsdf": bsdf}
+
+
+def _sphere(center, radius: float, bsdf: dict) -> dict:
+    return {"type": "sphere", "center": center, "radius": radius, "bsdf": bsdf}
+
+
+def _light(center, normal, size: tuple[float, float], radiance: tuple[float, float, float]) -> dict:
+    light = _wall(center, normal, size, _diffuse(0, 0, 0))
+    return light | {"emitter": {"type": "area", "radiance": _rgb(*radiance)}}
+
+
+def _room(front: float, floor: dict) -> dict:
+    """Walls of a room 3 m wide and 2.4 m high, from z = -1.5 m to ``front``; the side toward +z is left open."""
+    width, height, depth = 3, 2.4, front + 1.5
+    middle = (front - 1.5) / 2
+    white = _diffuse(0.75, 0.73, 0.7)
+    return {
+        "floor": _wall([0, 0, middle], [0, 1, 0], (width, depth), floor),
+        "ceiling": _wall([0, height, middle], [0, -1, 0], (width, depth), white),
+        "back": _wall([0, height / 2, -1.5], [0, 0, 1], (width, height), white),
+        "left": _wall([-width / 2, height / 2, middle], [1, 0, 0], (depth, height), _diffuse(0.62, 0.2, 0.13)),
+        "right": _wall([width / 2, height / 2, middle], [-1, 0, 0], (depth, height), _diffuse(0.14, 0.34, 0.42)),
+    }
+
+
+def _path(max_depth: int) -> dict:
+    return {"type": "path", "max_depth": max_depth, "rr_depth": 5}
+
+
+def diffuse() -> dict:
+    """A room of matte surfaces under one lamp: soft shadows and colour bleeding."""
+    tiles = {"type": "checkerboard", "color0": _rgb(0.3, 0.28, 0.25), "color1": _rgb(0.7, 0.68, 0.62)}
+    tiles["to_uv"] = _transform().scale([4, 4, 1])
+    return {
+        "type": "scene",
+        "integrator": _path(8),
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.15, 0], 50),
+        **_room(1.5, {"type": "diffuse", "reflectance": tiles}),
+        "lamp": _light([0, 2.2, -0.2], [0, -1, 0], (0.8, 0.6), (14, 12, 9)),
+        "tall": _box([-0.55, 0.65, -0.5], [0.7, 1.3, 0.6], 20, _diffuse(0.7, 0.68, 0.64)),
+        "low": _box([0.6, 0.3, 0.25], [0.6, 0.6, 0.6], -18, _diffuse(0.65, 0.55, 0.25)),
+        "ball": _sphere([0.6, 0.85, 0.25], 0.25, _diffuse(0.3, 0.42, 0.6)),
+    }
+
+
+def glossy() -> dict:
+    """A room with brushed metal, lacquer, a mirror and a glass ball: reflections and a caustic."""
+    return {
+        "type": "scene",
+        "integrator": _path(12),
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.05, 0], 50),
+        **_room(4.5, {"type": "roughplastic", "diffuse_reflectance": _rgb(0.35, 0.3, 0.24), "alpha": 0.15}),
+        "front": _wall([0, 1.2, 4.5], [0, 0, -1], (3, 2.4), _diffuse(0.6, 0.58, 0.5)),
+        "lamp": _light([0, 2.25, 0.2], [0, -1, 0], (1.2, 1.0), (7, 6.6, 6)),
+        "metal": _box(
+            [-0.6, 0.6, -0.5], [0.7, 1.2, 0.6], 25, {"type": "roughconductor", "material": "Al", "alpha": 0.12}
+        ),
+        "glass": _sphere([0.35, 0.42, 0.55], 0.42, {"type": "dielectric", "int_ior": 1.5}),
+        "gold": _sphere([0.85, 0.35, -0.5], 0.35, {"type": "roughconductor", "material": "Au", "alpha": 0.25}),
+        "lacquer": _sphere(
+            [-0.45, 0.22, 0.75], 0.22, {"type": "plastic", "diffuse_reflectance": _rgb(0.55, 0.06, 0.05)}
+        ),
+        "mirror": _wall([0.35, 1.35, -1.48], [0, 0, 1], (1.1, 0.9), {"type": "conductor", "material": "Ag"}),
+    }
+
+
+def environment() -> dict:
+    """Objects on a table in the open, lit by a sky with a low sun: hard and soft light, and a background."""
+    return {
+        "type": "scene",
+        "integrator": _path(8),
+        "sensor": _camera([0.3, 1.5, 4.2], [0, 0.55, 0], 38),
+        "sky": {"type": "envmap", "bitmap": mi.Bitmap(_sky(64, 128)), "scale": 1.0},
+        "ground": _wall([0, 0, 0], [0, 1, 0], (120, 120), _diffuse(0.42, 0.38, 0.33)),
+        "ball": _sphere([-0.75, 0.6, 0], 0.6, {"type": "plastic", "diffuse_reflectance": _rgb(0.1, 0.27, 0.42)}),
+        "block": _box([0.75, 0.45, -0.35], [0.8, 0.9, 0.8], 33, _diffuse(0.6, 0.5, 0.4)),
+        "copper": _sphere([0.3, 0.28, 0.8], 0.28, {"type": "roughconductor", "material": "Cu", "alpha": 0.2}),
+    }
+
+
+def lens() -> dict:
+    """A row of balls seen through a wide lens: sharp in the middle, blurred before and behind."""
+    colors = [(0.6, 0.2, 0.15), (0.6, 0.45, 0.15), (0.25, 0.5, 0.25), (0.15, 0.35, 0.55), (0.45, 0.25, 0.5)]
+    balls = {
+        f"ball{i}": _sphere([-1.0 + 0.5 * i, 0.3, 1.2 - 0.8 * i], 0.3, _diffuse(*color))
+        for i, color in enumerate(colors)
+    }
+    lens = {"type": "thinlens", "aperture_radius": 0.07, "focus_distance": 4.0}
+    return {
+        "type": "scene",
+        "integrator": _path(6),
+        "sensor": _camera([0, 1.0, 3.6], [0, 0.35, -0.4], 40) | lens,
+        "floor": _wall([0, 0, 0], [0, 1, 0], (8, 8), _diffuse(0.5, 0.48, 0.45)),
+        "back": _wall([0, 2, -3.2], [0, 0, 1], (8, 4), _diffuse(0.45, 0.5, 0.55)),
+        "lamp": _light([1.2, 3.5, 2.5], [-0.3, -1, -0.5], (1.5, 1.5), (11, 10, 9)),
+        "dots": _sphere([1.3, 1.4, -2.6], 0.06, _diffuse(0, 0, 0))
+        | {"emitter": {"type": "area", "radiance": _rgb(30, 20, 8)}},
+        **balls,
+    }
+
+
+def _sky(height: int, width: int) -> np.ndarray:
+    """A latitude-longitude sky, (height, width, 3) float32: blue gradient, dim ground, and a sun of a few texels."""
+    elevation = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
+    up = np.clip(np.sin(elevation), 0, 1)[:, None]
+    image = np.empty((height, width, 3), np.float32)
+    image[:] = ((1 - up) * [0.9, 0.85, 0.8] + up * [0.2, 0.38, 0.75])[:, None, :]
+    image[elevation < 0] = [0.12, 0.1, 0.08]
+    row, column = int(height * 0.3), int(width * 0.62)
+    image[row : row + 3, column : column + 3] = [160, 135, 95]
+    return image
+
+
+SCENES = {"diffuse": diffuse, "glossy": glossy, "environment": environment, "lens": lens}

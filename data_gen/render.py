@@ -1,0 +1,127 @@
+"""From a scene, a Mitsuba file or a built-in one, to a gradient stack."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import mitsuba as mi
+
+import ngpt
+from data_gen.builtin import SCENES
+from data_gen.camera import CameraSamples, render_passes
+from data_gen.features import features
+from data_gen.film import GradientFilm
+from data_gen.spectrum import to_rgb
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+# Name -> what it renders, as the command line explains it.
+SAMPLERS = {
+    "gpt-basic": "gradients by random sequence replay (five paths per sample; the teaching sampler)",
+    "primal": "the scene's own integrator without gradients (references, primal denoisers)",
+}
+
+
+def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
+    """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
+
+    ``size`` is (width, height) in pixels and replaces that of the scene's film, crop window included; ``parameters``
+    sets the file's ``<default>`` values. Raises NgptError with the file and Mitsuba's own complaint when it cannot.
+    """
+    parameters = parameters or {}
+    try:
+        if Path(name).is_file():
+            scene = mi.load_file(name, **parameters)
+        elif name in SCENES:
+            if parameters:
+                raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
+            scene = mi.load_dict(SCENES[name]())
+        else:
+            raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
+    except (RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, NgptError):
+            raise
+        raise NgptError(f"{name}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
+    if not isinstance(scene, mi.Scene):
+        raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")
+    if not scene.sensors():
+        raise NgptError(f"{name}: the scene has no sensor (camera)")
+    if size is not None:
+        set_film_size(scene, size)
+    return scene
+
+
+def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
+    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels, without a crop window."""
+    sensor = scene.sensors()[0]
+    params = mi.traverse(sensor)
+    params["film.size"] = list(size)
+    params.update()
+
+
+def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
+    """The scene's own integrator, or Mitsuba's ``path`` if it has none; it decides what transport is rendered."""
+    integrator = scene.integrator() or mi.load_dict({"type": "path"})
+    if not isinstance(integrator, mi.SamplingIntegrator):
+        raise NgptError(
+            f"integrator '{integrator.class_name()}' does not trace paths from the camera, so it has no gradients; "
+            "give the scene a 'path' or 'volpath' integrator"
+        )
+    return integrator
+
+
+def render_stack(
+    scene: mi.Scene,
+    spp: int,
+    seed: int = 0,
+    sampler: str = "gpt-basic",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> GradientStack:
+    """Renders a stack from the scene's first sensor.
+
+    ``spp`` is the number of (base) paths per pixel, ``sampler`` one of ``SAMPLERS``, and ``progress`` is called with
+    (samples done, spp) after each pass. The scene's reconstruction filter is not used: the pixels of a stack, and so
+    their differences, are box-filtered.
+    """
+    if spp < 1:
+        raise NgptError(f"{spp} samples per pixel: at least 1 is needed")
+    if not 0 <= seed < 2**64:
+        raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
+    sensor = scene.sensors()[0]
+    passes = sampler_passes(sampler, scene, sensor, seed, spp)
+    start = time.perf_counter()
+    progress(0, spp)
+    for done, film in passes:
+        progress(done, spp)
+    layers = film.develop()
+    attributes = {
+        "ngpt:spp": spp,
+        "ngpt:seed": str(seed),
+        "ngpt:sampler": sampler,
+        "ngpt:seconds": time.perf_counter() - start,
+        "ngpt:normalSpace": "camera",
+        "ngpt:discarded": film.discarded,
+        "software": f"ngpt {ngpt.__version__}, Mitsuba {mi.__version__} {mi.variant()}",
+    }
+    return GradientStack(layers, attributes=attributes)
+
+
+def sampler_passes(name: str, scene, sensor, seed: int, spp: int) -> Iterator[tuple[int, GradientFilm]]:
+    """The passes of the sampler called ``name``; see ``SAMPLERS``."""
+    integrator = reference_integrator(scene)
+    if name == "gpt-basic":
+        gpt = mi.load_dict({"type": "gpt_basic", "integrator": integrator})
+        return gpt.passes(scene, sensor, seed, spp)
+    if name == "primal":
+        return render_passes(lambda camera, film: sample_primal(scene, integrator, camera, film), sensor, seed, spp)
+    raise NgptError(f"unknown sampler '{name}'; choose one of: {', '.join(SAMPLERS)}")
+
+
+def sample_primal(scene, integrator, camera: CameraSamples, film: GradientFilm) -> None:
+    """One sample of radiance and features for each camera sample, by Mitsuba's integrator alone."""
+    ray, importance, _ = camera.rays()
+    L, _, _ = integrator.sample(scene, camera.random.clone(), ray, camera.sensor.get_medium())
+    film.put("primal", to_rgb(L * importance, ray.wavelengths))
+    film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))

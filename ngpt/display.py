@@ -1,0 +1,121 @@
+"""From scene-linear numbers to 8-bit colours for looking at.
+
+Nothing here is for measuring: display clamps and rounds. Every function takes scene-linear floats and returns
+(H, W, 3) uint8 in sRGB. A NaN is magenta wherever it turns up, so that it cannot be mistaken for a colour.
+"""
+
+import numpy as np
+
+from ngpt.errors import NgptError
+
+MAGENTA = (255, 0, 255)
+MIDDLE_GREY = 0.18  # what a photographer's light meter makes of the average scene
+LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709
+
+ERROR_EPSILON = 1e-2  # keeps the relative error of black pixels finite; of an image at automatic exposure
+ERROR_RANGE = (1e-4, 1.0)  # relative squared error at the two ends of the heat table: 1 % and 100 %
+
+# "inferno" of Smith and van der Walt at nine even steps: lightness grows evenly, and it survives colour blindness.
+_INFERNO = ("000004", "210c4a", "57106e", "8a226a", "bc3754", "e45a31", "f98e09", "f9cb35", "fcffa4")
+_DIVERGING = ("9ecbff", "2f7fd6", "777777", "d9772b", "ffd09a")  # negative blue, zero grey, positive orange
+
+
+def to_srgb8(image: np.ndarray, exposure_stops: float = 0.0) -> np.ndarray:
+    """(H, W, 3) scene-linear -> uint8 sRGB (IEC 61966-2-1), after multiplication by 2**exposure_stops.
+
+    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta.
+    """
+    image = _rgb(image)
+    # Clamped before and after the gain: before, so that Inf and the largest floats cannot overflow into a NaN.
+    linear = np.clip(np.nan_to_num(image, nan=0.0, posinf=1e30, neginf=0.0), 0.0, 1e30)
+    linear = np.clip(linear * 2.0**exposure_stops, 0.0, 1.0)
+    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+    out = np.floor(255.0 * encoded + 0.5).astype(np.uint8)
+    out[np.isposinf(image).any(axis=2)] = 255
+    out[np.isnan(image).any(axis=2)] = MAGENTA
+    return out
+
+
+def auto_exposure(reference: np.ndarray) -> float:
+    """The exposure, in stops, that brings the log-average luminance of (H, W, 3) to middle grey, 0.18.
+
+    Only finite pixels count. Pixels 13 stops or more under the bright end are background, not subject, and are left
+    out; fireflies count no more than the 99th percentile of the lit pixels. An all-black image gives 0.
+    """
+    with np.errstate(invalid="ignore"):  # Inf - Inf, left out below
+        luminance = (_rgb(reference) @ LUMINANCE).ravel()
+    lit = luminance[np.isfinite(luminance) & (luminance > 0.0)]
+    if lit.size == 0:
+        return 0.0
+    bright = np.percentile(lit, 99.0)
+    subject = lit[lit > bright * 2.0**-13]
+    key = np.exp(np.mean(np.log(np.minimum(subject, bright))))
+    return float(np.log2(MIDDLE_GREY / key))
+
+
+def relative_squared_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """(H, W): the mean over RGB of (image - reference)^2 / (reference^2 + epsilon), no unit, 0 is equal.
+
+    Both are brought to the automatic exposure of the reference first, so that ERROR_EPSILON means as much in a dim
+    scene as in a bright one: relMSE, which takes them as they are, calls every image of a dim scene good.
+    """
+    image, reference = _rgb(image), _rgb(reference)
+    if image.shape != reference.shape:
+        raise NgptError(f"error map: the image is {image.shape} but the reference is {reference.shape}")
+    epsilon = ERROR_EPSILON * 4.0 ** -auto_exposure(reference)
+    with np.errstate(invalid="ignore", over="ignore"):
+        return np.mean((image - reference) ** 2 / (reference**2 + epsilon), axis=2)
+
+
+def error_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The relative squared error of each pixel in the colours of :func:`heat_table`.
+
+    The scale is logarithmic over ERROR_RANGE: black is an error of at most 1 %, the middle 10 %, pale yellow 100 % or
+    more (an error here is the root of the relative squared error).
+    """
+    error = relative_squared_error(image, reference)
+    low, high = np.log10(ERROR_RANGE)
+    with np.errstate(divide="ignore"):
+        place = (np.log10(error) - low) / (high - low)
+    return _coloured(place, heat_table())
+
+
+def signed_map(gradient: np.ndarray) -> np.ndarray:
+    """A gradient layer, (H, W, 3) of either sign: zero is grey, negative is blue, positive is orange.
+
+    What shows is the mean over RGB, linear up to the 99th percentile of its own magnitude.
+    """
+    value = _rgb(gradient).mean(axis=2)
+    magnitude = np.abs(value[np.isfinite(value)])
+    scale = np.percentile(magnitude, 99.0) if magnitude.size else 0.0
+    if scale == 0.0:  # a layer that is zero nearly everywhere still has its peak
+        scale = magnitude.max(initial=0.0) or 1.0
+    return _coloured(0.5 + 0.5 * value / scale, _table(_DIVERGING, 255))  # odd: zero has an entry of its own
+
+
+def heat_table() -> np.ndarray:
+    """(256, 3) uint8 sRGB from black over red to pale yellow."""
+    return _table(_INFERNO, 256)
+
+
+def _table(anchors: tuple[str, ...], size: int) -> np.ndarray:
+    """(size, 3) uint8: the anchors at even steps, straight lines between them."""
+    colours = np.array([list(bytes.fromhex(anchor)) for anchor in anchors], dtype=np.float64)
+    place = np.linspace(0.0, len(anchors) - 1, size)
+    table = [np.interp(place, np.arange(len(anchors)), channel) for channel in colours.T]
+    return np.rint(np.stack(table, axis=1)).astype(np.uint8)
+
+
+def _coloured(place: np.ndarray, table: np.ndarray) -> np.ndarray:
+    """(H, W) positions in [0, 1], clamped, looked up in a (N, 3) table; NaN is magenta."""
+    index = np.rint((len(table) - 1) * np.clip(np.nan_to_num(place, nan=0.0), 0.0, 1.0))
+    out = table[index.astype(np.uint8)]
+    out[np.isnan(place)] = MAGENTA
+    return out
+
+
+def _rgb(image: np.ndarray) -> np.ndarray:
+    image = np.asarray(image)
+    if image.ndim != 3 or image.shape[2] != 3 or image.size == 0:
+        raise NgptError(f"display: needs a non-empty (H, W, 3) image, got {image.shape}")
+    return image.astype(np.float64)

@@ -1,0 +1,78 @@
+"""Non-finite pixels: repaired from their neighbours, and their gradients trusted no more."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import distance_transform_edt, uniform_filter
+
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """What reconstruction works on.
+
+    ``image``    (H, W, 3) primal without direct emission, finite
+    ``direct``   (H, W, 3) direct emission, finite, to be added back
+    ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
+    ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
+    ``pixels``   number of pixels whose primal was replaced
+    ``gradients``  number of differences left out
+    """
+
+    image: np.ndarray
+    direct: np.ndarray
+    dx: np.ndarray | None
+    dy: np.ndarray | None
+    trusted: tuple[np.ndarray, np.ndarray] | None
+    pixels: int
+    gradients: int
+
+
+def repair(stack: GradientStack) -> Repaired:
+    """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.
+
+    A difference is not trusted if it is not finite itself or one of its two pixels was not. Raises NgptError when the
+    primal has no finite pixel at all.
+    """
+    primal = stack["primal"]
+    direct = stack["direct"] if "direct" in stack else np.zeros_like(primal)
+    good = np.isfinite(primal).all(axis=-1) & np.isfinite(direct).all(axis=-1)
+    if not good.any():
+        raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
+    image = primal - direct if good.all() else _from_neighbours(primal, direct, good)
+    direct = np.where(good[..., None], direct, 0)
+    if "dx" not in stack or "dy" not in stack:
+        return Repaired(image, direct, None, None, None, int(np.sum(~good)), 0)
+    gradients, trusted = [], []
+    for name, axis in (("dx", 1), ("dy", 0)):
+        both = good.copy()
+        here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
+        both[here] &= good[there]
+        both &= np.isfinite(stack[name]).all(axis=-1)
+        border = np.s_[:, -1] if axis == 1 else np.s_[-1]
+        both[border] = True  # no difference there, so nothing to mistrust
+        gradients.append(np.where(both[..., None], stack[name], 0))
+        gradients[-1][border] = 0
+        trusted.append(both)
+    lost = int(sum(np.sum(~t) for t in trusted))
+    return Repaired(image, direct, *gradients, tuple(trusted) if lost else None, int(np.sum(~good)), lost)
+
+
+def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """primal - direct, with pixels that are not good replaced.
+
+    By the mean of the good ones among their eight neighbours, or where there is none, in the inside of a larger hole,
+    by the nearest good pixel.
+    """
+    image = np.subtract(primal, direct, where=good[..., None], out=np.zeros_like(primal))
+    weight = uniform_filter(good.astype(np.float64), 3, mode="constant")
+    mean = uniform_filter(image.astype(np.float64), (3, 3, 1), mode="constant")
+    near = ~good & (weight > 1e-6)
+    image[near] = mean[near] / weight[near, None]
+    far = ~good & ~near
+    if far.any():
+        rows, columns = distance_transform_edt(~good, return_distances=False, return_indices=True)
+        image[far] = image[rows[far], columns[far]]
+    return image

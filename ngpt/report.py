@@ -1,0 +1,284 @@
+"""One HTML file that shows every method on every scene: for judging images, sending to others, keeping.
+
+The page needs no network and no other file. Pictures travel as half floats, so the reader can change the exposure and
+see the error of what was measured, not of a screenshot. ``report.html`` holds the markup, the style and the script;
+this file fills it. Without JavaScript the tables and the thumbnails remain.
+"""
+
+import base64
+import hashlib
+import json
+import math
+import os
+import re
+import zlib
+from dataclasses import dataclass, field
+from html import escape
+from importlib.resources import files as package_files
+from pathlib import Path
+
+import numpy as np
+
+from ngpt import display
+from ngpt.errors import NgptError
+from ngpt.files import atomic_output
+from ngpt.png import encode_png
+
+REFERENCE = "reference"  # the name of Scene.reference among the pictures
+BASELINE = "primal"  # the method the table compares the others to
+HIGHER_IS_BETTER = {"psnr", "ssim", "ms-ssim"}  # compared in lower case; every other metric is an error
+THUMBNAIL_WIDTH = 320
+NOTHING = "&ndash;"
+HALF_MAX = 65504.0
+
+
+@dataclass
+class Entry:
+    """What one method made of one scene."""
+
+    name: str  #                  'primal', 'l2', ...: unique in its scene
+    image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
+    seconds: float | None = None  # reconstruction time
+    metrics: dict[str, float] = field(default_factory=dict)  # e.g. {'relMSE': 0.012}
+
+
+@dataclass
+class Scene:
+    """One tab of the report. All arrays have the same height and width."""
+
+    name: str
+    caption: str  # one line, e.g. 'diffuse room, 128x128, 16 spp, render 1.2 s'
+    reference: np.ndarray | None  # (H, W, 3) scene-linear
+    entries: list[Entry]
+    # Extra views, (H, W), (H, W, 1) or (H, W, 3): 'dx', 'dy', 'normal' and 'depth' get a map of their own, the others
+    # show as colour.
+    layers: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+def write_report(
+    path: str | os.PathLike,
+    title: str,
+    scenes: list[Scene],
+    *,
+    command: str,
+    footer: dict[str, str],
+    overwrite: bool = False,
+) -> Path:
+    """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
+
+    ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
+    Values beyond 18 stops over the average of the scene are stored as that limit, and the page says so ('≥').
+    """
+    path = Path(path)
+    if not scenes:
+        raise NgptError(f"{path}: a report needs at least one scene")
+    for scene in scenes:
+        _check(path, scene)
+    sections, pixels, facts = [], [], []
+    for number, scene in enumerate(scenes):
+        stops = display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
+        sections.append(_section(number, scene, stops))
+        for place, (_, image) in enumerate(_pictures(scene)):
+            pixels.append(f'<script type="text/plain" id="pixels-{number}-{place}">{_packed(image, stops)}</script>')
+        facts.append(_facts(scene, stops))
+    table = base64.b64encode(display.heat_table().tobytes()).decode()
+    page = {"scenes": facts, "heat": table, "epsilon": display.ERROR_EPSILON, "range": display.ERROR_RANGE}
+    notes = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in footer.items())
+    text = _filled(
+        TITLE=escape(title),
+        COMMAND=escape(command),
+        SCENES="\n".join(sections),
+        FOOTER=notes,
+        # '<' as an escape: a name that contains '</script>' must stay a name.
+        PAGE=json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        PIXELS="\n".join(pixels),
+    )
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+    return path
+
+
+def _filled(**parts: str) -> str:
+    """The template with its marks replaced, in one pass so that no part is searched for the marks of another."""
+    text = (package_files("ngpt") / "report.html").read_text(encoding="utf-8")
+    for tag in ("style", "script"):
+        # The policy names the one style and the one script that may run: nothing a name smuggles in does.
+        body = text.split(f"<{tag}>")[1].split(f"</{tag}>")[0]
+        parts[tag.upper() + "_HASH"] = "sha256-" + base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+    return re.sub(r"\{\{([A-Z_]+)\}\}", lambda mark: parts[mark.group(1)], text)
+
+
+def _check(path: Path, scene: Scene) -> None:
+    """Raises NgptError for what the page could only show wrongly: pictures of unequal size, two of one name."""
+    if not scene.entries:
+        raise NgptError(f"{path}: scene '{scene.name}' has no entry; give it at least one method")
+    pictures = _pictures(scene)
+    size = pictures[0][1].shape[:2]
+    for name, image in pictures:
+        if image.shape != (*size, 3) or image.size == 0:
+            raise NgptError(f"{path}: scene '{scene.name}', '{name}' is {image.shape}, expected {(*size, 3)}")
+    for name, layer in scene.layers.items():
+        if layer.shape not in (size, (*size, 1), (*size, 3)):
+            raise NgptError(f"{path}: scene '{scene.name}', layer '{name}' is {layer.shape}, expected {size} pixels")
+    names = [name for name, _ in pictures] + list(scene.layers)
+    for name in names:
+        if names.count(name) > 1:
+            raise NgptError(f"{path}: scene '{scene.name}' has two pictures named '{name}'; rename one")
+
+
+def _pictures(scene: Scene) -> list[tuple[str, np.ndarray]]:
+    """Everything with light in it, in the order of the page: the methods, then the reference."""
+    pictures = [(entry.name, np.asarray(entry.image)) for entry in scene.entries]
+    return pictures if scene.reference is None else [*pictures, (REFERENCE, np.asarray(scene.reference))]
+
+
+def _facts(scene: Scene, stops: float) -> dict:
+    """What the script has to know of a scene, besides the pixels."""
+    best = _best(scene, next(iter(scene.entries[0].metrics), ""))
+    names = [entry.name for entry in scene.entries]
+    second = names[best] if best is not None else (REFERENCE if scene.reference is not None else names[-1])
+    return {
+        "width": scene.entries[0].image.shape[1],
+        "height": scene.entries[0].image.shape[0],
+        "stops": stops,
+        "pictures": [name for name, _ in _pictures(scene)],
+        "layers": list(scene.layers),
+        "reference": scene.reference is not None,
+        "a": BASELINE if BASELINE in names else names[0],
+        "b": second if second != BASELINE else names[-1],
+    }
+
+
+# --- pixels ----------------------------------------------------------------------------------------------------------
+
+
+def _packed(image: np.ndarray, stops: float) -> str:
+    """(H, W, 3) -> base64 of deflated half floats, exposed by round(stops) stops so that half's range fits the scene.
+
+    Planes of R, G, B; each row as differences of neighbouring bit patterns, modulo 2^16; all high bytes, then all low
+    bytes. Neighbours have like exponents, so the high bytes nearly vanish: a smooth image takes a third of the room.
+    """
+    exposed = image.astype(np.float64) * 2.0 ** round(stops)
+    # Only what is infinite may read as infinite.
+    exposed = np.where(np.isfinite(exposed), np.clip(exposed, -HALF_MAX, HALF_MAX), exposed)
+    bits = exposed.astype(np.float16).view(np.uint16).transpose(2, 0, 1)
+    delta = np.diff(bits, axis=2, prepend=np.uint16(0))
+    planes = np.stack([delta >> 8, delta & 255]).astype(np.uint8)
+    return base64.b64encode(zlib.compress(planes.tobytes(), 6)).decode()
+
+
+def _layer_view(name: str, layer: np.ndarray) -> np.ndarray:
+    """An input layer as (H, W, 3) uint8."""
+    layer = np.atleast_3d(np.asarray(layer, dtype=np.float64))
+    layer = np.broadcast_to(layer, (*layer.shape[:2], 3))
+    if name in ("dx", "dy"):
+        return display.signed_map(layer)
+    if name == "normal":
+        colour = np.rint(127.5 * (np.clip(np.nan_to_num(layer), -1.0, 1.0) + 1.0)).astype(np.uint8)
+        return np.where(np.isnan(layer).any(axis=2, keepdims=True), np.array(display.MAGENTA, np.uint8), colour)
+    if name == "depth":
+        finite = layer[np.isfinite(layer)]
+        layer = layer / ((np.percentile(finite, 99.0) if finite.size else 0.0) or 1.0)
+    elif name.endswith("_var"):
+        return display.to_srgb8(layer, display.auto_exposure(layer))
+    return display.to_srgb8(layer)
+
+
+def _thumbnail(image: np.ndarray) -> np.ndarray:
+    """Averages uint8 blocks until the picture is at most THUMBNAIL_WIDTH wide."""
+    factor = math.ceil(image.shape[1] / THUMBNAIL_WIDTH)
+    height, width = (math.ceil(side / factor) for side in image.shape[:2])
+    rest = (height * factor - image.shape[0], width * factor - image.shape[1])
+    padded = np.pad(image, ((0, rest[0]), (0, rest[1]), (0, 0)), mode="edge").astype(np.float64)
+    return np.rint(padded.reshape(height, factor, width, factor, 3).mean(axis=(1, 3))).astype(np.uint8)
+
+
+# --- markup ----------------------------------------------------------------------------------------------------------
+
+
+def _section(number: int, scene: Scene, stops: float) -> str:
+    first = next(iter(scene.entries[0].metrics), "")
+    notes = {entry.name: _note(first, entry.metrics.get(first)) for entry in scene.entries}
+    pictures = [
+        _figure(name, _thumbnail(display.to_srgb8(image, stops)), notes.get(name, ""))
+        for name, image in _pictures(scene)
+    ]
+    # Layers are shown in full, not as thumbnails: the page has no other copy of them.
+    layers = [_figure(name, _layer_view(name, layer), "") for name, layer in scene.layers.items()]
+    parts = [
+        f'<section class="scene" id="scene-{number}">',
+        f"<h2>{escape(scene.name)}</h2>",
+        f'<p class="caption">{escape(scene.caption)}</p>',
+        '<div class="slot"></div>',
+        '<h3>Methods</h3><div class="thumbs">' + "".join(pictures) + "</div>",
+        "<h3>Measurements</h3>" + _table(scene),
+        '<h3>Input layers</h3><div class="thumbs">' + "".join(layers) + "</div>" if layers else "",
+        "</section>",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _figure(name: str, picture: np.ndarray, note: str) -> str:
+    height, width = picture.shape[:2]
+    data = base64.b64encode(encode_png(picture)).decode()
+    small = ' class="pixelated"' if width <= THUMBNAIL_WIDTH // 2 else ""
+    return (
+        f'<figure data-name="{escape(name)}"><div class="frame">'
+        f'<img{small} width="{width}" height="{height}" alt="{escape(name)}" src="data:image/png;base64,{data}"></div>'
+        f"<figcaption><b>{escape(name)}</b>{note}</figcaption></figure>"
+    )
+
+
+def _note(metric: str, value: float | None) -> str:
+    return "" if value is None else f"<small>{escape(metric)} {_number(value)}</small>"
+
+
+def _table(scene: Scene) -> str:
+    """Methods down, metrics and seconds across; the best value of a metric is bold, each is compared to BASELINE."""
+    metrics = list(dict.fromkeys(metric for entry in scene.entries for metric in entry.metrics))
+    best = {metric: _best(scene, metric) for metric in metrics}
+    baseline = next((entry.metrics for entry in scene.entries if entry.name == BASELINE), {})
+    heads = [
+        f'<th scope="col">{escape(metric)} <i>{"↑" if _rising(metric) else "↓"}</i><small></small></th>'
+        for metric in metrics
+    ]
+    rows = []
+    for row, entry in enumerate(scene.entries):
+        cells = []
+        for metric in metrics:
+            value = entry.metrics.get(metric, math.nan)
+            compared = "" if entry.name == BASELINE else _compared(metric, value, baseline.get(metric, math.nan))
+            mark = ' class="best"' if best[metric] == row else ""
+            cells.append(f"<td{mark}><span>{_number(value)}</span><small>{compared}</small></td>")
+        seconds = NOTHING if entry.seconds is None else f"{entry.seconds:.3g} s"
+        cells.append(f"<td><span>{seconds}</span></td>")
+        rows.append(f'<tr><th scope="row">{escape(entry.name)}</th>{"".join(cells)}</tr>')
+    head = f'<tr><th scope="col">method</th>{"".join(heads)}<th scope="col">time</th></tr>'
+    legend = f"↓ lower is better, ↑ higher is better; bold: best; &times; ratio to {BASELINE} (&plusmn; difference)"
+    return (
+        f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+        f'<p class="hint">{legend}</p>'
+    )
+
+
+def _rising(metric: str) -> bool:
+    return metric.lower() in HIGHER_IS_BETTER
+
+
+def _best(scene: Scene, metric: str) -> int | None:
+    """The index of the entry with the best finite value, or None."""
+    values = [(entry.metrics.get(metric, math.nan), row) for row, entry in enumerate(scene.entries)]
+    values = [(-value if _rising(metric) else value, row) for value, row in values if math.isfinite(value)]
+    return min(values)[1] if values else None
+
+
+def _compared(metric: str, value: float, baseline: float) -> str:
+    if not (math.isfinite(value) and math.isfinite(baseline)):
+        return ""
+    if _rising(metric):  # decibels and similarities have no meaningful ratio
+        return f"{value - baseline:+.2f}"
+    return f"&times;{value / baseline:.2g}" if baseline > 0.0 else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else NOTHING

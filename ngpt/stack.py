@@ -1,0 +1,135 @@
+"""The gradient stack: the data type between those who render gradients and those who reconstruct from them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ngpt.errors import NgptError
+from ngpt.layers import LAYERS
+
+if TYPE_CHECKING:
+    from ngpt.exr import StackSource
+
+
+@dataclass(eq=False)
+class GradientStack:
+    """The layers of one rendering, scene-linear, row 0 on top.
+
+    ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C): C is 3, and
+    1 for depth and alpha. Given are arrays of any real type and memory layout, (H, W) too where C is 1; they are
+    converted, without a copy where none is needed, and never modified. Every float value is legal, NaN and Inf
+    included. The last column of dx and the last row of dy are unused; they are kept as they are.
+
+    ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
+    ``source`` is the file the stack was read from, for what passes through it. ``path`` is for messages.
+
+    Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
+    images without pixels, and finite numbers that float32 cannot hold.
+    """
+
+    layers: dict[str, np.ndarray]
+    attributes: dict[str, Any] = field(default_factory=dict)
+    source: "StackSource | None" = None
+    path: str = "stack"
+
+    def __post_init__(self) -> None:
+        if not self.layers:
+            raise NgptError(f"{self.path}: a stack needs at least one layer; pass primal=...")
+        self.layers = {name: _as_layer(name, array, self.path) for name, array in self.layers.items()}
+        self.attributes = dict(self.attributes)
+        first = "primal" if "primal" in self.layers else next(iter(self.layers))
+        for name, array in self.layers.items():
+            _check_size(self.path, name, array.shape, first, self.layers[first].shape)
+
+    @classmethod
+    def from_arrays(
+        cls, *, attributes: Mapping[str, Any] | None = None, path: str = "stack", **layers: ArrayLike
+    ) -> "GradientStack":
+        """Makes a stack of arrays: ``GradientStack.from_arrays(primal=image, dx=dx, dy=dy)``."""
+        return cls({name: np.asarray(array) for name, array in layers.items()}, dict(attributes or {}), path=path)
+
+    @property
+    def height(self) -> int:
+        return next(iter(self.layers.values())).shape[0]
+
+    @property
+    def width(self) -> int:
+        return next(iter(self.layers.values())).shape[1]
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The layers held, in the order of the contract."""
+        return tuple(name for name in LAYERS if name in self.layers)
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.layers
+
+    def __getitem__(self, name: str) -> np.ndarray:
+        """Returns layer ``name``; raises NgptError if the stack does not hold it."""
+        if name not in self.layers:
+            self.require(name)
+        return self.layers[name]
+
+    def require(self, *names: str, why: str = "") -> None:
+        """Raises NgptError unless all of ``names`` are held; ``why`` says who needs them ("method 'l1'")."""
+        missing = [name for name in names if name not in self.layers]
+        for name in missing:
+            _check_name(name, self.path)
+        if missing:
+            needs = f"{why} needs" if why else "no"
+            what = f"layer{'s' if len(missing) > 1 else ''} {' and '.join(repr(name) for name in missing)}"
+            remedy = " ".join(f"--layer {name}=NAME" for name in missing)
+            raise NgptError(
+                f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; "
+                f"if the file has it under another name, pass {remedy}"
+            )
+
+    def replace(self, **layers: ArrayLike) -> "GradientStack":
+        """Returns a stack with these layers replaced or added, and the same attributes and source."""
+        new = {name: np.asarray(array) for name, array in layers.items()}
+        return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path)
+
+
+def _check_name(name: str, path: str) -> None:
+    if name not in LAYERS:
+        raise NgptError(f"{path}: no layer is called '{name}'; the layers are {', '.join(LAYERS)}")
+
+
+def _as_layer(name: str, array: ArrayLike, path: str) -> np.ndarray:
+    """Returns ``array`` as (H, W, C) float32, C-contiguous."""
+    _check_name(name, path)
+    given = np.asarray(array)
+    channels = len(LAYERS[name].channels)
+    if given.dtype.kind not in "fiu":
+        raise NgptError(f"{path}: layer '{name}' is of type {given.dtype}; convert it to float32")
+    if given.ndim == 2 and channels == 1:
+        given = given[..., np.newaxis]
+    if given.ndim != 3 or given.shape[2] != channels:
+        raise NgptError(f"{path}: layer '{name}' has shape {given.shape}; it must be (height, width, {channels})")
+    if given.size == 0:
+        raise NgptError(f"{path}: layer '{name}' is {given.shape[1]}x{given.shape[0]}; it has no pixels to work on")
+    with np.errstate(over="ignore"):
+        layer = np.ascontiguousarray(given, dtype=np.float32)
+    if given.dtype.itemsize > 4:
+        lost = np.isfinite(given) & ~np.isfinite(layer)
+        if lost.any():
+            raise NgptError(
+                f"{path}: layer '{name}' has {np.count_nonzero(lost)} values that float32 cannot hold "
+                f"(up to {np.abs(given[lost]).max():.3g}, the limit is 3.4e38); scale the scene's light down"
+            )
+    return layer
+
+
+def _check_size(path: str, name: str, shape: tuple[int, ...], first: str, expected: tuple[int, ...]) -> None:
+    (height, width), (rows, columns) = shape[:2], expected[:2]
+    if (height, width) == (rows, columns):
+        return
+    remedy = "all layers of a stack are of one size: render or crop them alike"
+    if name == "dx" and (height, width) == (rows, columns - 1):
+        remedy = "gradients are stored at image size with an unused last column: pad it with zeros"
+    elif name == "dy" and (height, width) == (rows - 1, columns):
+        remedy = "gradients are stored at image size with an unused last row: pad it with zeros"
+    raise NgptError(f"{path}: layer '{name}' is {width}x{height} but '{first}' is {columns}x{rows}; {remedy}")

@@ -1,0 +1,73 @@
+"""Statistical tests of renderings, for our own tests and for those of anyone who writes a sampler.
+
+A sampler is right when its mean is. That cannot be seen in one image against a fixed tolerance, but independent
+renders of both sides give their own standard errors, and the number of comparisons fixes the level of each.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import t as student_t
+
+
+@dataclass(frozen=True)
+class ZTest:
+    """Outcome of comparing the means of two sets of renders, block by block.
+
+    ``z``        (rows, columns, C) differences of block means in standard errors
+    ``p``        two-sided p-values of the same shape
+    ``level``    what each p-value is held against, after Šidák's correction for their number
+    """
+
+    z: np.ndarray
+    p: np.ndarray
+    level: float
+
+    @property
+    def passed(self) -> bool:
+        return bool(self.p.min() > self.level)
+
+    def __str__(self) -> str:
+        worst = np.unravel_index(np.argmin(self.p), self.p.shape)
+        return (
+            f"{self.z.size} block means: z has standard deviation {self.z.std():.3f} and is largest, "
+            f"{self.z[worst]:+.2f}, at block {tuple(int(i) for i in worst)}; p = {self.p[worst]:.2e}, "
+            f"level {self.level:.2e}; {np.sum(self.p <= self.level)} blocks fail"
+        )
+
+
+def z_test(renders: np.ndarray, references: np.ndarray, block: int = 8, level: float = 0.01) -> ZTest:
+    """Tests whether two sets of independent renders have the same mean.
+
+    ``renders``, ``references``  (batches, H, W, C), at least 8 batches each; batches must differ in their seed
+    ``block``                    edge of the pixel blocks whose means are compared: averaging makes them nearly normal,
+                                 which single pixels of path-traced images are not
+    ``level``                    probability that two equal means fail the test as a whole
+
+    Welch's t-test per block and channel, with Šidák's correction 1 - (1 - level)^(1/n). Standard errors are bounded
+    from below by float32 rounding, so blocks without any variance must agree to that.
+    """
+    means, errors = [], []
+    for batches in (renders, references):
+        if len(batches) < 8:
+            raise ValueError(f"{len(batches)} batches: a standard error needs at least 8")
+        blocks = _block_means(np.asarray(batches, np.float64), block)
+        means.append(blocks.mean(axis=0))
+        errors.append(blocks.var(axis=0, ddof=1) / len(blocks))
+    scale = np.abs(np.stack(means)).max()
+    total = errors[0] + errors[1] + (1e-6 * scale) ** 2
+    z = (means[0] - means[1]) / np.sqrt(total)
+    # Welch-Satterthwaite: the effective degrees of freedom of a sum of two unequal variances.
+    freedom = total**2 / (
+        errors[0] ** 2 / (len(renders) - 1) + errors[1] ** 2 / (len(references) - 1) + np.finfo(float).tiny
+    )
+    p = 2 * student_t.sf(np.abs(z), freedom)
+    return ZTest(z, p, level=1 - (1 - level) ** (1 / z.size))
+
+
+def _block_means(batches: np.ndarray, block: int) -> np.ndarray:
+    """(batches, H // block, W // block, C) means; pixels beyond the last whole block are left out."""
+    n, height, width, channels = batches.shape
+    rows, columns = height // block, width // block
+    cut = batches[:, : rows * block, : columns * block]
+    return cut.reshape(n, rows, block, columns, block, channels).mean(axis=(2, 4))

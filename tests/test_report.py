@@ -1,0 +1,376 @@
+"""The report page: its text, and what a real browser makes of it."""
+
+import base64
+import json
+import os
+import re
+import select
+import shlex
+import shutil
+import subprocess
+import time
+import zlib
+from html.parser import HTMLParser
+from urllib.parse import parse_qsl, quote, urlencode
+
+import numpy as np
+import pytest
+
+from ngpt import display
+from ngpt.errors import NgptError
+from ngpt.report import Entry, Scene, write_report
+
+FACTS = {"command": "ngpt demo --spp 16", "footer": {"ngpt": "0.1.0", "device": "CPU"}}
+HOSTILE = """<img src=x onerror="document.title='owned'"> & '</script>' {{PAGE}}"""
+
+# Constant colours, so that a screenshot can be checked by the number of pixels of each; dark ones, so that the page's
+# unit is not 1 and the error's epsilon counts.
+COLOURS = {"primal": (0.125, 0.0625, 0.03125), "l1": (0.03125, 0.0625, 0.125), "reference": (0.0625, 0.0625, 0.0625)}
+WIDTH, HEIGHT = 96, 32
+
+
+def constant(colour) -> np.ndarray:
+    return np.full((HEIGHT, WIDTH, 3), colour, dtype=np.float32)
+
+
+def flat_scene(name="flat") -> Scene:
+    entries = [
+        Entry("primal", constant(COLOURS["primal"]), None, {"relMSE": 0.5, "PSNR": 10.0}),
+        Entry("l1", constant(COLOURS["l1"]), 0.25, {"relMSE": 0.05, "PSNR": 14.0}),
+    ]
+    return Scene(name, "two colours", constant(COLOURS["reference"]), entries, {"dx": constant(-1.0)})
+
+
+def noise_scene(name="noise") -> Scene:
+    """Every kind of number a renderer has ever made."""
+    image = np.random.default_rng(0).gamma(1.0, 1.0, (20, 30, 3)).astype(np.float32)
+    image[0, :6] = [[np.nan] * 3, [np.inf] * 3, [-np.inf] * 3, [-2.5] * 3, [1e12] * 3, [1e-30] * 3]
+    layers = {
+        "dx": image,
+        "dy": np.zeros_like(image),
+        "albedo": np.clip(image, 0, 1),
+        "normal": image - 1,
+        "depth": image[:, :, :1],
+        "primal_var": image,
+    }
+    return Scene(name, "", None, [Entry("primal", image, 0.0, {"relMSE": np.nan, "FLIP": np.inf})], layers)
+
+
+def written(tmp_path, *scenes, title="A report", **facts):
+    return write_report(tmp_path / "report.html", title, list(scenes), **FACTS | facts)
+
+
+class Page(HTMLParser):
+    """Tags with their attributes, and the text outside scripts and styles."""
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.text, self.inside = [], "", ""
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        self.tags.append((tag, dict(attrs)))
+        self.inside = tag
+
+    def handle_endtag(self, tag):
+        self.inside = ""
+
+    def handle_data(self, data):
+        if self.inside not in ("script", "style"):
+            self.text += data
+
+
+# --- the text --------------------------------------------------------------------------------------------------------
+
+
+def test_the_page_holds_every_scene_method_and_fact(tmp_path):
+    path = written(tmp_path, flat_scene(), noise_scene())
+    text = path.read_text()
+    page = Page(text)
+    names = [attrs["data-name"] for tag, attrs in page.tags if tag == "figure"]
+    layers = ["dx", "dy", "albedo", "normal", "depth", "primal_var"]
+    assert names == ["primal", "l1", "reference", "dx", "primal", *layers]
+    for word in ("A report", "two colours", "ngpt demo --spp 16", "CPU", "relMSE 0.05", "0.25 s"):
+        assert word in page.text
+    assert "nan" not in page.text and "{{" not in text
+
+
+def test_the_table_marks_the_best_and_compares_to_primal(tmp_path):
+    text = written(tmp_path, flat_scene()).read_text()
+    assert re.findall(r'class="best"><span>([^<]*)', text) == ["0.05", "14"]
+    assert "<small>&times;0.1</small>" in text and "<small>+4.00</small>" in text
+
+
+def test_nothing_comes_from_outside(tmp_path):
+    text = written(tmp_path, flat_scene(), noise_scene()).read_text()
+    assert not re.search(r"https?:|//[a-z]+\.|@import|url\(|\bfetch\(|XMLHttp|<link|<iframe", text)
+    for tag, attrs in Page(text).tags:
+        assert not any(key.startswith("on") or key in ("style", "href") for key in attrs), tag
+        assert attrs.get("src", "data:image/png;base64,").startswith("data:image/png;base64,")
+    policy = next(attrs["content"] for _, attrs in Page(text).tags if attrs.get("http-equiv"))
+    assert policy.startswith("default-src 'none'; img-src data:;") and "unsafe" not in policy
+
+
+def test_names_are_only_names(tmp_path):
+    scene = flat_scene(HOSTILE)
+    scene.caption = scene.entries[1].name = HOSTILE
+    scene.entries[1].metrics = {HOSTILE: 1.0}
+    path = written(tmp_path, scene, title=HOSTILE, command=HOSTILE, footer={HOSTILE: HOSTILE})
+    page = Page(path.read_text())
+    assert page.text.count(HOSTILE) >= 8
+    assert all(attrs["src"].startswith("data:") for tag, attrs in page.tags if tag == "img")
+    figures = [attrs["data-name"] for tag, attrs in page.tags if tag == "figure"]
+    assert figures == ["primal", HOSTILE, "reference", "dx"]
+
+
+def test_pixels_are_half_floats_that_fit_the_scene(tmp_path):
+    """The inverse of the packing, written from the docstring, at an exposure far from 1."""
+    image = (2.0**40 * np.random.default_rng(1).gamma(1.0, 1.0, (7, 11, 3))).astype(np.float32)
+    image[3, 3] = [np.nan, -np.inf, 1e30]
+    text = written(tmp_path, Scene("s", "", None, [Entry("primal", image)])).read_text()
+    packed = re.search(r'id="pixels-0-0">([^<]*)', text).group(1)
+    high, low = np.frombuffer(zlib.decompress(base64.b64decode(packed)), np.uint8).reshape(2, 3, 7, 11)
+    bits = np.cumsum(high.astype(np.uint16) << 8 | low, axis=2, dtype=np.uint16)
+    unit = 2.0 ** -round(json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))["scenes"][0]["stops"])
+    found = bits.view(np.float16).astype(np.float64).transpose(1, 2, 0) * unit
+    assert np.isnan(found[3, 3, 0]) and found[3, 3, 1] == -np.inf and found[3, 3, 2] == 65504 * unit
+    found[3, 3] = image[3, 3] = 0
+    np.testing.assert_allclose(found, image, rtol=2**-11, atol=unit * 2**-25)
+
+
+def test_the_same_input_gives_the_same_bytes(tmp_path):
+    first = written(tmp_path, flat_scene(), noise_scene()).read_bytes()
+    again = write_report(tmp_path / "again.html", "A report", [flat_scene(), noise_scene()], **FACTS)
+    assert again.read_bytes() == first
+
+
+def test_big_pictures_have_small_thumbnails(tmp_path):
+    image = np.random.default_rng(0).gamma(1.0, 1.0, (75, 1001, 3)).astype(np.float32)
+    page = Page(written(tmp_path, Scene("wide", "", None, [Entry("primal", image)])).read_text())
+    (picture,) = (attrs for tag, attrs in page.tags if tag == "img")
+    assert (picture["width"], picture["height"]) == ("251", "19")
+
+
+def test_no_overwriting_and_no_half_files(tmp_path):
+    path = written(tmp_path, flat_scene())
+    before = path.read_bytes()
+    with pytest.raises(NgptError, match="exists already"):
+        written(tmp_path, noise_scene())
+    assert path.read_bytes() == before
+    written(tmp_path, noise_scene(), overwrite=True)
+    assert path.read_bytes() != before
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_what_cannot_be_shown_is_refused(tmp_path):
+    def refused(scenes, message):
+        with pytest.raises(NgptError, match=message):
+            written(tmp_path, *scenes)
+        assert not list(tmp_path.iterdir())
+
+    refused([], "at least one scene")
+    refused([Scene("s", "", None, [])], "no entry")
+    scene = flat_scene()
+    scene.entries[1].image = scene.entries[1].image[:-1]
+    refused([scene], r"'l1' is \(31, 96, 3\), expected \(32, 96, 3\)")
+    scene = flat_scene()
+    scene.entries[1].name = "reference"
+    refused([scene], "two pictures named 'reference'")
+    scene = flat_scene()
+    scene.layers["depth"] = np.zeros((4, 4))
+    refused([scene], "layer 'depth'")
+
+
+# --- the browser -----------------------------------------------------------------------------------------------------
+
+
+def browser_command(profile) -> list[str]:
+    """A headless browser that keeps to itself, or the test is skipped."""
+    names = ("chromium", "chromium-browser", "google-chrome")
+    browser = next(filter(None, map(shutil.which, names)), None)
+    if browser is None:
+        pytest.skip(f"none of {', '.join(names)} is installed")
+    quiet = "--disable-quic --no-first-run --disable-background-networking --disable-component-update --disable-sync"
+    options = ["--headless", "--no-sandbox", "--disable-gpu", *quiet.split(), "--hide-scrollbars"]
+    return [browser, *options, f"--user-data-dir={profile}", "--window-size=1200,900"]
+
+
+def address(path, **view) -> str:
+    return f"file://{quote(str(path))}#{urlencode(view)}"
+
+
+def browse(path, tmp_path, *, picture=None, **view) -> str:
+    """Opens the page at a view and returns the DOM; with ``picture``, writes a screenshot there instead."""
+    output = f"--screenshot={picture}" if picture else "--dump-dom"
+    command = [*browser_command(tmp_path / "profile"), "--virtual-time-budget=5000", output, address(path, **view)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert result.returncode == 0, result.stderr
+    return result.stdout
+
+
+def opened(path, tmp_path, **view) -> str:
+    """The DOM of a page that has shown the view and has met no error."""
+    dom = browse(path, tmp_path, **view)
+    assert not re.search(r'data-error="([^"]*)', dom), re.search(r'data-error="([^"]*)', dom).group(1)
+    assert '<html lang="en" data-ready="true"' in dom
+    return dom
+
+
+def cells(dom: str, row: str) -> list[str]:
+    """The texts of one row of the readout, which starts at the centre of the picture."""
+    inner = re.search(rf'<tr id="{row}">(.*?)</tr>', dom).group(1)
+    return re.findall(r"<td[^>]*>([^<]*)</td>", inner)
+
+
+def test_the_script_decodes_what_was_written(tmp_path):
+    dom = opened(written(tmp_path, flat_scene(), noise_scene()), tmp_path)
+    assert dom.count('role="tab"') == 2
+    # Both methods are off by 1/16, 0 and 1/32.
+    epsilon = display.ERROR_EPSILON * (0.0625 / 0.18) ** 2
+    error = 100 * np.sqrt((2**-8 + 2**-10) / 3 / (2**-8 + epsilon))
+    assert cells(dom, "value-a") == ["0.125", "0.0625", "0.03125", f"{error:.3g} %"]
+    assert cells(dom, "value-b") == ["0.03125", "0.0625", "0.125", f"{error:.3g} %"]
+    assert cells(dom, "value-reference") == ["0.0625", "0.0625", "0.0625", ""]
+
+
+def test_hostile_names_and_numbers_do_not_break_the_script(tmp_path):
+    noise = noise_scene(HOSTILE)
+    noise.entries.append(Entry(HOSTILE, np.full((20, 30, 3), 1e12)))
+    dom = opened(written(tmp_path, flat_scene(), noise), tmp_path, scene=1, a=HOSTILE, b="dx", exposure=-4, zoom=4)
+    assert "owned" not in re.search(r"<title>(.*?)</title>", dom).group(1)
+    assert all(cell.startswith("≥ ") for cell in cells(dom, "value-a")[:3])
+    assert cells(dom, "value-b") == ["display colours"]
+
+
+def test_a_screenshot_shows_a_left_and_b_right_at_the_exposure_asked(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    path = written(tmp_path, flat_scene())
+    browse(path, tmp_path, picture=tmp_path / "shot.png", a="primal", b="l1", exposure=-2, split=30)
+    shot = imageio.imread(tmp_path / "shot.png")[:, :, :3].astype(int)
+    stops = display.auto_exposure(constant(COLOURS["reference"])) - 2
+    left, right = (where(shot, display.to_srgb8(constant(COLOURS[name]), stops)[0, 0]) for name in ("primal", "l1"))
+    row = (left | right).sum(axis=1).argmax()  # the stage is wider than all the thumbnails together
+    a, b = np.flatnonzero(left[row]), np.flatnonzero(right[row])
+    assert a.max() < b.min()
+    border = (a.max() + b.min()) / 2
+    assert (border - a.min()) / (b.max() + 1 - a.min()) == pytest.approx(0.3, abs=0.01)
+    assert b.max() + 1 - a.min() == WIDTH * 11  # the largest whole factor that fits into the stage's 1150 pixels
+
+
+def test_a_screenshot_shows_the_error_map_of_python(tmp_path):
+    imageio = pytest.importorskip("imageio.v3")
+    path = written(tmp_path, flat_scene())
+    browse(path, tmp_path, picture=tmp_path / "shot.png", a="primal", b="reference", error=1, split=50)
+    shot = imageio.imread(tmp_path / "shot.png")[:, :, :3].astype(int)
+    expected = display.error_map(constant(COLOURS["primal"]), constant(COLOURS["reference"]))[0, 0]
+    assert where(shot, expected).sum() > 100_000
+    assert where(shot, display.heat_table()[0]).sum() > 100_000  # the reference has no error
+
+
+class Session:
+    """A page in a browser that stays open, driven over Chromium's own pipe: commands go in, answers and events out."""
+
+    def __init__(self, profile, url):
+        command = shlex.join([*browser_command(profile), "--remote-debugging-pipe"])
+        into, out = profile.with_suffix(".in"), profile.with_suffix(".out")
+        os.mkfifo(into)
+        os.mkfifo(out)
+        command = f"exec {command} 3<{shlex.quote(str(into))} 4>{shlex.quote(str(out))}"  # it reads 3 and writes 4
+        self.process = subprocess.Popen(["sh", "-c", command], stderr=subprocess.DEVNULL)
+        self.into, self.out = os.open(into, os.O_WRONLY), os.open(out, os.O_RDONLY)
+        self.count, self.target, self.buffer, self.complaints = 0, {}, b"", []
+        page = self.call("Target.createTarget", url="about:blank")["targetId"]
+        self.target = {"sessionId": self.call("Target.attachToTarget", targetId=page, flatten=True)["sessionId"]}
+        for domain in ("Runtime", "Log", "Page"):
+            self.call(domain + ".enable")
+        self.call("Page.navigate", url=url)
+        self.settle()
+
+    def call(self, method, **params):
+        self.count += 1
+        message = {"id": self.count, "method": method, "params": params} | self.target
+        os.write(self.into, json.dumps(message).encode() + b"\0")
+        while True:
+            while b"\0" not in self.buffer:
+                assert select.select([self.out], [], [], 20)[0], f"no answer to {method}"
+                part = os.read(self.out, 1 << 16)
+                assert part, f"the browser left at {method}"
+                self.buffer += part
+            text, self.buffer = self.buffer.split(b"\0", 1)
+            answer = json.loads(text)
+            if answer.get("method") in ("Runtime.exceptionThrown", "Runtime.consoleAPICalled", "Log.entryAdded"):
+                self.complaints.append(answer["params"])
+            if answer.get("id") == self.count:
+                assert "error" not in answer, answer
+                return answer["result"]
+
+    def ask(self, expression):
+        return self.call("Runtime.evaluate", expression=expression, returnByValue=True)["result"].get("value")
+
+    def settle(self):
+        """Waits until the page shows what it was asked to show, and has written it into its address."""
+        end = time.monotonic() + 20
+        while self.ask("document.documentElement.dataset.ready") != "true":
+            assert time.monotonic() < end, "the page never became ready"
+            time.sleep(0.02)
+        time.sleep(0.4)
+
+    def view(self):
+        self.settle()
+        return dict(parse_qsl(self.ask("location.hash.slice(1)")))
+
+    def mouse(self, kind, x, y):
+        self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def key(self, key):
+        for kind in ("keyDown", "keyUp"):
+            self.call("Input.dispatchKeyEvent", type=kind, key=key)
+
+    def close(self):
+        os.close(self.into)  # a browser whose pipe is closed leaves
+        try:
+            self.process.wait(20)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+        os.close(self.out)
+
+
+def test_mouse_and_keyboard_drive_the_page(tmp_path):
+    session = Session(tmp_path / "profile", address(written(tmp_path, flat_scene(), noise_scene()), zoom="fit"))
+    try:
+        left, top, width, height = session.ask(
+            "(({x, y, width, height}) => [x, y, width, height])($('frame').getBoundingClientRect())"
+        )
+        session.mouse("mousePressed", left + 0.5 * width, top + 0.5 * height)
+        session.mouse("mouseMoved", left + 0.25 * width, top + 0.5 * height)
+        session.mouse("mouseReleased", left + 0.25 * width, top + 0.5 * height)
+        assert float(session.view()["split"]) == pytest.approx(25, abs=0.1)
+        assert session.ask("$('where').textContent") == "x 24, y 16"
+        session.key("ArrowRight")  # the drag left the focus on the border
+        assert float(session.view()["split"]) == pytest.approx(26, abs=0.1)
+        session.key("End")
+        assert session.view()["split"] == session.ask("$('wipe').getAttribute('aria-valuenow')") == "100"
+
+        session.ask("document.querySelector('#scene-0 figure[data-name=reference] button.a').click()")
+        session.ask("document.querySelector('#exposures button[value=\"2\"]').click()")
+        session.ask("$('error').click()")
+        session.ask("document.querySelector('#zooms button[value=\"4\"]').click()")
+        expected = {"a": "reference", "b": "l1", "exposure": "2", "error": "1", "zoom": "4"}
+        assert session.view().items() >= expected.items()
+        assert session.ask("$('legend').hidden") is False
+
+        # The other scene has neither an 'l1' nor a reference: the page falls back, it does not fail.
+        session.ask("document.querySelectorAll('[role=tab]')[1].click()")
+        expected = {"scene": "1", "a": "primal", "b": "primal", "error": "0"}
+        assert session.view().items() >= expected.items()
+        assert session.ask("$('error').disabled") is True
+        session.ask("location.hash = '#scene=0&a=nonsense&exposure=nonsense&split=-7&zoom=toString'")
+        assert session.ask("getComputedStyle($('scene-0')).display") != "none"
+        assert session.ask("document.documentElement.dataset.error ?? null") is None
+        assert session.complaints == []
+    finally:
+        session.close()
+
+
+def where(shot: np.ndarray, colour: np.ndarray) -> np.ndarray:
+    return np.abs(shot - colour.astype(int)).max(axis=2) <= 1
