@@ -82,7 +82,7 @@ def map_rows(function: Callable[[int, int], Any], planes: Array) -> list:
 
 
 def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
-    """The arrays (..., H, W) whose rows first .. last - 1 ``function(first, last)`` gives, shaped like those of ``out``.
+    """The arrays (..., H, W), shaped like ``out``, whose rows first .. last - 1 ``function(first, last)`` returns.
 
     What the function returns beyond these comes back as one last item, a list over the bands, from top to bottom.
 

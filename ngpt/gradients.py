@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ngpt.arrays import Array, by_rows, module
+from ngpt.arrays import Array, by_rows
 
 
 def forward_differences(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -50,7 +50,7 @@ def adjoint(dx: Array, dy: Array) -> Array:
 
 
 def adjoint_by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
-    """As ``by_rows``, but the first three values of the function are v, dx, dy, and v + adjoint(dx, dy) is made of them.
+    """As ``by_rows``, but the function's first three values are v, dx, dy, of which v + adjoint(dx, dy) is made.
 
     v may be None for 0.
     """

@@ -152,23 +152,18 @@ class _Weighted:
         self.σ, self.mean = float((screen * self.scaling**2).mean()), None
 
     def solve(self, b: Array, tolerance: float, max_iterations: int) -> tuple[Array, int]:
-        xp = module(b)
-        u, residual, p, q, z = xp.zeros_like(b), b, *(empty(b, len(b)) for _ in range(3))
-        first = None
-        for iteration in range(max_iterations + 1):
-            z, gain = self._precondition(residual, z)
-            first = gain if first is None else first
-            if not gain > tolerance**2 * first:
+        zeros = module(b).zeros_like
+        u, p, residual, q, z = zeros(b), zeros(b), b, empty(b, len(b)), empty(b, len(b))
+        z, gain = self._precondition(residual, z)
+        goal, previous = tolerance**2 * gain, math.inf
+        for iteration in range(max_iterations):
+            if not gain > goal:
                 return u, iteration
-            ratio = gain / previous if iteration else 0.0
-            (p, _) = by_rows(lambda i, j: (z[:, i:j] + (ratio * p[:, i:j] if ratio else 0),), p)
-            q, energies = adjoint_by_rows(lambda i, j: self._apply(p, i, j), q)
+            p = _plus(z, gain / previous, p, p)
+            q, energies = self._apply(p, q)
             step, previous = gain / total_of(energies), gain
-
-            def advance(i, j):
-                return u[:, i:j] + step * p[:, i:j], residual[:, i:j] - step * q[:, i:j]
-
-            u, residual, _ = by_rows(advance, u, residual)
+            u, residual = _plus(u, step, p, u), _plus(residual, -step, q, residual)
+            z, gain = self._precondition(residual, z)
         return u, max_iterations
 
     def _precondition(self, residual: Array, out: Array) -> tuple[Array, float]:
@@ -183,12 +178,21 @@ class _Weighted:
         z, products = by_rows(finish, out)
         return z, total_of(products)
 
-    def _apply(self, p: Array, first: int, last: int) -> tuple:
-        """screen p, weights ∇p, and what these rows contribute to p·(screen + ∇ᵀ weights ∇) p."""
-        dx, dy = differences(p, first, last)
-        x, y = self.weights[0, :, first:last] * dx, self.weights[1, :, first:last] * dy
-        own = self.screen[:, first:last] * p[:, first:last]
-        return own, x, y, sum_of(x * dx + y * dy + own * p[:, first:last])
+    def _apply(self, p: Array, out: Array) -> tuple[Array, list]:
+        """(screen + ∇ᵀ weights ∇) p, and its product with p in parts."""
+
+        def rows(i, j):
+            dx, dy = differences(p, i, j)
+            x, y, own = self.weights[0, :, i:j] * dx, self.weights[1, :, i:j] * dy, self.screen[:, i:j] * p[:, i:j]
+            return own, x, y, sum_of(x * dx + y * dy + own * p[:, i:j])
+
+        result, energies = adjoint_by_rows(rows, out)
+        return result, energies
+
+
+def _plus(a: Array, factor: float, b: Array, out: Array) -> Array:
+    """a + factor b"""
+    return by_rows(lambda i, j: (a[:, i:j] + factor * b[:, i:j],), out)[0]
 
 
 def unused_zeroed(differences: Array) -> Array:
