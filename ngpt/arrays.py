@@ -34,9 +34,9 @@ def cast(array: Array, dtype: Any) -> Array:
     return array.astype(dtype, copy=False) if isinstance(array, np.ndarray) else array.to(dtype)
 
 
-def detach(array: Array) -> Array:
+def detach(array: Array | float) -> Array | float:
     """The same values, as a constant for automatic differentiation."""
-    return array if isinstance(array, np.ndarray) else array.detach()
+    return array.detach() if hasattr(array, "detach") else array
 
 
 def like(values: np.ndarray, array: Array) -> Array:

@@ -13,7 +13,7 @@ from ngpt.leastsquares import Equations, solve_weighted
 from ngpt.variances import smooth_variances
 
 # Relative residual at which to stop.
-TOLERANCE = 1e-3
+TOLERANCE = 1e-4
 
 
 def wl2(
