@@ -39,6 +39,11 @@ def detach(array: Array | float) -> Array | float:
     return array.detach() if hasattr(array, "detach") else array
 
 
+def to_numpy(array: Array) -> np.ndarray:
+    """A tensor's values in an array of its own precision, on the CPU."""
+    return array if isinstance(array, np.ndarray) else array.detach().cpu().numpy()
+
+
 def like(values: np.ndarray, array: Array) -> Array:
     """NumPy values as an array of the kind, precision and device of ``array``."""
     if isinstance(array, np.ndarray):

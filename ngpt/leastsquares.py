@@ -33,7 +33,7 @@ class Equations:
         peak = _peak(primal, dx, dy)
         if not math.isfinite(peak):
             raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
-        sample = abs(primal[::4, ::4])
+        sample = abs(detach(primal[::4, ::4]))
         typical = float((sample**0.5).sum() / max(int((sample > 0).sum()), 1)) ** 2
         self.work = self.xp.float64 if peak > FLOAT32_RANGE * typical else self.dtype
         self.primal, self.dx, self.dy = (cast(planes(a), self.work) for a in (primal, dx, dy))
@@ -147,7 +147,7 @@ class _Weighted:
             self.σ, self.mean = screen, 0.0
             return
         self.screen = screen
-        mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights)))
+        mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights))).clip(1, None)
         self.scaling = (mean + screen) ** -0.5
         self.σ, self.mean = float((screen * self.scaling**2).mean()), None
 
@@ -218,3 +218,16 @@ def sum_of(values: Array) -> float:
 def total_of(bands: list) -> float:
     """The sum of the one further value of each band, as ``by_rows`` lists them."""
     return float(sum(value for (value,) in bands))
+
+
+def robust_mean(values: Array) -> float:
+    """The mean of values >= 0 when none counts as more than a hundred times this mean.
+
+    Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
+    """
+    mean = math.inf
+    while True:
+        clipped = float(values.clip(None, 100 * mean).mean(dtype=module(values).float64)) if values.shape[-1] else 0.0
+        if not clipped < 0.5 * mean:
+            return clipped
+        mean = clipped

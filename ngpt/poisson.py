@@ -23,7 +23,7 @@ import numpy as np
 from ngpt.arrays import Array, by_rows, cast, detach, empty, module
 from ngpt.errors import NgptError
 from ngpt.gradients import adjoint_by_rows, differences
-from ngpt.leastsquares import Equations, solve, solve_weighted, sum_of, total_of
+from ngpt.leastsquares import Equations, robust_mean, solve, solve_weighted, sum_of
 
 DEFAULT_ALPHA = 0.2
 
@@ -84,6 +84,8 @@ def l1(
 def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iterations: int) -> tuple[Array, list[float]]:
     """The correction u (C, H, W) that minimises Σ ‖K u - (0, r)‖, K = (α, ∂x, ∂y), and the energies on the way.
 
+    (In these, a norm beyond a thousand times the mean of the first counts as a thousand.)
+
     ``r`` (2, C, H, W) of a magnitude near 1, as ``Equations.scaled_residual`` gives it.
 
     ADMM [Boyd et al. 2011, "Distributed Optimization and Statistical Learning via ADMM", section 3.4] on the residuals
@@ -102,12 +104,9 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
         # The tiny number keeps the derivative of the square root finite.
         return xp.sqrt((e * e).sum(1, keepdims=True) + 1e-30)
 
-    def energy(e, first, last):
-        return sum_of(norm(detach(e)) * counts[:, :, first:last])
-
     def start(first, last):
         e = residual(u, first, last)
-        return e, xp.ones_like(e[:, :1]), energy(e, first, last)
+        return e, norm(e)
 
     def iterate(first, last):
         e, previous = residual(u, first, last), s[:, :, first:last]
@@ -115,14 +114,18 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
         # The proximal operator of the norm shortens each colour by the threshold; what does not count stays.
         shorter = (1 - threshold * counts[:, :, first:last] / norm(new)).clip(0, None)
         α, x, y = (2 * shorter - 1) * new
+        energy = sum_of(norm(detach(e)).clip(None, limit) * counts[:, :, first:last])
         x, y = x + r[0, :, first:last], y + r[1, :, first:last]
-        return alpha * α, x, y, new, shorter, energy(e, first, last), α.sum((1, 2), dtype=xp.float64)
+        return alpha * α, x, y, new, shorter, energy, α.sum((1, 2), dtype=xp.float64)
 
     b, _ = adjoint_by_rows(lambda i, j: (None, *r[..., i:j, :]), empty(r, channels))
     u, free = solve(b, alpha**2, mean=0.0), [empty(b, channels), empty(b, channels)]
-    s, factor, bands = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
-    # In units of the mean residual, the iteration follows the exposure of the image.
-    threshold = total_of(bands) / (3 * r.shape[2] * r.shape[3]) / PENALTY
+    s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
+    # In units of the mean residual, the iteration follows the exposure of the image. Outliers must neither set this
+    # unit nor, by an energy beside which the rest of the image is nothing, decide when to stop.
+    mean = robust_mean(detach(norms))
+    threshold, limit = mean / PENALTY, 1000 * mean
+    factor = xp.ones_like(norms)
     energies: list[float] = []
     best = u
     while threshold > 0 and len(energies) < max_iterations:
