@@ -36,7 +36,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         kind = node.type.name
         if kind in plugins:
             plugins[kind][node.props.plugin_name()] += 1
-        if kind == "Film" and node.props.has_property("width") and node.props.has_property("height"):
+        if kind == "Film" and "width" in node.props and "height" in node.props:
             size = (int(node.props["width"]), int(node.props["height"]))
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},

@@ -41,7 +41,7 @@ class GPTBasic(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        nested = [props[name] for name in props.property_names() if isinstance(props[name], mi.SamplingIntegrator)]
+        nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
         self.nested = nested[0] if nested else mi.load_dict({"type": "path"})
         self.channels: list[str] = []
 
