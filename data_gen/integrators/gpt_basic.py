@@ -86,7 +86,7 @@ class GPTBasic(mi.SamplingIntegrator):
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.
         L, _, _ = self.nested.sample(scene, camera.random.clone(), ray, medium, inside)
-        Le = mi.Spectrum(0)
+        Le = dr.zeros(mi.Spectrum, dr.width(inside))
         if not self.nested.hide_emitters and medium is None:
             si = scene.ray_intersect(ray, inside)
             Le = si.emitter(scene, inside).eval(si, inside)

@@ -39,3 +39,29 @@ def fog():
             "interior": {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.4},
         },
     }
+
+
+def within_fog():
+    """The same with the camera inside the medium and lamps that hide from it."""
+    scene = fog()
+    medium = {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.2, "id": "air"}
+    scene["integrator"]["hide_emitters"] = True
+    scene["sensor"]["medium"] = {"type": "ref", "id": "air"}
+    scene["box"]["to_world"] = _scale(6)
+    scene["box"]["interior"] = {"type": "ref", "id": "air"}
+    return {"type": "scene", "air": medium, **scene}
+
+
+def hidden_lamp():
+    """The diffuse room with a lamp that the camera does not see."""
+    from data_gen.builtin import diffuse
+
+    scene = diffuse()
+    scene["integrator"]["hide_emitters"] = True
+    return scene
+
+
+def _scale(factor):
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().scale(factor)
