@@ -21,6 +21,13 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         raise NgptError(
             "rendering needs Mitsuba 3, which is not installed; `pip install 'ngpt-recon[render]'`"
         ) from error
+    except (ImportError, NameError) as error:
+        # Dr.Jit fails with a NameError of its own when a system library is missing; the cause is one below it.
+        cause = error.__context__ or error
+        raise NgptError(
+            f"Mitsuba is installed but cannot be loaded: {cause}; if a library is missing, install it, "
+            "e.g. libatomic.so.1 by `apt-get install libatomic1` (as root)"
+        ) from error
     jit_variants = [v for v in mi.variants() if not v.startswith("scalar")]
     if name not in jit_variants:
         raise NgptError(

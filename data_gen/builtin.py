@@ -27,7 +27,14 @@ def _camera(origin, target, fov: float, **extra) -> dict:
         "fov": fov,
         "fov_axis": "larger",
         "to_world": _transform().look_at(origin=origin, target=target, up=[0, 1, 0]),
-        "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, "pixel_format": "rgb", "component_format": "float32"},
+        "film": {
+            "type": "hdrfilm",
+            "width": 640,
+            "height": 360,
+            "rfilter": {"type": "box"},
+            "pixel_format": "rgb",
+            "component_format": "float32",
+        },
     } | extra
 
 

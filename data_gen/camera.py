@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from itertools import pairwise
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
+
+Progress = Callable[[int, int], None]
 
 # Lanes in one kernel launch. A lane's state takes about 150 bytes, so a pass stays below about 300 MB.
 LANES_PER_PASS = 1 << 21
@@ -48,20 +51,25 @@ class CameraSamples:
 
 
 def render_passes(
-    sample: Callable[[CameraSamples, GradientFilm], None], sensor: mi.Sensor, seed: int, spp: int
-) -> Iterator[tuple[int, GradientFilm]]:
-    """Calls ``sample`` with the camera samples of as many passes as memory asks for.
+    sample: Callable[[CameraSamples, GradientFilm], None],
+    sensor: mi.Sensor,
+    seed: int,
+    spp: int,
+    progress: Progress = lambda done, total: None,
+) -> GradientFilm:
+    """Calls ``sample`` with the camera samples of as many passes as memory asks for, and returns the film it filled.
 
-    Yields (samples per pixel so far, film) after each. The same seed, size and spp give the same bits.
+    The same seed, size and spp give the same bits. ``progress`` is called with (samples per pixel so far, spp) before
+    the first pass and after each.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     film = GradientFilm(width, height)
-    count = min(spp, -(-spp * width * height // LANES_PER_PASS))
-    done = 0
-    for i in range(count):
+    passes = min(spp, -(-spp * width * height // LANES_PER_PASS))
+    ends = [spp * i // passes for i in range(passes + 1)]
+    progress(0, spp)
+    for i, (start, end) in enumerate(pairwise(ends)):
         # Independent streams for the passes of one render and for renders of different seeds.
         pass_seed = int(np.random.SeedSequence((seed, i)).generate_state(1)[0])
-        end = spp * (i + 1) // count
-        sample(CameraSamples(sensor, pass_seed, end - done), film)
-        done = end
-        yield done, film
+        sample(CameraSamples(sensor, pass_seed, end - start), film)
+        progress(end, spp)
+    return film

@@ -59,9 +59,12 @@ def first_nonspecular_vertex(scene, sampler, ray):
         through_hole = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
         found = si.is_valid() & mi.has_flag(flags, mi.BSDFFlags.Smooth) & ~through_hole
         # eval_diffuse_reflectance() is free of noise, but means nothing without a diffuse component. The weight of a
-        # sampled direction has the directional albedo as its mean, for any material.
+        # sampled direction has the directional albedo as its mean, for any material; η² takes out that radiance, not
+        # power, changes where it is refracted.
         diffuse = mi.has_flag(flags, mi.BSDFFlags.DiffuseReflection)
-        reflectance = dr.select(diffuse, bsdf.eval_diffuse_reflectance(si, si.is_valid()), weight)
+        reflectance = dr.select(
+            diffuse, bsdf.eval_diffuse_reflectance(si, si.is_valid()), weight * dr.square(sample.eta)
+        )
         vertices += 1
         searching = si.is_valid() & ~found & (vertices < MAX_SPECULAR_VERTICES) & (dr.max(weight) > 0)
         ray = si.spawn_ray(si.to_world(sample.wo))

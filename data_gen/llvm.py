@@ -86,3 +86,11 @@ def _has_modern_interface(path: Path) -> bool:
 def _remedy() -> str:
     install = "`brew install llvm`" if sys.platform == "darwin" else "`apt-get install libllvm19` (as root)"
     return f"install one, e.g. {install}, or set {ENVIRONMENT} to its file"
+
+
+if __name__ == "__main__":
+    # For scripts that prepare a machine: the library on success, one line of advice and status 1 otherwise.
+    try:
+        print(use_llvm())
+    except NgptError as error:
+        sys.exit(str(error))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 
 import mitsuba as mi
 
 import ngpt
 from data_gen.builtin import SCENES
-from data_gen.camera import CameraSamples, render_passes
+from data_gen.camera import CameraSamples, Progress, render_passes
 from data_gen.features import features
 from data_gen.film import GradientFilm
 from data_gen.spectrum import to_rgb
@@ -22,6 +22,7 @@ SAMPLERS = {
     "gpt-basic": "gradients by random sequence replay (five paths per sample; the teaching sampler)",
     "primal": "the scene's own integrator without gradients (references, primal denoisers)",
 }
+DEFAULT_SAMPLER = "gpt-basic"
 
 
 def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
@@ -76,25 +77,22 @@ def render_stack(
     scene: mi.Scene,
     spp: int,
     seed: int = 0,
-    sampler: str = "gpt-basic",
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    sampler: str = "auto",
+    progress: Progress = lambda done, total: None,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``spp`` is the number of (base) paths per pixel, ``sampler`` one of ``SAMPLERS``, and ``progress`` is called with
-    (samples done, spp) after each pass. The scene's reconstruction filter is not used: the pixels of a stack, and so
-    their differences, are box-filtered.
+    ``spp`` is the number of (base) paths per pixel, ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is
+    called with (samples done, spp) before the first pass and after each. The scene's reconstruction filter is not used:
+    the pixels of a stack, and so their differences, are box-filtered.
     """
     if spp < 1:
         raise NgptError(f"{spp} samples per pixel: at least 1 is needed")
     if not 0 <= seed < 2**64:
         raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
-    sensor = scene.sensors()[0]
-    passes = sampler_passes(sampler, scene, sensor, seed, spp)
+    sampler = DEFAULT_SAMPLER if sampler == "auto" else sampler
     start = time.perf_counter()
-    progress(0, spp)
-    for done, film in passes:
-        progress(done, spp)
+    film = render_film(sampler, scene, seed, spp, progress)
     layers = film.develop()
     attributes = {
         "ngpt:spp": spp,
@@ -108,15 +106,16 @@ def render_stack(
     return GradientStack(layers, attributes=attributes)
 
 
-def sampler_passes(name: str, scene, sensor, seed: int, spp: int) -> Iterator[tuple[int, GradientFilm]]:
-    """The passes of the sampler called ``name``; see ``SAMPLERS``."""
+def render_film(sampler: str, scene: mi.Scene, seed: int, spp: int, progress: Progress) -> GradientFilm:
+    """Runs the sampler of that name; see ``SAMPLERS``."""
+    sensor = scene.sensors()[0]
     integrator = reference_integrator(scene)
-    if name == "gpt-basic":
+    if sampler == "gpt-basic":
         gpt = mi.load_dict({"type": "gpt_basic", "integrator": integrator})
-        return gpt.passes(scene, sensor, seed, spp)
-    if name == "primal":
-        return render_passes(lambda camera, film: sample_primal(scene, integrator, camera, film), sensor, seed, spp)
-    raise NgptError(f"unknown sampler '{name}'; choose one of: {', '.join(SAMPLERS)}")
+        return gpt.render_film(scene, sensor, seed, spp, progress=progress)
+    if sampler == "primal":
+        return render_passes(partial(sample_primal, scene, integrator), sensor, seed, spp, progress)
+    raise NgptError(f"unknown sampler '{sampler}'; choose one of: auto, {', '.join(SAMPLERS)}")
 
 
 def sample_primal(scene, integrator, camera: CameraSamples, film: GradientFilm) -> None:

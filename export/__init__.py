@@ -1,0 +1,1 @@
+"""export: reconstructions as ONNX files that any renderer can run."""

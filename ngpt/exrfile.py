@@ -8,15 +8,16 @@ that Python's OpenEXR knows, data and display windows, tiles, line order. The ex
 - Of mipmaps and ripmaps the full-size level is kept.
 - Attributes that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
 
-Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, has its C core report errors on
-stderr by itself, and hands over the readable parts of a damaged file as if there were no others; here a damaged file
-is an error.
+Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, and hands over the readable parts
+of a damaged file as if there were no others; here a damaged file is an error. While a file is read, what other threads
+print to stdout or stderr is lost, since OpenEXR's own messages have to be kept out of there.
 """
 
 import contextlib
 import io
 import math
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
@@ -132,13 +133,31 @@ def _open(path: Path, header_only: bool) -> tuple[list[Any], str]:
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed):
+        with contextlib.redirect_stdout(printed), _without_native_stderr():
             parts = OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts
     except Exception as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
     warning = printed.getvalue().partition("Warning: ")[2].splitlines()
     return parts, f" ({warning[0]})" if warning else ""
+
+
+@contextlib.contextmanager
+def _without_native_stderr() -> Iterator[None]:
+    """Keeps what OpenEXR's C core writes to file descriptor 2 from the user: it comes again as an exception."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # the process has no stderr
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
 
 
 def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:

@@ -1,4 +1,4 @@
-"""Screened Poisson reconstruction: the image that has the sampled gradients for differences and stays near the primal.
+"""Screened Poisson reconstruction: the image near the primal whose differences are the sampled gradients.
 
     l2   min  Σ α² |I - P|²   + Σ |∇I - G|²     exact, by cosine transforms
     l1   min  Σ α ‖I - P‖     + Σ ‖∇I - G‖      robust to outliers, by ADMM around the same transforms

@@ -16,8 +16,6 @@ q to p, are sampled and weighted 1/2 each.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -26,6 +24,7 @@ from data_gen.camera import CameraSamples, render_passes
 from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.spectrum import to_rgb
+from ngpt.layers import LAYERS
 
 
 class GPTBasic(mi.SamplingIntegrator):
@@ -42,7 +41,7 @@ class GPTBasic(mi.SamplingIntegrator):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        nested = [props[name] for name in props.keys() if isinstance(props[name], mi.SamplingIntegrator)]
+        nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
         self.nested = nested[0] if nested else mi.load_dict({"type": "path"})
         self.channels: list[str] = []
 
@@ -54,18 +53,17 @@ class GPTBasic(mi.SamplingIntegrator):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
         sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
         spp = spp or sensor.sampler().sample_count()
-        for _, film in self.passes(scene, sensor, seed, spp):
-            pass
+        film = self.render_film(scene, sensor, seed, spp)
         layers = film.develop()
-        self.channels = [f"{name}.{c}" for name, layer in layers.items() for c in range(layer.shape[-1])]
+        self.channels = [f"{name}.{c}" for name in layers for c in LAYERS[name].channels]
         return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
 
     def aov_names(self):
         return self.channels
 
-    def passes(self, scene, sensor, seed: int, spp: int) -> Iterator[tuple[int, GradientFilm]]:
+    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
         """Renders pass by pass: see ``data_gen.camera.render_passes()``."""
-        return render_passes(lambda camera, film: self.sample_pass(scene, camera, film), sensor, seed, spp)
+        return render_passes(lambda camera, film: self.sample_pass(scene, camera, film), sensor, seed, spp, **progress)
 
     def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path for each camera sample and shifts it to the four neighbours of its pixel."""
@@ -88,7 +86,7 @@ class GPTBasic(mi.SamplingIntegrator):
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.
         L, _, _ = self.nested.sample(scene, camera.random.clone(), ray, medium, inside)
-        Le = mi.Spectrum(0)
+        Le = dr.zeros(mi.Spectrum, dr.width(inside))
         if not self.nested.hide_emitters and medium is None:
             si = scene.ray_intersect(ray, inside)
             Le = si.emitter(scene, inside).eval(si, inside)

@@ -1,0 +1,28 @@
+# `make demo` and `make test` are all a fresh machine needs; each prepares what it uses (scripts/setup).
+
+PY = .venv/bin/python
+
+.PHONY: demo test test-slow check bench setup-demo setup-dev
+
+demo: setup-demo
+	$(PY) -m ngpt demo -o demo --force
+
+test: setup-dev
+	$(PY) -m pytest -q -m "not slow"
+
+test-slow: setup-dev
+	$(PY) -m pytest -q -m slow
+
+check: setup-dev
+	$(PY) -m ruff check .
+	$(PY) -m ruff format --check .
+	$(PY) -m mypy
+
+bench: setup-dev
+	$(PY) -m bench.sampler -o bench/results/sampler.json
+
+setup-demo:
+	@scripts/setup render llvm
+
+setup-dev:
+	@scripts/setup dev llvm chromium

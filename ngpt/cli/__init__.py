@@ -1,0 +1,59 @@
+"""The command ``ngpt``: one verb, one module.
+
+Exit status: 0 when everything asked for was done, 1 when some files failed or images differ, 2 for an error that
+stopped the command, 130 when interrupted.
+"""
+
+import argparse
+import os
+import sys
+from importlib import import_module
+from typing import NoReturn
+
+import ngpt
+from ngpt.console import Console
+from ngpt.errors import NgptError
+
+VERBS = {
+    "demo": "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
+    "render": "render a scene to a gradient stack",
+    "denoise": "reconstruct images from gradient stacks",
+    "info": "say what a file holds, or what a scene requires",
+    "diff": "compare two images",
+}
+
+
+class _Parser(argparse.ArgumentParser):
+    """Reports a wrong call in one line, as all other errors are."""
+
+    def error(self, message: str) -> NoReturn:
+        Console().error(f"{message}; see `{self.prog} --help`")
+        sys.exit(2)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Runs a command line and returns its exit status."""
+    parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
+    parser.add_argument("--version", action="version", version=f"ngpt {ngpt.__version__}")
+    verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_Parser)
+    for verb, summary in VERBS.items():
+        subparser = verbs.add_parser(verb, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")
+        subparser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
+        import_module(f"ngpt.cli.{verb}").add_arguments(subparser)
+    args = parser.parse_args(arguments)
+    console = Console(args.quiet)
+    try:
+        return import_module(f"ngpt.cli.{args.verb}").run(args, console)
+    except NgptError as error:
+        console.error(error)
+        return 2
+    except MemoryError:
+        console.error("out of memory; use a smaller image or fewer files at once")
+        return 2
+    except KeyboardInterrupt:
+        console.error("interrupted")
+        return 130
+    except BrokenPipeError:
+        # The reader of our output is gone; keep Python from complaining again while it flushes at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1

@@ -1,0 +1,97 @@
+"""Arguments that several verbs share, and their conversion."""
+
+import argparse
+import glob
+import json
+from pathlib import Path
+
+from ngpt.errors import NgptError
+from ngpt.layers import LAYERS
+
+# What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
+RESULT_SUFFIX = "_denoised"
+
+
+def add_force(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+
+
+def add_json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print the result as JSON on standard output")
+
+
+def add_layers(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--layer",
+        action="append",
+        default=[],
+        type=assignment,
+        metavar="NAME=LAYER",
+        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file; may be repeated",
+    )
+
+
+def assignment(text: str) -> tuple[str, str]:
+    """``name=value`` as a pair."""
+    name, equals, value = text.partition("=")
+    if not (name and equals and value):
+        raise argparse.ArgumentTypeError(f"'{text}' is not of the form NAME=VALUE")
+    return name, value
+
+
+def size(text: str) -> tuple[int, int]:
+    """``640x360`` as (width, height) in pixels."""
+    width, cross, height = text.lower().partition("x")
+    if not (cross and width.isdecimal() and height.isdecimal() and int(width) > 0 and int(height) > 0):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a size; write WIDTHxHEIGHT in pixels, e.g. 640x360")
+    return int(width), int(height)
+
+
+def positive(text: str) -> int:
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 1 or more")
+    return int(text)
+
+
+def natural(text: str) -> int:
+    if not text.isdecimal():
+        raise argparse.ArgumentTypeError(f"'{text}' is not a whole number of 0 or more")
+    return int(text)
+
+
+def stack_files(names: list[str]) -> list[Path]:
+    """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
+
+    Folders and patterns leave out results of earlier runs. Raises NgptError for a folder or pattern without a file; a
+    plain name is taken as it is, for its reader to complain about.
+    """
+    files: dict[Path, None] = {}
+    for name in names:
+        path = Path(name)
+        if path.is_dir():
+            found = sorted(p for p in path.iterdir() if p.suffix.lower() == ".exr")
+        elif glob.has_magic(name) and not path.exists():
+            found = sorted(Path(p) for p in glob.glob(name, recursive=True))
+        else:
+            files[path] = None
+            continue
+        inputs = [p for p in found if not p.stem.endswith(RESULT_SUFFIX) and not p.name.startswith(".")]
+        if not inputs:
+            raise NgptError(f"{name}: no .exr files to denoise there")
+        files.update(dict.fromkeys(inputs))
+    return list(files)
+
+
+def print_json(value: object) -> None:
+    """Strict JSON: numbers that it does not know (infinite, not a number) become null."""
+    print(json.dumps(_strict(value), indent=2))
+
+
+def _strict(value):
+    if isinstance(value, dict):
+        return {key: _strict(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_strict(item) for item in value]
+    if isinstance(value, float) and not abs(value) < float("inf"):
+        return None
+    return value

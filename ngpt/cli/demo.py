@@ -1,0 +1,115 @@
+"""``ngpt demo``: everything once, on the built-in scenes, ending in a report."""
+
+import argparse
+import platform
+import shlex
+import time
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from ngpt.cli.arguments import add_force, positive, size
+from ngpt.console import Console
+from ngpt.errors import NgptError
+from ngpt.exr import write
+from ngpt.files import check_output
+from ngpt.methods import METHODS, reconstruct
+from ngpt.metrics import compare
+from ngpt.report import Entry, Scene, write_report
+from ngpt.stack import GradientStack
+
+TABLE_METRICS = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR")
+LAYER_VIEWS = ("dx", "dy", "albedo", "normal", "depth")
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "-o", "--output", default="demo", metavar="DIR", help="folder for all that is made (default: demo)"
+    )
+    parser.add_argument(
+        "--scene", action="append", metavar="NAME", help="built-in scene; may be repeated (default: all)"
+    )
+    parser.add_argument("--spp", type=positive, default=16, help="paths per pixel of the stacks (default: 16)")
+    parser.add_argument("--reference-spp", type=positive, default=2048, help="of the references (default: 2048)")
+    parser.add_argument("--size", type=size, default=(240, 160), metavar="WxH", help="pixels (default: 240x160)")
+    parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb)")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(args.variant or DEFAULT_VARIANT)
+    import mitsuba as mi
+
+    from data_gen.builtin import SCENES
+
+    names = args.scene or list(SCENES)
+    for name in names:
+        if name not in SCENES:
+            raise NgptError(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")
+    folder = Path(args.output)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{folder}: cannot be made: {error.strerror}; name another folder with -o") from error
+    report = check_output(folder / "report.html", args.force)
+    start = time.perf_counter()
+    scenes = [demo_scene(name, args, folder, console) for name in names]
+    command = shlex.join(
+        ["ngpt", "demo", "--spp", str(args.spp), "--reference-spp", str(args.reference_spp)]
+        + ["--size", f"{args.size[0]}x{args.size[1]}"]
+        + [word for name in args.scene or [] for word in ("--scene", name)]
+    )
+    footer = {
+        "ngpt": ngpt.__version__,
+        "Mitsuba": f"{mi.__version__} ({mi.variant()})",
+        "NumPy": np.__version__,
+        "Python": platform.python_version(),
+        "whole run": f"{time.perf_counter() - start:.0f} s",
+    }
+    write_report(report, "ngpt demo", scenes, command=command, footer=footer, overwrite=args.force)
+    print_table(scenes)
+    console.say(f"report: {report} (open it in a browser), {time.perf_counter() - start:.0f} s in all")
+    return 0
+
+
+def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Console) -> Scene:
+    """Renders one scene with its reference, runs every method on it, and writes all of the images."""
+    from data_gen.render import load_scene, render_stack
+
+    targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *METHODS)}
+    scene = load_scene(name, args.size)
+    with console.progress(f"{name}: stack", "spp") as progress:
+        stack = render_stack(scene, args.spp, progress=progress)
+    # Another seed than the stack's: a reference must not share its noise.
+    with console.progress(f"{name}: reference", "spp") as progress:
+        reference = render_stack(scene, args.reference_spp, seed=1, sampler="primal", progress=progress)["primal"]
+    write(targets["stack"], stack, overwrite=args.force)
+    write(targets["ref"], reference, overwrite=args.force)
+    entries = []
+    for method, entry in METHODS.items():
+        if all(layer in stack for layer in entry.needs):
+            entries.append(demo_method(method, stack, reference, targets[method], args.force))
+    caption = (
+        f"{stack.width}x{stack.height}, {args.spp} spp, rendered in {stack.attributes['ngpt:seconds']:.1f} s; "
+        f"reference {args.reference_spp} spp of Mitsuba's own integrator"
+    )
+    return Scene(name, caption, reference, entries, {layer: stack[layer] for layer in LAYER_VIEWS if layer in stack})
+
+
+def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> Entry:
+    result = reconstruct(stack, method)
+    write(target, result.image, like=stack, overwrite=force)
+    metrics = compare(result.image, reference)
+    return Entry(method, result.image, result.seconds, {name: metrics[name] for name in TABLE_METRICS})
+
+
+def print_table(scenes: list[Scene]) -> None:
+    """The numbers of the report, for those who do not open it."""
+    print(f"{'scene':14}{'method':10}{'relMSE':>12}{'of primal':>12}{'seconds':>10}")
+    for scene in scenes:
+        for entry in scene.entries:
+            share = entry.metrics["relMSE"] / max(scene.entries[0].metrics["relMSE"], 1e-30)
+            print(f"{scene.name:14}{entry.name:10}{entry.metrics['relMSE']:12.5f}{share:12.1%}{entry.seconds:10.2f}")

@@ -1,0 +1,105 @@
+"""``ngpt denoise``: from gradient stacks to images."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.cli.arguments import RESULT_SUFFIX, add_force, add_json, add_layers, print_json, stack_files
+from ngpt.console import Console
+from ngpt.errors import NgptError
+from ngpt.exr import read, read_image, write
+from ngpt.files import check_output
+from ngpt.methods import METHODS, reconstruct
+from ngpt.metrics import compare
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    methods = "; ".join(f"{name}: {method.summary}" for name, method in METHODS.items())
+    parser.add_argument("stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help=f"file for one stack, folder for several (default: STACK{RESULT_SUFFIX}.exr beside each)",
+    )
+    parser.add_argument("-m", "--method", default="auto", choices=["auto", *METHODS], help=f"default: auto. {methods}")
+    parser.add_argument("--alpha", type=float, help="weight of the primal image in l2 and l1 (default: 0.2)")
+    parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
+    add_layers(parser)
+    add_force(parser)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    pairs = output_paths(stack_files(args.stacks), args.output)
+    for _, target in pairs:
+        check_output(target, args.force)
+    reference = read_image(args.ref) if args.ref else None
+    options = {} if args.alpha is None else {"alpha": args.alpha}
+    reports = []
+    for i, (source, target) in enumerate(pairs, 1):
+        try:
+            report = denoise_file(source, target, args, options, reference)
+            console.say(f"[{i}/{len(pairs)}] {describe(report)}")
+        except NgptError as error:
+            report = {"input": str(source), "error": str(error)}
+            console.error(error)
+        reports.append(report)
+    failed = sum("error" in report for report in reports)
+    if failed and len(pairs) > 1:
+        console.error(f"{failed} of {len(pairs)} stacks were not reconstructed")
+    if args.json:
+        print_json({"ok": failed == 0, "files": reports})
+    return 1 if failed else 0
+
+
+def denoise_file(source: Path, target: Path, args, options: dict, reference: np.ndarray | None) -> dict:
+    """Reads, reconstructs and writes one stack; returns what there is to report."""
+    stack = read(source, dict(args.layer))
+    result = reconstruct(stack, args.method, **options)
+    report = {
+        "input": str(source),
+        "output": str(target),
+        "method": result.method,
+        "seconds": result.seconds,
+        "width": stack.width,
+        "height": stack.height,
+        "repaired": result.repaired,
+        "untrusted": result.untrusted,
+    }
+    if reference is not None:
+        report["metrics"] = compare(result.image, reference)
+    write(target, result.image, like=stack, overwrite=args.force)
+    return report
+
+
+def describe(report: dict) -> str:
+    """One line about one file."""
+    text = f"{report['input']} -> {report['output']}: {report['method']}, {report['seconds']:.2f} s"
+    if report["repaired"] or report["untrusted"]:
+        text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if "metrics" in report:
+        text += f", relMSE {report['metrics']['relMSE']:.5g}"
+    return text
+
+
+def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
+    """Where the result of each source goes; makes the output folder if there is to be one."""
+    if output is None:
+        targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
+    elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith("/"):
+        targets = [Path(output)]
+    else:
+        folder = Path(output)
+        if folder.exists() and not folder.is_dir():
+            raise NgptError(f"{folder}: is a file; the results of {len(sources)} stacks need a folder")
+        targets = [folder / path.name for path in sources]
+        repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
+        if repeated:
+            raise NgptError(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
+    return list(zip(sources, targets, strict=True))

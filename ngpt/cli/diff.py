@@ -1,0 +1,33 @@
+"""``ngpt diff``: every metric between two images; the exit status says whether they agree."""
+
+import argparse
+
+from ngpt.cli.arguments import add_json, print_json
+from ngpt.console import Console
+from ngpt.exr import read_image
+from ngpt.metrics import compare
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("image", metavar="A", help="the image to judge: its root R G B, i.e. the result if it has one")
+    parser.add_argument("reference", metavar="B", help="the image to judge it by")
+    parser.add_argument(
+        "--tolerance",
+        type=float,
+        default=1e-6,
+        metavar="RELMSE",
+        help="the images agree up to this relMSE (default: 1e-6)",
+    )
+    add_json(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    metrics = compare(read_image(args.image), read_image(args.reference))
+    agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
+    if args.json:
+        print_json({"agree": agree, "tolerance": args.tolerance, "metrics": metrics})
+    else:
+        for name, value in metrics.items():
+            print(f"{name:16} {value:.6g}")
+        print(f"{'agree' if agree else 'differ':16} (relMSE up to {args.tolerance:g}, no non-finite pixels)")
+    return 0 if agree else 1

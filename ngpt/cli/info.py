@@ -1,0 +1,132 @@
+"""``ngpt info``: what a file holds, what a scene requires, which names are known."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from ngpt.cli.arguments import add_json, add_layers, assignment, print_json
+from ngpt.console import Console
+from ngpt.errors import NgptError
+from ngpt.exr import read
+from ngpt.layers import LAYERS, format_aliases
+from ngpt.methods import METHODS
+from ngpt.stack import GradientStack
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("file", nargs="?", metavar="FILE", help="an .exr file, a scene file, or a built-in scene")
+    parser.add_argument(
+        "--aliases", action="store_true", help="print the layer names of other renderers that are known"
+    )
+    parser.add_argument(
+        "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
+    )
+    add_layers(parser)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    if args.aliases:
+        print(format_aliases())
+    elif args.file is None:
+        show(overview(), args.json)
+    elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
+        show(scene(args.file, dict(args.define)), args.json)
+    else:
+        show(stack(read(args.file, dict(args.layer))), args.json)
+    return 0
+
+
+def overview() -> dict:
+    """What this installation offers."""
+    report = {"version": ngpt.__version__, "methods": {name: method.summary for name, method in METHODS.items()}}
+    try:
+        use_renderer()
+    except NgptError as error:
+        return report | {"rendering": f"not available: {error}"}
+    from data_gen.builtin import SCENES
+    from data_gen.render import SAMPLERS
+
+    scenes = {name: (scene.__doc__ or "").split("\n")[0] for name, scene in SCENES.items()}
+    return report | {"samplers": SAMPLERS, "built-in scenes": scenes}
+
+
+def scene(name: str, parameters: dict[str, str]) -> dict:
+    """What a scene is made of and how it would be rendered."""
+    if Path(name).suffix.lower() == ".exr":
+        raise NgptError(f"{name}: not found; check the name")
+    use_renderer()
+    from data_gen.inspect import inspect_scene
+
+    return {"scene": name} | inspect_scene(name, parameters)
+
+
+def use_renderer() -> None:
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(DEFAULT_VARIANT)
+
+
+def stack(stack: GradientStack) -> dict:
+    """What an image file holds, what of it is understood, and what can be done with it."""
+    assert stack.source is not None
+    parts, resolution = stack.source.image.parts, stack.source.resolution
+    main = parts[resolution["primal"].part]
+    window = [[int(n) for n in corner] for corner in main.header["dataWindow"]]
+    known = {(found.part, channel) for found in resolution.values() for channel in found.channels}
+    layers = {}
+    for name in stack.names:
+        found = resolution[name]
+        values = stack[name]
+        finite = values[np.isfinite(values)]
+        layers[name] = {
+            "channels": " ".join(found.channels),
+            "part": parts[found.part].name or found.part,
+            "type": str(parts[found.part].channels[found.channels[0]].dtype),
+            "min": float(finite.min()) if finite.size else None,
+            "mean": float(finite.mean(dtype=np.float64)) if finite.size else None,
+            "max": float(finite.max()) if finite.size else None,
+            "nonfinite": int(np.sum(~np.isfinite(values).all(axis=-1))),
+        }
+    return {
+        "file": stack.path,
+        "size": [stack.width, stack.height],
+        "data window": window,
+        "parts": len(parts),
+        "layers": layers,
+        "other channels": [c for i, part in enumerate(parts) for c in part.channels if (i, c) not in known],
+        "missing": [name for name in LAYERS if name not in stack],
+        "methods": [name for name, method in METHODS.items() if all(layer in stack for layer in method.needs)],
+        "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
+    }
+
+
+def show(report: dict, as_json: bool) -> None:
+    if as_json:
+        print_json(report)
+        return
+    for name, value in report.items():
+        if isinstance(value, dict):
+            print(f"{name}:")
+            for key, item in value.items():
+                text = (
+                    "  ".join(f"{k} {_number(v)}" for k, v in item.items()) if isinstance(item, dict) else _number(item)
+                )
+                print(f"  {key:16} {text}")
+        elif isinstance(value, list) and value and isinstance(value[0], str) and max(map(len, value)) > 30:
+            print(f"{name}:")
+            for item in value:
+                print(f"  {item}")
+        else:
+            print(f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}")
+
+
+def _number(value: object) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def _plain(value):
+    """A header attribute as something JSON can hold."""
+    return value if isinstance(value, bool | int | float | str) else " ".join(str(value).split())

@@ -1,0 +1,39 @@
+"""Fixtures that several tests share."""
+
+import numpy as np
+import pytest
+
+from ngpt.errors import NgptError
+from ngpt.gradients import forward_differences
+from ngpt.stack import GradientStack
+
+
+@pytest.fixture
+def rng():
+    return np.random.default_rng(20261121)
+
+
+@pytest.fixture
+def noisy_stack(rng):
+    """A smooth image, 24x17, with noise of 0.1 on the primal and 0.01 on the gradients; and the image itself."""
+    y, x = np.mgrid[0:17, 0:24] / 10
+    clean = np.stack([1 + np.sin(x + c) * np.cos(y) for c in range(3)], axis=-1)
+    clean[5:12, 8:15] += 1
+    dx, dy = (g + rng.normal(0, 0.01, g.shape) for g in forward_differences(clean))
+    stack = GradientStack.from_arrays(primal=clean + rng.normal(0, 0.1, clean.shape), dx=dx, dy=dy)
+    return stack, clean
+
+
+@pytest.fixture(scope="session")
+def renderer():
+    """Mitsuba with a CPU variant; tests that render skip where it, or LLVM, is not to be had."""
+    pytest.importorskip("mitsuba")
+    from data_gen.backend import use_variant
+
+    try:
+        use_variant("llvm_ad_rgb")
+    except NgptError as error:
+        pytest.skip(str(error))
+    import mitsuba
+
+    return mitsuba

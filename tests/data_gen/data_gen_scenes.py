@@ -1,0 +1,67 @@
+"""Scenes of the statistical tests, each a dictionary for Mitsuba."""
+
+
+def glass():
+    """Smooth and rough glass under a lamp large enough to be found through them."""
+    import mitsuba as mi
+
+    from data_gen.builtin import _camera, _diffuse, _light, _room, _sphere
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 8, "rr_depth": 3},
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.1, 0], 50),
+        **_room(1.5, _diffuse(0.5, 0.5, 0.5)),
+        "lamp": _light([0, 2.3, 0], [0, -1, 0], (2.6, 2.6), (2, 2, 2)),
+        "smooth": _sphere([-0.6, 0.7, 0], 0.7, {"type": "dielectric"}),
+        "rough": _sphere([0.8, 0.6, 0], 0.6, {"type": "roughdielectric", "alpha": 0.3}),
+        "hole": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([0, 1.6, 0.8]).scale(0.4),
+            "bsdf": {"type": "mask", "opacity": 0.5, "nested": {"type": "twosided", "nested": _diffuse(0.2, 0.6, 0.3)}},
+        },
+    }
+
+
+def fog():
+    """A ball in a scattering medium that fills the view."""
+    from data_gen.builtin import _camera, _diffuse, _light, _sphere
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 8, "rr_depth": 3},
+        "sensor": _camera([0, 0, 4], [0, 0, 0], 40),
+        "ball": _sphere([0, 0, 0], 0.6, _diffuse(0.7, 0.3, 0.2)),
+        "lamp": _light([0, 2.5, 1], [0, -1, 0], (3, 3), (4, 4, 4)),
+        "box": {
+            "type": "cube",
+            "bsdf": {"type": "null"},
+            "interior": {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.4},
+        },
+    }
+
+
+def within_fog():
+    """The same with the camera inside the medium and lamps that hide from it."""
+    scene = fog()
+    medium = {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.2, "id": "air"}
+    scene["integrator"]["hide_emitters"] = True
+    scene["sensor"]["medium"] = {"type": "ref", "id": "air"}
+    scene["box"]["to_world"] = _scale(6)
+    scene["box"]["interior"] = {"type": "ref", "id": "air"}
+    return {"type": "scene", "air": medium, **scene}
+
+
+def hidden_lamp():
+    """The diffuse room with a lamp that the camera does not see."""
+    from data_gen.builtin import diffuse
+
+    scene = diffuse()
+    scene["integrator"]["hide_emitters"] = True
+    return scene
+
+
+def _scale(factor):
+    import mitsuba as mi
+
+    return mi.ScalarTransform4f().scale(factor)

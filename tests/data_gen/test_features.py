@@ -1,0 +1,109 @@
+"""Features where their exact values are known."""
+
+import numpy as np
+import pytest
+
+
+def features_of(mi, size=(33, 33), spp=4, **objects):
+    """Feature layers of a scene seen by a camera at (0, 0, 5) that looks along -z with 30 degrees across."""
+    from data_gen.render import render_stack, set_film_size
+
+    camera = {
+        "type": "perspective",
+        "fov": 30,
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]),
+    }
+    scene = mi.load_dict(
+        {"type": "scene", "sensor": camera, "light": {"type": "constant"}, "integrator": {"type": "path"}, **objects}
+    )
+    set_film_size(scene, size)
+    return render_stack(scene, spp, sampler="primal")
+
+
+def sphere(bsdf, **parameters):
+    return {"type": "sphere", "bsdf": bsdf} | parameters
+
+
+def plane(mi, z, bsdf, scale=10):
+    return {"type": "rectangle", "to_world": mi.ScalarTransform4f().translate([0, 0, z]).scale(scale), "bsdf": bsdf}
+
+
+def diffuse(r, g, b):
+    return {"type": "diffuse", "reflectance": {"type": "rgb", "value": [r, g, b]}}
+
+
+def test_normals_are_in_camera_space(renderer):
+    normal = features_of(renderer, ball=sphere(diffuse(0.5, 0.5, 0.5)))["normal"]
+    assert np.allclose(normal[16, 16], [0, 0, 1], atol=0.05)  # toward the viewer
+    assert normal[16, 25, 0] > 0.5 and normal[16, 7, 0] < -0.5  # right, left
+    assert normal[7, 16, 1] > 0.5 and normal[25, 16, 1] < -0.5  # row 0 is on top
+    assert np.allclose(np.linalg.norm(normal[16, 16]), 1, atol=1e-2)
+
+
+def test_normals_do_not_depend_on_where_the_camera_looks(renderer):
+    mi = renderer
+    turned = mi.ScalarTransform4f().rotate([0, 1, 0], 70).rotate([1, 0, 0], 20)
+    camera = mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0])
+    straight = features_of(mi, ball=sphere(diffuse(0.5, 0.5, 0.5)))["normal"]
+    sensor = {"type": "perspective", "fov": 30, "to_world": turned @ camera}
+    assert np.allclose(
+        features_of(mi, ball=sphere(diffuse(0.5, 0.5, 0.5)), sensor=sensor)["normal"], straight, atol=1e-3
+    )
+
+
+def test_the_back_of_a_surface_faces_the_viewer_too(renderer):
+    away = {"type": "twosided", "bsdf": diffuse(0.2, 0.4, 0.6)}
+    wall = plane(renderer, 0, away)
+    wall["to_world"] = wall["to_world"] @ renderer.ScalarTransform4f().rotate([0, 1, 0], 180)
+    stack = features_of(renderer, wall=wall)
+    assert np.allclose(stack["normal"], [0, 0, 1], atol=1e-5)
+    assert np.allclose(stack["albedo"], [0.2, 0.4, 0.6], atol=1e-5)
+
+
+def test_what_escapes_has_no_features(renderer):
+    stack = features_of(renderer, ball=sphere(diffuse(0.5, 0.5, 0.5), radius=0.2))
+    for name in ("albedo", "normal", "depth"):
+        assert not stack[name][0, 0].any()
+    assert stack["depth"][16, 16, 0] == pytest.approx(4.8, abs=0.02)
+
+
+def test_mirrors_and_glass_show_what_is_behind_them(renderer):
+    mi = renderer
+    green = plane(mi, 8, {"type": "twosided", "bsdf": diffuse(0.1, 0.7, 0.2)})  # behind the camera
+    mirror = plane(mi, 0, {"type": "twosided", "bsdf": {"type": "conductor"}})
+    stack = features_of(mi, wall=green, mirror=mirror)
+    assert np.allclose(stack["albedo"], [0.1, 0.7, 0.2], atol=1e-5)
+    assert stack["depth"][16, 16, 0] == pytest.approx(5 + 8, abs=0.1)
+    pane = plane(mi, 1, {"type": "thindielectric"})
+    wall = plane(mi, -2, diffuse(0.3, 0.3, 0.6))
+    through = features_of(mi, wall=wall, pane=pane, spp=256)
+    assert np.median(through["depth"]) == pytest.approx(7, abs=1.2)
+
+
+def test_holes_of_masks_are_seen_through(renderer):
+    mi = renderer
+    mask = {"type": "mask", "opacity": 0.25, "nested": diffuse(1, 0, 0)}
+    stack = features_of(mi, leaf=plane(mi, 1, mask), wall=plane(mi, 0, diffuse(0, 1, 0)), spp=256)
+    assert np.allclose(stack["albedo"].mean(axis=(0, 1)), [0.25, 0.75, 0], atol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "low", "high"),
+    [
+        ({"type": "roughconductor", "material": "Au", "alpha": 0.1}, [0.85, 0.6, 0.2], [1, 0.9, 0.6]),
+        ({"type": "roughconductor", "material": "none", "alpha": 0.4}, [0.75] * 3, [1.0] * 3),
+        ({"type": "roughdielectric", "alpha": 0.2}, [0.85] * 3, [1.0] * 3),
+        ({"type": "principled", "metallic": 1.0, "roughness": 0.1}, [0.3] * 3, [1.0] * 3),
+        ({"type": "plastic", "diffuse_reflectance": 0.6}, [0.5] * 3, [0.7] * 3),
+    ],
+)
+def test_albedo_is_a_reflectance_for_glossy_materials_too(renderer, bsdf, low, high):
+    albedo = features_of(renderer, wall=plane(renderer, 0, bsdf), spp=64)["albedo"]
+    assert albedo.min() >= 0 and albedo.max() <= 1
+    assert (albedo.mean(axis=(0, 1)) >= low).all() and (albedo.mean(axis=(0, 1)) <= high).all()
+
+
+def test_a_hall_of_mirrors_ends(renderer):
+    room = {"type": "sphere", "radius": 50, "flip_normals": True, "bsdf": {"type": "conductor", "material": "none"}}
+    stack = features_of(renderer, room=room, size=(8, 8))
+    assert not stack["albedo"].any() and not stack["depth"].any()

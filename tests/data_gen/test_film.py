@@ -1,0 +1,78 @@
+"""The film's statistics against NumPy's on all samples at once."""
+
+import numpy as np
+import pytest
+
+
+@pytest.fixture
+def film(renderer):
+    from data_gen.film import GradientFilm
+
+    return GradientFilm
+
+
+def fill(mi, film, samples, **kwargs):
+    """``samples``: (pixels, spp, 3), put as lanes ordered pixel by pixel."""
+    film.put("primal", mi.Color3f(*samples.reshape(-1, 3).T.astype(np.float32)), **kwargs)
+
+
+def test_mean_and_variance_over_passes_of_different_size(renderer, film, rng):
+    samples = (1000 + rng.normal(size=(6, 7, 3))).astype(np.float32)  # mean large beside the deviation
+    whole = film(3, 2)
+    fill(renderer, whole, samples[:, :4])
+    fill(renderer, whole, samples[:, 4:5])
+    fill(renderer, whole, samples[:, 5:])
+    layers = whole.develop()
+    assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-6)
+    expected = samples.astype(np.float64).var(axis=1, ddof=1) / 7
+    assert np.allclose(layers["primal_var"].reshape(6, 3), expected, rtol=1e-3)
+
+
+def test_nonfinite_samples_have_no_weight_and_are_counted(renderer, film, rng):
+    samples = rng.random((4, 5, 3)).astype(np.float32)
+    spoiled = samples.copy()
+    spoiled[0, 2, 1], spoiled[3, 0, 0], spoiled[1] = np.nan, -np.inf, np.inf
+    target = film(2, 2)
+    fill(renderer, target, spoiled)
+    layer = target.develop()["primal"].reshape(4, 3)
+    assert target.discarded == 1 + 1 + 5
+    assert np.allclose(layer[0], np.delete(samples[0], 2, axis=0).mean(axis=0))
+    assert np.allclose(layer[2], samples[2].mean(axis=0))
+    assert np.isnan(layer[1]).all()  # nothing is known about it, which must not look like black
+
+
+def test_a_single_sample_has_no_variance(renderer, film, rng):
+    target = film(2, 2)
+    fill(renderer, target, rng.random((4, 1, 3)))
+    assert set(target.develop()) == {"primal"}
+
+
+def test_gradients_combine_both_directions(renderer, film):
+    mi = renderer
+    target = film(3, 1)
+    fill(mi, target, np.zeros((3, 2, 3)))
+
+    def put(name, *pixels):
+        target.put(name, mi.Color3f(mi.Float(np.repeat(pixels, 2).astype(np.float32))))
+
+    # Differences "neighbour - base", two equal samples a pixel; the outer neighbours do not exist.
+    put("right", 1, 2, 99)
+    put("left", 99, -3, -5)
+    put("down", 99, 99, 99)
+    put("up", 99, 99, 99)
+    layers = target.develop()
+    assert layers["dx"][0, :, 0].tolist() == [(1 + 3) / 2, (2 + 5) / 2, 0]
+    assert not layers["dy"].any()
+
+
+def test_variance_of_a_gradient_is_that_of_its_mean(renderer, film, rng):
+    mi = renderer
+    target = film(4, 4)
+    fill(mi, target, np.zeros((16, 8, 3)))
+    samples = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("right", "left", "down", "up")}
+    for name, values in samples.items():
+        target.put(name, mi.Color3f(mi.Float(values.ravel())))
+    variance = {name: values.var(axis=1, ddof=1).reshape(4, 4) / 8 for name, values in samples.items()}
+    layers = target.develop()
+    assert np.allclose(layers["dx_var"][:, :-1, 0], (variance["right"][:, :-1] + variance["left"][:, 1:]) / 4)
+    assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["down"][:-1] + variance["up"][1:]) / 4)

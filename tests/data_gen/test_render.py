@@ -1,0 +1,169 @@
+"""From scenes to stacks: loading, sizes, variants, and what goes wrong."""
+
+import numpy as np
+import pytest
+
+from ngpt.errors import NgptError
+
+SCENE = """<scene version="3.0.0">
+  <default name="resx" value="40"/> <default name="depth" value="3"/>
+  <integrator type="{integrator}"><integer name="max_depth" value="$depth"/></integrator>
+  <sensor type="perspective">
+    <transform name="to_world"><lookat origin="0,0,4" target="0,0,0" up="0,1,0"/></transform>
+    <film type="hdrfilm"><integer name="width" value="$resx"/><integer name="height" value="30"/>{film}</film>
+  </sensor>
+  <shape type="sphere"><bsdf type="{bsdf}"/></shape>
+  <emitter type="constant"/>
+</scene>"""
+
+
+@pytest.fixture
+def scene_file(renderer, tmp_path):
+    def write(integrator="path", film="", bsdf="diffuse", text=SCENE):
+        path = tmp_path / "scene.xml"
+        path.write_text(text.format(integrator=integrator, film=film, bsdf=bsdf) if text is SCENE else text)
+        return str(path)
+
+    return write
+
+
+def test_scene_file_with_its_own_size_a_given_size_and_parameters(scene_file):
+    from data_gen.render import load_scene, render_stack
+
+    assert render_stack(load_scene(scene_file()), 1)["primal"].shape == (30, 40, 3)
+    assert render_stack(load_scene(scene_file(), parameters={"resx": "20"}), 1)["primal"].shape == (30, 20, 3)
+    assert render_stack(load_scene(scene_file(), (17, 5)), 1)["primal"].shape == (5, 17, 3)
+
+
+def test_crop_window_shows_its_part_of_the_image(scene_file):
+    from data_gen.render import load_scene, render_stack
+
+    names = ("offset_x", "offset_y", "width", "height")
+    crop = "".join(f'<integer name="crop_{n}" value="{v}"/>' for n, v in zip(names, (10, 5, 20, 15), strict=True))
+    whole = render_stack(load_scene(scene_file()), 512)
+    part = render_stack(load_scene(scene_file(film=crop)), 512)
+    assert part["depth"].shape == (15, 20, 1)
+    assert np.abs(part["depth"] - whole["depth"][5:20, 10:30]).mean() < 0.02
+    assert np.abs(part["dx"][:, :-1] - whole["dx"][5:20, 10:29]).mean() < 0.01
+
+
+def test_the_primal_sampler_agrees_with_mitsuba(renderer):
+    from data_gen.render import load_scene, render_stack
+    from ngpt.testing import z_test
+
+    scene = load_scene("environment", (24, 24))
+    ours = np.stack([render_stack(scene, 64, seed, "primal")["primal"] for seed in range(12)])
+    theirs = np.stack([np.array(renderer.render(scene, spp=64, seed=100 + i)) for i in range(12)])
+    result = z_test(ours, theirs)
+    assert result.passed, result
+
+
+def test_attributes_tell_how_it_was_made(renderer):
+    from data_gen.render import load_scene, render_stack
+
+    attributes = render_stack(load_scene("lens", (8, 8)), 3, seed=2**63).attributes
+    assert attributes["ngpt:spp"] == 3 and attributes["ngpt:seed"] == str(2**63)
+    assert attributes["ngpt:sampler"] == "gpt-basic" and attributes["ngpt:normalSpace"] == "camera"
+    assert attributes["ngpt:seconds"] > 0 and attributes["ngpt:discarded"] == 0
+
+
+@pytest.mark.parametrize("variant", ["llvm_ad_mono", "llvm_ad_spectral", "llvm_ad_spectral_polarized"])
+def test_every_kind_of_variant_renders_the_same_image(renderer, variant):
+    from data_gen.backend import use_variant
+
+    def mean(spp):
+        from data_gen.render import load_scene, render_stack
+
+        stack = render_stack(load_scene("lens", (12, 8)), spp)
+        return {name: stack[name].mean(axis=(0, 1)) for name in stack.names}
+
+    expected = mean(256)
+    use_variant(variant)
+    try:
+        found = mean(256)
+    finally:
+        use_variant("llvm_ad_rgb")
+    assert found.keys() == expected.keys()
+    for name in ("primal", "albedo", "direct"):
+        # Mono keeps only the luminance; colours that leave and re-enter RGB by a spectrum change a little.
+        weights = [0.2126, 0.7152, 0.0722]
+        assert np.dot(found[name], weights) == pytest.approx(np.dot(expected[name], weights), rel=0.1), name
+    assert np.allclose(found["normal"], expected["normal"], atol=0.02)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"name": "missing.xml"}, "missing.xml: no such file, nor a built-in scene; those are: diffuse"),
+        ({"name": "diffuse", "parameters": {"a": "1"}}, "built-in scene 'diffuse' has no parameters"),
+    ],
+)
+def test_scenes_that_are_not_there(renderer, arguments, message):
+    from data_gen.render import load_scene
+
+    with pytest.raises(NgptError, match=message):
+        load_scene(**arguments)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"bsdf": "nonsense"}, 'scene.xml: Mitsuba cannot load it: .*"nonsense" not found'),
+        ({"text": "<scene version='3.0.0'><shape"}, "scene.xml: Mitsuba cannot load it"),
+        ({"text": "<scene version='3.0.0'/>"}, "the scene has no sensor"),
+        ({"text": "<bsdf version='3.0.0' type='diffuse'/>"}, "not a whole scene"),
+    ],
+)
+def test_scene_files_that_cannot_be_loaded(scene_file, options, message):
+    from data_gen.render import load_scene
+
+    with pytest.raises(NgptError, match=message) as error:
+        load_scene(scene_file(**options))
+    assert "\n" not in str(error.value)
+
+
+def test_integrators_without_camera_paths(scene_file):
+    from data_gen.render import load_scene, render_stack
+
+    with pytest.raises(NgptError, match=r"does not trace paths from the camera.*'path' or 'volpath'"):
+        render_stack(load_scene(scene_file(integrator="ptracer")), 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"spp": 0}, "0 samples"), ({"spp": 1, "seed": -1}, "seed -1"), ({"spp": 1, "sampler": "x"}, "auto, gpt-basic")],
+)
+def test_bad_options(renderer, options, message):
+    from data_gen.render import load_scene, render_stack
+
+    with pytest.raises(NgptError, match=message):
+        render_stack(load_scene("diffuse", (4, 4)), **options)
+
+
+def test_variants_that_do_not_exist(renderer):
+    from data_gen.backend import use_variant
+
+    for name in ("scalar_rgb", "llvm_rgb"):
+        with pytest.raises(NgptError, match=f"'{name}' is not one .*llvm_ad_rgb"):
+            use_variant(name)
+
+
+def test_inspection_names_what_matters(scene_file):
+    from data_gen.inspect import inspect_scene
+
+    report = inspect_scene(scene_file(bsdf="dielectric"), {"resx": "50"})
+    assert report["size"] == (50, 30)
+    assert report["plugins"]["bsdf"] == {"dielectric": 1} and report["plugins"]["emitter"] == {"constant": 1}
+    assert any("clear glass" in line for line in report["plan"])
+    assert "thinlens" in inspect_scene("lens")["plugins"]["sensor"]
+    with pytest.raises(NgptError, match="not a scene Mitsuba can read"):
+        inspect_scene(scene_file(text="<scene"))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (2, 2)])
+def test_tiny_images(renderer, size):
+    from data_gen.render import load_scene, render_stack
+
+    stack = render_stack(load_scene("diffuse", size), 2)
+    assert stack["dx"].shape == (size[1], size[0], 3)
+    assert not stack["dx"][:, -1].any() and not stack["dy"][-1].any()

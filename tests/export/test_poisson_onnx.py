@@ -1,0 +1,52 @@
+"""The ONNX graph of l2 against ngpt's own solver, in ONNX Runtime."""
+
+import numpy as np
+import pytest
+
+from ngpt.poisson import l2
+
+pytest.importorskip("onnx")
+ort = pytest.importorskip("onnxruntime")
+
+
+@pytest.fixture(scope="module")
+def session():
+    from export.poisson import l2_model
+
+    return lambda alpha: ort.InferenceSession(l2_model(alpha).SerializeToString(), providers=["CPUExecutionProvider"])
+
+
+def run(session, *layers):
+    inputs = dict(zip(("primal", "dx", "dy"), (layer.transpose(2, 0, 1)[None] for layer in layers), strict=True))
+    return session.run(["image"], {name: np.ascontiguousarray(a, np.float32) for name, a in inputs.items()})[0][0]
+
+
+@pytest.mark.parametrize("alpha", [0.02, 0.2, 3.0])
+def test_one_file_for_every_size(session, rng, alpha):
+    solver = session(alpha)
+    for shape in [(16, 16), (37, 53), (1, 8), (7, 1), (1, 1), (270, 480)]:
+        layers = rng.random((3, *shape, 3)).astype(np.float32)
+        layers[1:, :, -1], layers[1:, -1] = 9.0, 9.0  # unused by contract
+        image = run(solver, *layers).transpose(1, 2, 0)
+        assert np.abs(image - l2(*layers, alpha)).max() < 1e-4, shape
+
+
+def test_metadata_and_plain_operators(session):
+    from export.poisson import l2_model
+
+    metadata = session(0.2).get_modelmeta().custom_metadata_map
+    assert metadata["ngpt.method"] == "l2" and float(metadata["ngpt.alpha"]) == 0.2
+    model = l2_model(0.2)
+    assert not model.functions and {node.domain for node in model.graph.node} == {""}
+
+
+def test_command(tmp_path, capfd):
+    from export.__main__ import main
+
+    target = tmp_path / "l2.onnx"
+    assert main(["-o", str(target)]) == 0
+    assert ort.InferenceSession(target, providers=["CPUExecutionProvider"]).get_inputs()[0].name == "primal"
+    assert main(["-o", str(target)]) == 2
+    assert main(["-o", str(tmp_path / "b.onnx"), "--alpha", "-1"]) == 2
+    assert "alpha -1.0: must be a positive number" in capfd.readouterr().err
+    assert [path.name for path in tmp_path.iterdir()] == ["l2.onnx"]

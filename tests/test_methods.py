@@ -1,0 +1,79 @@
+"""The registry, and what happens to pixels that are not finite."""
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.gradients import forward_differences
+from ngpt.methods import METHODS, reconstruct
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+
+def test_auto_takes_what_the_stack_allows(noisy_stack):
+    stack, _ = noisy_stack
+    assert reconstruct(stack).method != "primal"
+    assert reconstruct(GradientStack.from_arrays(primal=stack["primal"])).method == "primal"
+
+
+@pytest.mark.parametrize("method", METHODS)
+def test_every_method_gives_a_float32_image(noisy_stack, method):
+    stack, _ = noisy_stack
+    variances = {f"{name}_var": np.full_like(stack[name], 0.01) for name in ("primal", "dx", "dy")}
+    image = ngpt.denoise(stack.replace(**variances), method)
+    assert image.shape == stack["primal"].shape and image.dtype == np.float32 and np.isfinite(image).all()
+
+
+def test_direct_emission_is_added_back(noisy_stack):
+    stack, _ = noisy_stack
+    direct = np.zeros_like(stack["primal"])
+    direct[:4, :5] = 50  # an edge that is in primal but, by contract, not in dx and dy
+    with_lamp = stack.replace(primal=stack["primal"] + direct, direct=direct)
+    assert np.abs(ngpt.denoise(with_lamp, "l2") - ngpt.denoise(stack, "l2") - direct).max() < 1e-4
+
+
+@pytest.mark.parametrize("method", ["l2", "l1"])
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_nonfinite_pixels_are_repaired_and_counted(noisy_stack, method, bad):
+    stack, clean = noisy_stack
+    primal, dx, dy = (stack[name].copy() for name in ("primal", "dx", "dy"))
+    primal[3, 4, 1] = bad
+    primal[12:15, 18:22] = bad  # a hole whose inside has no good neighbour
+    dx[9, 2], dy[10, 6, 0] = bad, bad
+    dx[:, -1], dy[-1] = bad, bad  # no gradients there: must not be counted
+    result = reconstruct(GradientStack.from_arrays(primal=primal, dx=dx, dy=dy), method)
+    assert result.repaired == 1 + 12
+    # Around the lone pixel 2 + 2 differences, around the hole 3 * 5 + 4 * 4, and the two by themselves.
+    assert result.untrusted == 4 + 15 + 16 + 2
+    assert np.abs(result.image - clean).max() < 0.6
+
+
+def test_repair_uses_neighbours(rng):
+    primal = np.ones((5, 5, 3))
+    primal[2, 2] = np.nan
+    primal[1:4, 1:4][~np.isnan(primal[1:4, 1:4])] = 7.0
+    assert np.allclose(repair(GradientStack.from_arrays(primal=primal)).image[2, 2], 7.0)
+
+
+def test_converged_input_is_returned_unharmed(rng):
+    image = rng.random((20, 30, 3)).astype(np.float32)
+    dx, dy = forward_differences(image)
+    for method in ("l2", "l1"):
+        assert np.abs(ngpt.denoise(GradientStack.from_arrays(primal=image, dx=dx, dy=dy), method) - image).max() < 1e-5
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda s: reconstruct(s, "l3"), "unknown method 'l3'; choose one of: auto, primal"),
+        (lambda s: reconstruct(s, "primal", alpha=1), "method 'primal' has no option 'alpha'"),
+        (lambda s: reconstruct(GradientStack.from_arrays(primal=s["primal"]), "l1"), "method 'l1' needs layers 'dx'"),
+        (lambda s: reconstruct(s.replace(primal=s["primal"] * np.nan)), "no finite pixel among 408"),
+        (lambda s: reconstruct(s.replace(primal=s["primal"] * 3e37, dx=s["dx"] * 1e38), "l2"), "non-finite pixels"),
+    ],
+)
+def test_errors_name_the_problem(noisy_stack, call, message):
+    with pytest.raises(NgptError) as error:
+        call(noisy_stack[0])
+    assert message in str(error.value) and "\n" not in str(error.value)
