@@ -51,7 +51,4 @@ def _spans(length: int, tile: int, margin: int) -> list[tuple[slice, slice]]:
     """Intervals of at most ``tile`` that cover 0 .. length, and the same with a margin on both sides."""
     count = math.ceil(length / tile)
     edges = [length * i // count for i in range(count + 1)]
-    return [
-        (slice(a, b), slice(max(a - margin, 0), min(b + margin, length)))
-        for a, b in pairwise(edges)
-    ]
+    return [(slice(a, b), slice(max(a - margin, 0), min(b + margin, length))) for a, b in pairwise(edges)]

@@ -79,6 +79,22 @@ def test_l1_is_within_half_a_percent_of_reweighted_least_squares(alpha, seed):
     assert energy(data[0] + scale * np.moveaxis(u, 0, -1), *data, alpha) == pytest.approx(min(energies) * scale)
 
 
+@pytest.mark.parametrize("size", [10.0, 1e3, 1e5])
+def test_outliers_do_not_hold_l1_up(size):
+    """Gradients of which one in a hundred is off by up to 100 000 times the image."""
+    _, primal, dx, dy, _ = noisy_stack(40, 48)
+    random = np.random.default_rng(5)
+    for layer in (dx, dy):
+        hit = random.random(layer.shape[:2]) < 0.01
+        layer[hit] += size * random.standard_normal((np.count_nonzero(hit), 1))
+    data = [a.astype(np.float64) for a in (primal, dx, dy)]
+    r, scale = Equations(*data).scaled_residual()
+    u, energies = least_norms(r, 0.2, None, 1.5e-3, 300)
+    assert len(energies) < 80
+    reached = energy(primal + scale * np.moveaxis(u, 0, -1), *data, 0.2)
+    assert reached < 1.005 * energy(l1_by_irls(*data, 0.2, steps=100), *data, 0.2)
+
+
 def test_l1_never_ends_above_the_energy_of_l2():
     for seed in range(5):
         _, *data, _ = noisy_stack(24, 24, seed)
