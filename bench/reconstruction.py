@@ -72,16 +72,22 @@ def conjugate_gradients(u, r, weights, alpha, steps, goal=0.0):
         if size <= goal**2:
             return u, step
         image, energy = apply(direction)
-        length = size / energy
-
-        def advance(i, j, image=image, length=length):
-            new = residual[:, i:j] - length * image[:, i:j]
-            return u[:, i:j] + length * direction[:, i:j], new, sum_of(new * new)
-
-        u, residual, sizes = by_rows(advance, u, residual)
-        ratio, size = total_of(sizes) / size, total_of(sizes)
-        direction, _ = by_rows(lambda i, j, ratio=ratio: (residual[:, i:j] + ratio * direction[:, i:j],), direction)
+        u, _ = plus(u, size / energy, direction, u)
+        residual, new_size = plus(residual, -size / energy, image, residual)
+        direction, _ = plus(residual, new_size / size, direction, direction)
+        size = new_size
     return u, steps
+
+
+def plus(a, factor, b, out):
+    """a + factor b, and its square."""
+
+    def band(i, j):
+        result = a[:, i:j] + factor * b[:, i:j]
+        return result, sum_of(result * result)
+
+    result, squares = by_rows(band, out)
+    return result, total_of(squares)
 
 
 def norms(u, r, alpha):

@@ -19,9 +19,9 @@ import scipy.fft
 # Array is a NumPy array or a torch tensor: (..., H, W), float32 or float64.
 Array = Any
 
-# Values in one band of rows and one channel. The dozen or so temporaries of a stencil then stay in a core's own cache,
-# which makes plain NumPy expressions several times faster than over whole images.
-BAND = 1 << 15
+# Values that one band of rows has in all results. The dozen or so temporaries of a stencil then stay in a core's own
+# cache, which makes plain NumPy expressions several times faster than over whole images.
+BAND = 3 << 17
 
 
 def module(array: Array) -> ModuleType:
@@ -68,15 +68,15 @@ def empty(array: Array, *lead: int, channels_last: bool = False) -> Array:
     return planes(new) if channels_last else new
 
 
-def map_rows(function: Callable[[int, int], Any], planes: Array) -> list:
-    """What ``function(first, last)`` returns for bands of rows first .. last - 1 of (..., H, W) planes, top to bottom.
+def map_rows(function: Callable[[int, int], Any], *like: Array) -> list:
+    """What ``function(first, last)`` returns for bands of rows first .. last - 1 of (..., H, W) arrays, top to bottom.
 
     NumPy: many bands, on all cores. torch: one.
     """
-    height, width = planes.shape[-2:]
-    if not isinstance(planes, np.ndarray):
+    height = like[0].shape[-2]
+    if not isinstance(like[0], np.ndarray):
         return [function(0, height)]
-    rows = max(1, BAND // width)
+    rows = max(1, BAND * height // sum(array.size for array in like))
 
     def band(first: int) -> Any:
         # Errors are silenced per thread; reconstruct() checks what comes out.
@@ -104,7 +104,7 @@ def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
             array[..., first:last, :] = part
         return values[len(out) :]
 
-    return (*out, map_rows(band, out[0]))
+    return (*out, map_rows(band, *out))
 
 
 @cache

@@ -8,7 +8,7 @@ import math
 
 import numpy as np
 
-from ngpt.arrays import Array, by_rows, cast, dct2, detach, empty, idct2, image, like, map_rows, module, planes
+from ngpt.arrays import Array, by_rows, cast, dct2, detach, empty, idct2, image, like, module, planes
 from ngpt.errors import NgptError
 from ngpt.gradients import adjoint, adjoint_by_rows, differences
 
@@ -18,7 +18,7 @@ FLOAT32_RANGE = 2.0**16
 
 
 class Equations:
-    """The right-hand sides, checked, as planes (C, H, W), and in double precision where their range asks for it.
+    """The right-hand sides as planes (C, H, W), in double precision where their range asks for it.
 
     ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, NumPy or torch, finite
     ``trusted``  for dx and dy, (H, W) booleans: a difference marked False has no equation; None trusts all
@@ -30,14 +30,10 @@ class Equations:
             raise NgptError(f"primal, dx and dy have shapes {shapes}; they must all be of one shape (H, W, C)")
         self.dtype = primal.dtype
         self.xp = module(primal)
-        peak = _peak(primal, dx, dy)
-        if not math.isfinite(peak):
-            raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
-        sample = abs(detach(primal[::4, ::4]))
-        typical = float((sample**0.5).sum() / max(int((sample > 0).sum()), 1)) ** 2
-        self.work = self.xp.float64 if peak > FLOAT32_RANGE * typical else self.dtype
-        self.primal, self.dx, self.dy = (cast(planes(a), self.work) for a in (primal, dx, dy))
         self.trusted = trusted
+        self.primal, self.dx, self.dy = map(planes, (primal, dx, dy))
+        sample = abs(detach(primal[::4, ::4]))
+        self.typical = float((sample**0.5).sum() / max(int((sample > 0).sum()), 1)) ** 2
 
     def residual(self, first: int, last: int) -> tuple[Array, Array]:
         """r = G - ∇P of rows first .. last - 1, (C, rows, W) for dx and dy, 0 where there is no equation."""
@@ -50,42 +46,57 @@ class Equations:
             x, y = (self.xp.where(t[first:last], v, 0) for t, v in zip(self.trusted, (x, y), strict=True))
         return x, y
 
-    def scaled_residual(self) -> tuple[Array, float]:
-        """(r / scale, scale), r as (2, C, H, W); scale is a power of two (exact) of about the mean of |r|, or 0."""
-        stack = self.xp.stack
+    def divergence(self) -> Array:
+        """∇ᵀ r as (C, H, W), the right-hand side of least squares with equal weights."""
 
         def rows(first, last):
-            r = stack(self.residual(first, last))
-            return r, sum_of(abs(detach(r)))
+            x, y = self.residual(first, last)
+            return None, x, y, _peak(x, y)
 
-        r, sums = by_rows(rows, empty(self.primal, 2, self.primal.shape[0]))
-        mean = total_of(sums) / math.prod(r.shape)
+        b, peaks = adjoint_by_rows(rows, empty(self.primal, len(self.primal), channels_last=True))
+        return b if self._holds(peaks) else self.divergence()
+
+    def scaled_residual(self) -> tuple[Array, float]:
+        """(r / scale, scale), r as (2, C, H, W); scale is a power of two (exact) of about the mean of |r|, or 0."""
+
+        def rows(first, last):
+            r = self.xp.stack(self.residual(first, last))
+            return r, _peak(r), sum_of(abs(detach(r)))
+
+        r, bands = by_rows(rows, empty(self.primal, 2, len(self.primal)))
+        if not self._holds([peak for peak, _ in bands]):
+            return self.scaled_residual()
+        mean = sum(total for _, total in bands) / math.prod(r.shape)
         scale = 2.0 ** round(math.log2(mean)) if mean > 0 else 0.0
         if scale > 0:
             r, _ = by_rows(lambda first, last: (r[..., first:last, :] * (1 / scale),), r)
         return r, scale
 
-    def image(self, u: Array, scale: float = 1.0) -> Array:
-        """P + scale · u as (H, W, C) in the precision of the input."""
-        xp, out = self.xp, empty(u, len(u), channels_last=True)
+    def _holds(self, peaks: list) -> bool:
+        """Whether the precision does for these largest values of r in each band; turns to double precision if not."""
+        peak = float(np.max(peaks))
+        if not math.isfinite(peak):
+            raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
+        if peak <= FLOAT32_RANGE * self.typical or self.primal.dtype == self.xp.float64:
+            return True
+        self.primal, self.dx, self.dy = (cast(a, self.xp.float64) for a in (self.primal, self.dx, self.dy))
+        return False
+
+    def image(self, u: Array, scale: float = 1.0, out: Array | None = None) -> Array:
+        """P + scale · u as (H, W, C) in the precision of the input; ``out`` (C, H, W) is memory that may be reused."""
+        out = empty(u, len(u), channels_last=True) if out is None else out
 
         def rows(first, last):
-            # Channel by channel: NumPy is slow at sums of arrays whose axes lie in different order in memory.
-            pairs = zip(self.primal[:, first:last], u[:, first:last], strict=True)
-            return (planes(xp.stack([p + (v if scale == 1 else scale * v) for p, v in pairs], -1)),)
+            part = u[:, first:last] if scale == 1 else scale * u[:, first:last]
+            return (self.primal[:, first:last] + part,)
 
         return cast(image(by_rows(rows, out)[0]), self.dtype)
 
 
 def _peak(*arrays: Array) -> float:
-    """The largest absolute value of (H, W, C) arrays, which is not finite if one is not."""
-
-    def extremes(first, last):
-        rows = [detach(a[first:last]) for a in arrays]
-        return [abs(float(value)) for r in rows for value in (r.min(), r.max())]
-
-    values = np.array(map_rows(extremes, planes(arrays[0])))
-    return float(values.max())
+    """The largest absolute value, which is not finite if one is not; 0 without any."""
+    extremes = [abs(float(v)) for a in map(detach, arrays) if math.prod(a.shape) for v in (a.min(), a.max())]
+    return float(np.max(extremes, initial=0))
 
 
 def solve(b: Array, screen: float, mean: Array | float | None = None) -> Array:
@@ -96,9 +107,11 @@ def solve(b: Array, screen: float, mean: Array | float | None = None) -> Array:
     """
     height, width = b.shape[-2:]
     λy, λx = (like(4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2, b) for n in (height, width))
-    λx = λx + screen
+    # With all channels and in their layout: NumPy is slow where the axes of arrays lie in different order in memory.
+    screened = module(b).zeros_like(b[:, :1]) + screen
+    screened += λx
     coefficients = dct2(b)
-    coefficients, _ = by_rows(lambda i, j: (coefficients[:, i:j] / (λy[i:j, None] + λx),), coefficients)
+    coefficients, _ = by_rows(lambda i, j: (coefficients[:, i:j] / (λy[i:j, None] + screened),), coefficients)
     if mean is not None:
         coefficients[:, 0, 0] = mean * math.sqrt(height * width)
     return idct2(coefficients)

@@ -31,9 +31,8 @@ def wl2(
     ``ngpt.poisson.l2``. Linear in (primal, dx, dy) for given variances.
     """
     equations = Equations(primal, dx, dy, trusted)
-    primal_var, difference_var = (
-        cast(v, equations.work) for v in smooth_variances(primal_var, dx_var, dy_var, trusted)
-    )
     r, scale = equations.scaled_residual()
-    u, _ = solve_weighted(r, 1 / primal_var, 1 / difference_var, TOLERANCE)
+    variances = smooth_variances(primal_var, dx_var, dy_var, trusted)
+    screen, weights = (1 / cast(variance, r.dtype) for variance in variances)
+    u, _ = solve_weighted(r, screen, weights, TOLERANCE)
     return equations.image(u, scale)
