@@ -113,29 +113,28 @@ def irls(r, alpha, scale, outer=20, inner=50):
 
 
 def bench(width: int, height: int, repeats: int) -> dict:
-    data, variances = synthetic(width, height)
+    (primal, dx, dy), (vp, vx, vy) = synthetic(width, height)
     alpha = DEFAULT_ALPHA
-    planes = np.ascontiguousarray(np.moveaxis(data[0], -1, 0))
-    r, scale = Equations(*data).scaled_residual()
+    planes = np.ascontiguousarray(np.moveaxis(primal, -1, 0))
+    r, scale = Equations(primal, dx, dy).scaled_residual()
 
     def normal_residual(u):
         b, _ = adjoint_by_rows(lambda i, j: (None, *r[..., i:j, :]), empty(r, 3))
-        dx, dy = differences(u, 0, height)
-        flux, _ = adjoint_by_rows(lambda i, j: (alpha**2 * u[:, i:j], dx[:, i:j], dy[:, i:j]), empty(r, 3))
+        flux, _ = adjoint_by_rows(lambda i, j: (alpha**2 * u[:, i:j], *differences(u, i, j)), empty(r, 3))
         return float(np.linalg.norm(b - flux)), float(np.linalg.norm(b))
 
-    solution = np.moveaxis((l2(*data, alpha).astype(np.float64) - data[0]) / scale, -1, 0)
+    solution = np.moveaxis((l2(primal, dx, dy, alpha).astype(np.float64) - primal) / scale, -1, 0)
     goal, start = normal_residual(np.ascontiguousarray(solution, np.float32))
     _, cg_steps = conjugate_gradients(np.zeros_like(r[0]), r, None, alpha, 1000, goal)
     seconds = measure(
         {
             "dct pair": lambda: dct_pair(planes),
-            "l2": lambda: l2(*data, alpha),
+            "l2": lambda: l2(primal, dx, dy, alpha),
             "cg": lambda: conjugate_gradients(np.zeros_like(r[0]), r, None, alpha, cg_steps),
-            "l1": lambda: l1(*data, alpha),
-            "cv": lambda: cv(*data),
-            "wcv": lambda: wcv(*data, *variances),
-            "wl2": lambda: wl2(*data, *variances),
+            "l1": lambda: l1(primal, dx, dy, alpha),
+            "cv": lambda: cv(primal, dx, dy),
+            "wcv": lambda: wcv(primal, dx, dy, vp, vx, vy),
+            "wl2": lambda: wl2(primal, dx, dy, vp, vx, vy),
         },
         repeats,
     )
@@ -144,7 +143,7 @@ def bench(width: int, height: int, repeats: int) -> dict:
     seconds["irls"] = {"median": time.perf_counter() - begin, "runs": 1}
     u, energies = least_norms(r, alpha, None, 1e-5, 400)
     lowest = norms(u, r, alpha).sum(dtype=np.float64)
-    ours = np.moveaxis((l1(*data, alpha) - data[0]) / np.float32(scale), -1, 0)
+    ours = np.moveaxis((l1(primal, dx, dy, alpha) - primal) / np.float32(scale), -1, 0)
     pair, ours_l1 = seconds["dct pair"]["median"], seconds["l1"]["median"]
     return {
         "seconds": seconds,
@@ -172,7 +171,8 @@ def main() -> None:
     args = parser.parse_args()
     result = metadata()
     for size in args.sizes:
-        result[size] = bench(*map(int, size.split("x")), args.repeats)
+        width, height = map(int, size.split("x"))
+        result[size] = bench(width, height, args.repeats)
         print(size)
         for name, times in result[size]["seconds"].items():
             print(f"  {name:10s}{1e3 * times['median']:10.1f} ms")

@@ -34,7 +34,7 @@ def cast(array: Array, dtype: Any) -> Array:
     return array.astype(dtype, copy=False) if isinstance(array, np.ndarray) else array.to(dtype)
 
 
-def detach(array: Array | float) -> Array | float:
+def detach(array: Array) -> Array:
     """The same values, as a constant for automatic differentiation."""
     return array.detach() if hasattr(array, "detach") else array
 

@@ -157,7 +157,8 @@ class _Weighted:
         if isinstance(screen, float):
             self.screen = module(weights).full_like(weights[0], screen)
             self.scaling = module(weights).ones_like(weights[0])
-            self.σ, self.mean = screen, 0.0
+            self.σ = screen
+            self.mean: float | None = 0.0
             return
         self.screen = screen
         mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights))).clip(1, None)

@@ -68,18 +68,22 @@ def _cv(data: Repaired) -> np.ndarray:
 
 
 def _wcv(data: Repaired) -> np.ndarray:
-    return controlvariates.wcv(data.image, data.dx, data.dy, *data.variances, data.trusted)
+    assert data.variances  # reconstruct() has required the layers
+    return controlvariates.wcv(data.image, data.dx, data.dy, *data.variances, trusted=data.trusted)
 
 
 def _wl2(data: Repaired) -> np.ndarray:
-    return weighted.wl2(data.image, data.dx, data.dy, *data.variances, data.trusted)
+    assert data.variances  # reconstruct() has required the layers
+    return weighted.wl2(data.image, data.dx, data.dy, *data.variances, trusted=data.trusted)
 
 
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
-    if alpha != "auto":
-        return alpha
-    return auto_alpha(*data.variances, norm=norm) if data.variances else poisson.DEFAULT_ALPHA
+    if alpha == "auto":
+        return auto_alpha(*data.variances, norm=norm) if data.variances else poisson.DEFAULT_ALPHA
+    if isinstance(alpha, str):
+        raise NgptError(f"alpha '{alpha}': must be a number or 'auto'")
+    return alpha
 
 
 _GRADIENTS = ("primal", "dx", "dy")

@@ -61,10 +61,13 @@ def repair(stack: GradientStack) -> Repaired:
     lost = int(sum(np.sum(~t) for t in trusted))
     flags = (trusted[0], trusted[1]) if lost else None
     variances = _variances(stack, good & ~direct.any(axis=-1), trusted)
-    return Repaired(image, direct, *gradients, flags, variances, int(np.sum(~good)), lost)
+    dx, dy = gradients
+    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost)
 
 
-def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]):
+def _variances(
+    stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
     """Variances of primal - direct, dx and dy, NaN where they are not those of what is reconstructed.
 
     Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
@@ -73,7 +76,8 @@ def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray
     if not all(name in stack for name in names):
         return None
     pairs = zip(names, (known, *trusted), strict=True)
-    return tuple(np.where(flags[..., None], stack[name], np.float32(np.nan)) for name, flags in pairs)
+    primal, dx, dy = (np.where(flags[..., None], stack[name], np.float32(np.nan)) for name, flags in pairs)
+    return primal, dx, dy
 
 
 def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -> np.ndarray:

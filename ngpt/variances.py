@@ -60,11 +60,19 @@ def smooth_variances(
     layers = [_smoothed(*_over_colours(layer)) for layer in (primal_var, dx_var[:, :-1], dy_var[:-1])]
     mean = robust_mean(xp.concatenate([layer.reshape(-1) for layer in layers]))
     p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
-    differences = xp.full_like(xp.stack([p, p]), math.inf)
+    differences = xp.stack([p, p])
     differences[0, :, :-1], differences[1, :-1] = x, y
+    return cast(p, primal_var.dtype)[None], cast(without_missing(differences, trusted), primal_var.dtype)
+
+
+def without_missing(variances: Array, trusted: tuple[Array, Array] | None) -> Array:
+    """Variances (2, H, W) of differences as (2, 1, H, W), infinite where there is none or it is not ``trusted``."""
+    xp = module(variances)
+    variances[0, :, -1] = math.inf
+    variances[1, -1] = math.inf
     if trusted is not None:
-        differences = xp.where(xp.stack(trusted), differences, math.inf)
-    return cast(p, primal_var.dtype)[None], cast(differences, primal_var.dtype)[:, None]
+        variances = xp.where(xp.stack(trusted), variances, math.inf)
+    return variances[:, None]
 
 
 def _positive_values(variance: Array) -> np.ndarray:
