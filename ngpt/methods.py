@@ -91,7 +91,7 @@ _VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 METHODS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
-    # The derived alpha lowers the error of l2 by half, and is as good as the fixed one for l1 (docs/LOG.md).
+    # The derived alpha lowers the error of l2 by half, and is no better than the fixed one for l1.
     "l2": Method("screened Poisson, least squares: unbiased, fast", _GRADIENTS, _l2, {"alpha": "auto"}),
     "l1": Method(
         "screened Poisson, least norms: robust to outliers", _GRADIENTS, _l1, {"alpha": poisson.DEFAULT_ALPHA}
@@ -106,8 +106,8 @@ def choose(stack: GradientStack) -> str:
     """The method that ``auto`` stands for: the best of those the stack has the layers for.
 
     Geometric mean of the trimmed relMSE over the four built-in scenes at 4, 16 and 64 spp, in thousandths: primal 53,
-    l2 4.6 (5.3 at alpha 0.2), cv 5.2, l1 3.8, wl2 3.0, wcv 2.9. The same over these and six real scenes: primal 60,
-    l2 12 (23), cv 22, l1 6.9, wl2 6.2, wcv 6.1.
+    l2 4.7 (5.3 at alpha 0.2), cv 5.2, l1 3.8, wl2 3.0, wcv 2.9. The same over these and six real scenes: primal 60,
+    l2 10 (23), cv 22, l1 6.9, wl2 6.0, wcv 5.9.
     """
     return next(
         name for name in ("wcv", "l1", "primal") if name == "primal" or all(n in stack for n in METHODS[name].needs)

@@ -90,7 +90,7 @@ def test_outliers_do_not_hold_l1_up(size):
     data = [a.astype(np.float64) for a in (primal, dx, dy)]
     r, scale = Equations(*data).scaled_residual()
     u, energies = least_norms(r, 0.2, None, 7e-4, 300)
-    assert len(energies) < 60
+    assert len(energies) < 40  # after as many as the strides take to get short
     reached = energy(primal + scale * np.moveaxis(u, 0, -1), *data, 0.2)
     assert reached < 1.005 * energy(l1_by_irls(*data, 0.2, steps=100), *data, 0.2)
 

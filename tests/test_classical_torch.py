@@ -88,9 +88,9 @@ def test_the_derivative_of_cv_and_wcv():
 
 def test_the_derivative_of_weighted_least_squares_also_by_its_weights():
     random = np.random.default_rng(0)
-    r = random.standard_normal((2, 2, 4, 5))
+    r = random.standard_normal((2, 2, 3, 3))
     r[0, ..., -1] = r[1, ..., -1, :] = 0
-    weights, screen = random.uniform(0.5, 2, (2, 1, 4, 5)), random.uniform(0.1, 1, (1, 4, 5))
+    weights, screen = random.uniform(0.5, 2, (2, 1, 3, 3)), random.uniform(0.1, 1, (1, 3, 3))
     arguments = [torch.from_numpy(a).requires_grad_() for a in (r, screen, weights)]
 
     def solution(r, screen, weights):
