@@ -1,6 +1,7 @@
 """Non-finite pixels: repaired from their neighbours, and their gradients trusted no more."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
@@ -17,15 +18,17 @@ class Repaired:
     ``direct``   (H, W, 3) direct emission, finite, to be added back
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
     ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
+    ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     """
 
     image: np.ndarray
     direct: np.ndarray
-    dx: np.ndarray | None
-    dy: np.ndarray | None
+    dx: Any
+    dy: Any
     trusted: tuple[np.ndarray, np.ndarray] | None
+    variances: Any
     pixels: int
     gradients: int
 
@@ -44,7 +47,7 @@ def repair(stack: GradientStack) -> Repaired:
     image = primal - direct if good.all() else _from_neighbours(primal, direct, good)
     direct = np.where(good[..., None], direct, 0)
     if "dx" not in stack or "dy" not in stack:
-        return Repaired(image, direct, None, None, None, int(np.sum(~good)), 0)
+        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0)
     gradients, trusted = [], []
     for name, axis in (("dx", 1), ("dy", 0)):
         both = good.copy()
@@ -57,7 +60,22 @@ def repair(stack: GradientStack) -> Repaired:
         gradients[-1][border] = 0
         trusted.append(both)
     lost = int(sum(np.sum(~t) for t in trusted))
-    return Repaired(image, direct, *gradients, tuple(trusted) if lost else None, int(np.sum(~good)), lost)
+    flags = (trusted[0], trusted[1]) if lost else None
+    variances = _variances(stack, good & ~direct.any(axis=-1), trusted)
+    dx, dy = gradients
+    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost)
+
+
+def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]) -> tuple | None:
+    """Variances of primal - direct, dx and dy, NaN where they are not those of what is reconstructed.
+
+    Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
+    """
+    names = ("primal_var", "dx_var", "dy_var")
+    if not all(name in stack for name in names):
+        return None
+    pairs = zip(names, (known, *trusted), strict=True)
+    return tuple(np.where(flags[..., None], stack[name], np.float32(np.nan)) for name, flags in pairs)
 
 
 def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -> np.ndarray:
