@@ -49,13 +49,15 @@ def main() -> None:
             if all(layer in stack for layer in entry.needs):
                 result = reconstruct(stack, method)
                 images[name, spp, method] = result.image
-                cells[name, spp, method] = compare(result.image, references[name]["primal"])
+                reference = references[name]["primal"]
+                energy = float(result.image.mean(dtype=np.float64) / reference.mean(dtype=np.float64))
+                cells[name, spp, method] = compare(result.image, reference) | {"energy": energy}
         print(name, spp, {m: round(cells[name, spp, m][METRIC], 5) for m in METHODS if (name, spp, m) in cells})
     noise = {name: reference_noise(reference) for name, reference in references.items()}
     rows = [{"scene": n, "spp": s, "method": m, "metrics": c} for (n, s, m), c in cells.items()]
     setup = {"size": args.size, "reference spp": args.reference_spp, "reference noise": noise}
     save(args.output, {"benchmark": "methods", **setup, "rows": rows, "metadata": metadata("mitsuba")})
-    write_text(args.docs / "classical-table.md", table(cells, noise))
+    write_text(args.docs / "classical-table.md", table(cells, noise) + "\n" + energy_table(cells))
     for method in METHODS:
         if method != "primal":
             write_picture(args.docs / "images" / f"{method}-fails.png", method, cells, images, references)
@@ -99,6 +101,17 @@ def table(cells: dict, noise: dict) -> str:
         means = [np.exp(np.mean([np.log(cells[name, spp, m][METRIC]) for name in noise])) for m in methods]
         texts = [f"**{v:.4f}**" if v == min(means) else f"{v:.4f}" for v in means]
         lines.append(f"| *geometric mean* | {spp} | " + " | ".join(texts) + " | |")
+    return "\n".join(lines) + "\n"
+
+
+def energy_table(cells: dict) -> str:
+    """Markdown: how much of the reference's energy a method keeps, median and lowest of the scenes."""
+    methods = [method for method in METHODS if any(key[2] == method for key in cells)]
+    lines = ["| energy kept, median (lowest) | " + " | ".join(f"`{m}`" for m in methods) + " |"]
+    lines.append("|---|" + "--:|" * len(methods))
+    for spp in sorted({spp for _, spp, _ in cells}):
+        kept = [[c["energy"] for (_, s, m), c in cells.items() if (s, m) == (spp, method)] for method in methods]
+        lines.append(f"| {spp} spp | " + " | ".join(f"{np.median(k):.3f} ({min(k):.3f})" for k in kept) + " |")
     return "\n".join(lines) + "\n"
 
 

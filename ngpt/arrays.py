@@ -35,7 +35,7 @@ def cast(array: Array, dtype: Any) -> Array:
 
 
 def detach(array: Array) -> Array:
-    """The same values, as a constant for automatic differentiation."""
+    """The same values (of an array, or a number), as a constant for automatic differentiation."""
     return array.detach() if hasattr(array, "detach") else array
 
 

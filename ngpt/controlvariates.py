@@ -69,7 +69,7 @@ def _sweep(equations: Equations, primal_var: Array, difference_var: Array, facto
     pixel's value e is weighted by a: u += Σ a e / (1 + Σ a).
     """
     r, scale = equations.scaled_residual()
-    v, vx, vy = primal_var, difference_var[0], difference_var[1]
+    v, (vx, vy) = primal_var, difference_var
 
     def rows(u, factor, first, last):
         # One row more on top, whose difference to the first row counts for that, too.

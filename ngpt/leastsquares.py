@@ -154,16 +154,17 @@ class _Weighted:
 
     def __init__(self, screen: Array | float, weights: Array):
         self.weights = weights
+        self.mean: float | None = None
         if isinstance(screen, float):
             self.screen = module(weights).full_like(weights[0], screen)
             self.scaling = module(weights).ones_like(weights[0])
             self.σ = screen
-            self.mean: float | None = 0.0
+            self.mean = 0.0
             return
         self.screen = screen
         mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights))).clip(1, None)
         self.scaling = (mean + screen) ** -0.5
-        self.σ, self.mean = float((screen * self.scaling**2).mean()), None
+        self.σ = float((screen * self.scaling**2).mean())
 
     def solve(self, b: Array, tolerance: float, max_iterations: int) -> tuple[Array, int]:
         zeros = module(b).zeros_like

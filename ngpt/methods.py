@@ -67,23 +67,20 @@ def _cv(data: Repaired) -> np.ndarray:
     return controlvariates.cv(data.image, data.dx, data.dy, data.trusted)
 
 
-def _wcv(data: Repaired) -> np.ndarray:
-    assert data.variances  # reconstruct() has required the layers
-    return controlvariates.wcv(data.image, data.dx, data.dy, *data.variances, trusted=data.trusted)
-
-
-def _wl2(data: Repaired) -> np.ndarray:
-    assert data.variances  # reconstruct() has required the layers
-    return weighted.wl2(data.image, data.dx, data.dy, *data.variances, trusted=data.trusted)
+def _with_variances(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
+    return lambda data: solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
 
 
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
-    if alpha == "auto":
-        return auto_alpha(*data.variances, norm=norm) if data.variances else poisson.DEFAULT_ALPHA
-    if isinstance(alpha, str):
-        raise NgptError(f"alpha '{alpha}': must be a number or 'auto'")
-    return alpha
+    if not isinstance(alpha, str):
+        return alpha
+    if alpha != "auto":
+        raise NgptError(f"alpha '{alpha}': must be a number, or 'auto' to derive it from the variances")
+    if data.variances is None:
+        return poisson.DEFAULT_ALPHA
+    primal_var, dx_var, dy_var = data.variances
+    return auto_alpha(primal_var, dx_var, dy_var, norm)
 
 
 _GRADIENTS = ("primal", "dx", "dy")
@@ -97,8 +94,13 @@ METHODS = {
         "screened Poisson, least norms: robust to outliers", _GRADIENTS, _l1, {"alpha": poisson.DEFAULT_ALPHA}
     ),
     "cv": Method("uniform control variates: close to l2, unbiased", _GRADIENTS, _cv, {}),
-    "wcv": Method("control variates weighted by variance: the best of these", (*_GRADIENTS, *_VARIANCES), _wcv, {}),
-    "wl2": Method("least squares weighted by variance", (*_GRADIENTS, *_VARIANCES), _wl2, {}),
+    "wcv": Method(
+        "control variates weighted by variance: the best of these",
+        (*_GRADIENTS, *_VARIANCES),
+        _with_variances(controlvariates.wcv),
+        {},
+    ),
+    "wl2": Method("least squares weighted by variance", (*_GRADIENTS, *_VARIANCES), _with_variances(weighted.wl2), {}),
 }
 
 
@@ -117,9 +119,9 @@ def choose(stack: GradientStack) -> str:
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:
     """Runs a method on a stack and says what it did.
 
-    ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own (``alpha`` for l2
-    and l1: a number, or "auto" to derive it from the variances). Raises
-    NgptError for an unknown method or option, missing layers, and a primal without any finite pixel.
+    ``method`` is ``auto`` or a name in ``METHODS``; ``options`` are the method's own: for l2 and l1 ``alpha``, a number
+    or "auto" to derive it from the variances. Raises NgptError for an unknown method or option, missing layers, and a
+    primal without any finite pixel.
     """
     start = time.perf_counter()
     name = choose(stack) if method == "auto" else method

@@ -1,6 +1,7 @@
 """Non-finite pixels: repaired from their neighbours, and their gradients trusted no more."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import distance_transform_edt, uniform_filter
@@ -24,10 +25,10 @@ class Repaired:
 
     image: np.ndarray
     direct: np.ndarray
-    dx: np.ndarray | None
-    dy: np.ndarray | None
+    dx: Any
+    dy: Any
     trusted: tuple[np.ndarray, np.ndarray] | None
-    variances: tuple[np.ndarray, np.ndarray, np.ndarray] | None
+    variances: Any
     pixels: int
     gradients: int
 
@@ -65,9 +66,7 @@ def repair(stack: GradientStack) -> Repaired:
     return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost)
 
 
-def _variances(
-    stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray] | None:
+def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]) -> tuple | None:
     """Variances of primal - direct, dx and dy, NaN where they are not those of what is reconstructed.
 
     Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.

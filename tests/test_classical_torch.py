@@ -16,6 +16,9 @@ from ngpt.poisson import l1, l2  # noqa: E402
 from ngpt.variances import auto_alpha  # noqa: E402
 from ngpt.weighted import wl2  # noqa: E402
 
+# Threads only get into each other's way on images this small.
+torch.set_num_threads(1)
+
 DEVICES = ["cpu", *(["cuda"] if torch.cuda.is_available() else [])]
 on_every_device = pytest.mark.parametrize("device", DEVICES)
 
@@ -48,7 +51,8 @@ def test_tensors_and_arrays_give_the_same(device, name, size, dtype):
     tensors = [torch.from_numpy(a).to(device) for a in data]
     result = METHODS[name](*tensors, [torch.from_numpy(v).to(device) for v in variances])
     assert result.dtype == tensors[0].dtype and result.device == tensors[0].device
-    tolerance = 1e-5 if name != "wl2" else 1e-3  # within the tolerance of its iteration
+    # wl2 stops at a tolerance of its own; the many iterations of l1 multiply the rounding of float32.
+    tolerance = {"wl2": 1e-3, "l1": 5e-5}.get(name, 1e-5)
     assert np.abs(result.cpu().numpy() - expected).max() <= tolerance * np.abs(expected).max()
 
 

@@ -24,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"file for one stack, folder for several (default: STACK{RESULT_SUFFIX}.exr beside each)",
     )
     parser.add_argument("-m", "--method", default="auto", choices=["auto", *METHODS], help=f"default: auto. {methods}")
-    parser.add_argument("--alpha", type=float, help="weight of the primal image in l2 and l1 (default: 0.2)")
+    parser.add_argument("--alpha", type=alpha, help="weight of the primal image in l2 and l1: a number, or auto")
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_layers(parser)
     add_force(parser)
@@ -72,6 +72,11 @@ def denoise_file(source: Path, target: Path, args, options: dict, reference: np.
         report["metrics"] = compare(result.image, reference)
     write(target, result.image, like=stack, overwrite=args.force)
     return report
+
+
+def alpha(text: str) -> float | str:
+    """A number, or ``auto``."""
+    return text if text == "auto" else float(text)
 
 
 def describe(report: dict) -> str:

@@ -28,7 +28,9 @@ def test_one_file_for_every_size(session, rng, alpha):
         layers = rng.random((3, *shape, 3)).astype(np.float32)
         layers[1:, :, -1], layers[1:, -1] = 9.0, 9.0  # unused by contract
         image = run(solver, *layers).transpose(1, 2, 0)
-        assert np.abs(image - l2(*layers, alpha)).max() < 1e-4, shape
+        expected = l2(*layers, alpha)
+        # At small alpha random gradients add up to images of several hundred.
+        assert np.abs(image - expected).max() < 1e-5 * max(1, np.abs(expected).max()), shape
 
 
 def test_metadata_and_plain_operators(session):
