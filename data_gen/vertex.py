@@ -72,3 +72,15 @@ def seen_from(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Surface
     other = mi.SurfaceInteraction3f(si)
     other.wi = dr.select(si.is_valid(), si.to_local(-direction), si.wi)
     return other
+
+
+def evaluate(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
+) -> tuple[mi.Spectrum, mi.Float]:
+    """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there.
+
+    Such directions may lie below the horizon, where some materials (``roughplastic``) answer with NaN: zero it is.
+    """
+    f, p = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    good = dr.isfinite(p) & dr.isfinite(dr.sum(f))
+    return dr.select(good, f, 0), dr.select(good, p, 0)

@@ -39,7 +39,7 @@ from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.shift import gradient_weight, mis_weight, reconnection_jacobian, reconnects, replay_inverts
 from data_gen.spectrum import to_rgb
-from data_gen.vertex import NULL, SMOOTH, Materials, event_kind, seen_from
+from data_gen.vertex import NULL, SMOOTH, Materials, evaluate, event_kind, seen_from
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 
@@ -304,7 +304,7 @@ class GPT(mi.SamplingIntegrator):
         lit = step.lit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         light, light_weight = scene.sample_emitter_direction(y, step.u_light, True, lit)
         lit &= light.pdf != 0
-        f, p = bsdf.eval_pdf(mi.BSDFContext(), y, y.to_local(light.d), lit)
+        f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
         L_light = dr.select(lit, f * light_weight * light_mis(light, p), 0)
         Δ = path.Δ + gradient_weight(path.r, lit) * (path.β * L_light - step.β * step.L_light)
 
@@ -339,7 +339,7 @@ class GPT(mi.SamplingIntegrator):
         direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
         occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)))
         J = dr.select(reaches, reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
-        f, p = bsdf.eval_pdf(mi.BSDFContext(), y, y.to_local(direction))
+        f, p = evaluate(bsdf, y, y.to_local(direction))
         y1 = seen_from(x1, direction)
         light = mi.DirectionSample3f(scene, y1, y)
         Le = light.emitter.eval(y1)
@@ -379,11 +379,11 @@ class GPT(mi.SamplingIntegrator):
         """A step from the shared vertex x, to which the offset path has come from elsewhere; settles it."""
         y = seen_from(step.x, path.ray.d)
         bsdf = y.bsdf()
-        f, p = bsdf.eval_pdf(mi.BSDFContext(), y, y.to_local(step.light.d), step.lit)
+        f, p = evaluate(bsdf, y, y.to_local(step.light.d), step.lit)
         L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light, p), 0)
         Δ = path.Δ + gradient_weight(path.r, True) * (path.β * L_light - step.β * step.L_light)
 
-        f, p = bsdf.eval_pdf(mi.BSDFContext(), y, step.wo, step.goes_on)
+        f, p = evaluate(bsdf, y, step.wo, step.goes_on)
         β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
         r1 = path.r * p / step.p
         # A mirror component sends light from elsewhere elsewhere.
