@@ -61,6 +61,50 @@ def hidden_lamp():
     return scene
 
 
+def one_sided(side):
+    """A scene without symmetry, of which ``side`` = -1 is the mirror image of ``side`` = 1."""
+    from data_gen.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
+        "wall": _wall([side * 1.2, 1, 0], [-side, 0, 0], (6, 2), _diffuse(0.7, 0.2, 0.2)),
+        "ball": _sphere([-side * 0.4, 0.5, 0], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.1}),
+        "lamp": _light([-side * 0.6, 2.4, 0.8], [0, -1, 0], (1.2, 1.2), (5, 5, 5)),
+    }
+
+
+def furnace():
+    """The inside of a ball whose wall glows and reflects half of what it gets: radiance is 1 everywhere."""
+    from data_gen.builtin import _camera, _diffuse, _rgb, _sphere
+
+    wall = _sphere([0, 0, 0], 2, _diffuse(0.5, 0.5, 0.5)) | {"flip_normals": True}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 40, "rr_depth": 5},
+        "sensor": _camera([0.4, 0.2, 1.2], [0, 0, 0], 60),
+        "wall": wall | {"emitter": {"type": "area", "radiance": _rgb(0.5, 0.5, 0.5)}},
+        "ball": _sphere([0, -0.3, 0], 0.5, _diffuse(0.5, 0.5, 0.5))
+        | {"emitter": {"type": "area", "radiance": _rgb(0.5, 0.5, 0.5)}},
+    }
+
+
+def polished(alpha):
+    """A metal floor of the given roughness beside a lacquered ball, under a lamp of radiance 1."""
+    from data_gen.builtin import _camera, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), {"type": "roughconductor", "material": "Ag", "alpha": alpha}),
+        "ball": _sphere([0.4, 0.5, 0], 0.5, {"type": "roughplastic", "alpha": alpha}),
+        "lamp": _light([0, 2.4, 0], [0, -1, 0], (3, 3), (1, 1, 1)),
+    }
+
+
 def _scale(factor):
     import mitsuba as mi
 
