@@ -29,15 +29,13 @@ def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bo
     return (kind == SMOOTH) & base & base_next & offset
 
 
-def replay_inverts(
-    kind: mi.UInt32, offset_kind: mi.UInt32, base: mi.Bool, offset: mi.Bool, offset_next: mi.Bool
-) -> mi.Bool:
+def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
     """Whether the replay of an event would be undone by the reverse shift.
 
-    Events of different kinds are not replayed into each other. And the path found must not be one that the reverse
-    shift reconnects, for that would lead it elsewhere.
+    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else it
+    replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
     """
-    return (kind == offset_kind) & ~reconnects(offset_kind, offset, offset_next, base)
+    return ~reconnects(offset_kind, offset, offset_next, base)
 
 
 def reconnection_jacobian(base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f) -> mi.Float:

@@ -19,7 +19,9 @@ four offsets cost about as much as the base path and not four times that.
     a                 once a path is settled, Δ of all that follows is a times the radiance that arrives by the base path
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
-from elsewhere), then *settled*: joined for longer, or dead. Russian roulette looks at all five paths, so that none is
+from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that has ended while offset paths are
+apart walks on as a ghost: its offset paths replay numbers that it has no use for, so that their pixels' samples serve
+this pixel too, with w = 1/2, as they do in random sequence replay. Russian roulette looks at all five paths, so that none is
 starved, and leaves r as it is: w need not know of it for the two directions of a difference to sum to the whole.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
@@ -39,7 +41,7 @@ from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.shift import gradient_weight, mis_weight, reconnection_jacobian, reconnects, replay_inverts
 from data_gen.spectrum import to_rgb
-from data_gen.vertex import NULL, SMOOTH, Materials, evaluate, event_kind, seen_from
+from data_gen.vertex import DELTA, NULL, SMOOTH, Materials, evaluate, event_kind, seen_from
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 
@@ -57,6 +59,7 @@ class Offset:
     r: mi.Float
     apart: mi.Bool
     joined: mi.Bool
+    seen: mi.Bool  # an escape sees the environment
     a: mi.Spectrum
     Δ: mi.Spectrum
 
@@ -83,7 +86,8 @@ class Step:
     f_p: mi.Spectrum  # f / p, survival included
     survival: mi.Float  # 1 / probability to survive Russian roulette
     goes_on: mi.Bool  # there is a next vertex, or an escape
-    seen: mi.Bool  # an escape would see the environment
+    walks: mi.Bool  # some path of the five may go on
+    seen: mi.Bool  # an escape sees the environment
     β1: mi.Spectrum
     x1: mi.SurfaceInteraction3f
     x1_connectable: mi.Bool
@@ -100,7 +104,9 @@ class Move:
     hit: mi.PreliminaryIntersection3f
     f_p: mi.Spectrum  # f |J| / p, with the p of the base path
     r: mi.Float  # p' |J| / p
+    seen: mi.Bool
     L_bsdf: mi.Spectrum
+    reaches: mi.Bool  # there is a next vertex
     good: mi.Bool
 
 
@@ -175,20 +181,20 @@ class GPT(mi.SamplingIntegrator):
         seen = mi.Bool(not self.hide_emitters)
         Le = importance * x.emitter(scene).eval(x, x.is_valid() | seen)
         L = mi.Spectrum(0)
-        β = mi.Spectrum(importance)
+        β = dr.select(x.is_valid(), importance, 0)
         η = mi.Float(1)
         depth = mi.UInt32(1)
         offsets = [self.offset_path(scene, x, importance, *shift) for shift in shifted]
-        active = x.is_valid() & (depth < self.max_depth)
+        active = (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < self.max_depth)
         while dr.hint(active, label="gpt"):
             step, η = self.base_step(scene, materials, random, x, β, η, depth, seen, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
             offsets = self.offset_steps(scene, materials, step, offsets)
             x = step.x1
-            β = step.β1
+            β = dr.select(x.is_valid(), step.β1, 0)
             seen = step.seen
             depth += 1
-            active = step.goes_on & x.is_valid() & (depth < self.max_depth)
+            active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < self.max_depth)
         return L, Le, [offset.Δ for offset in offsets]
 
     def first_hit(self, scene, ray) -> mi.PreliminaryIntersection3f:
@@ -202,17 +208,18 @@ class GPT(mi.SamplingIntegrator):
         return hit
 
     def offset_path(self, scene, x, importance, ray, offset_importance, inside) -> Offset:
-        """An offset path up to its first vertex; dead from the start where only one of the two paths has one."""
+        """An offset path up to its first vertex; it has ended where it finds none."""
         hit = self.first_hit(scene, ray)
-        apart = inside & x.is_valid() & hit.is_valid()
+        ended = inside & ~hit.is_valid()
         return Offset(
             ray=mi.Ray3f(ray),
             hit=hit,
             β=mi.Spectrum(offset_importance),
             r=mi.Float(1),
-            apart=apart,
+            apart=inside & hit.is_valid(),
             joined=mi.Bool(False),
-            a=dr.select(inside & ~apart, -2 * importance, 0),
+            seen=mi.Bool(not self.hide_emitters),
+            a=dr.select(ended & x.is_valid(), -importance, 0),
             Δ=mi.Spectrum(0),
         )
 
@@ -228,9 +235,10 @@ class GPT(mi.SamplingIntegrator):
         f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
         L_light = dr.select(lit, f * light_weight * light_mis(light, p), 0)
 
-        kind = event_kind(sample.sampled_type)
+        found = sample.pdf > 0
+        kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
         seen = seen | (kind != NULL)
-        η = η * sample.eta
+        η = dr.select(found, η * sample.eta, η)
         largest = dr.max(β * f_p)
         for y in offsets:
             ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
@@ -238,7 +246,8 @@ class GPT(mi.SamplingIntegrator):
         q = dr.fmin(largest * dr.square(η), 0.95)
         roulette = depth >= self.rr_depth
         survival = dr.select(roulette, dr.rcp(q), 1)
-        goes_on = (sample.pdf > 0) & (largest > 0) & (~roulette | (u_survival < q))
+        walks = (largest > 0) & (~roulette | (u_survival < q))
+        goes_on = walks & found
         f_p = dr.select(goes_on, f_p * survival, 0)
 
         x1 = scene.ray_intersect(x.spawn_ray(x.to_world(sample.wo)), goes_on)
@@ -262,6 +271,7 @@ class GPT(mi.SamplingIntegrator):
             f_p=f_p,
             survival=survival,
             goes_on=goes_on,
+            walks=walks,
             seen=seen,
             β1=β * f_p,
             x1=x1,
@@ -301,35 +311,40 @@ class GPT(mi.SamplingIntegrator):
         bsdf = y.bsdf()
         connectable = materials.connectable(bsdf)
         # Emitter sampling is replayed: densities cancel in r, and the same numbers lead to, or near, the same point.
-        lit = step.lit & mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+        lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
         light, light_weight = scene.sample_emitter_direction(y, step.u_light, True, lit)
         lit &= light.pdf != 0
         f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
         L_light = dr.select(lit, f * light_weight * light_mis(light, p), 0)
-        Δ = path.Δ + gradient_weight(path.r, lit) * (path.β * L_light - step.β * step.L_light)
+        Δ = path.Δ + gradient_weight(path.r, True) * (path.β * L_light - step.β * step.L_light)
 
         joins = step.goes_on & reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
-        replays = step.goes_on & ~joins
-        move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), mi.Spectrum(0), mi.Bool(False))
+        replays = step.walks & ~joins
+        none = mi.Bool(False)
+        move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none)
         move = dr.if_stmt((move,), joins, lambda move: self.reconnect(scene, step, y, bsdf, move), lambda move: move)
         move = dr.if_stmt(
             (move,),
             replays,
-            lambda move: self.replay(scene, materials, step, y, bsdf, connectable),
+            lambda move: self.replay(scene, materials, step, y, bsdf, connectable, move),
             lambda move: move,
         )
         β1, r1 = path.β * move.f_p, path.r * move.r
         good = move.good & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
         β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
+        apart, joined = good & replays & move.reaches, good & joins & move.reaches
+        w2 = gradient_weight(r1, good)
         return Offset(
             ray=move.ray,
             hit=move.hit,
             β=β1,
             r=r1,
-            apart=good & replays,
-            joined=good & joins & step.x1.is_valid(),
-            a=dr.select(good, 0, -2 * step.β1),
-            Δ=Δ + gradient_weight(r1, good) * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
+            apart=apart,
+            joined=joined,
+            seen=move.seen,
+            # Rejected or at its end, it has nothing to set against the rest of the base path.
+            a=dr.select(apart | joined, 0, -w2 * step.β1),
+            Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
         )
 
     def reconnect(self, scene, step: Step, y, bsdf, move: Move) -> Move:
@@ -348,31 +363,36 @@ class GPT(mi.SamplingIntegrator):
             hit=move.hit,
             f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0),
             r=J * p / step.p,
+            seen=mi.Bool(True),
             L_bsdf=Le * mis_weight(p, scene.pdf_emitter_direction(y, light)),
+            reaches=reaches,
             good=~occluded,
         )
 
-    def replay(self, scene, materials, step: Step, y, bsdf, connectable) -> Move:
-        """Along the direction that the base path's random numbers give here."""
+    def replay(self, scene, materials, step: Step, y, bsdf, connectable, move: Move) -> Move:
+        """Along the direction that the base path's random numbers give here, if any."""
         sample, f_p = bsdf.sample(mi.BSDFContext(), y, step.u_lobe, step.u_direction)
-        kind = event_kind(sample.sampled_type)
+        found = sample.pdf > 0
+        kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
+        seen = move.seen | (kind != NULL)
         ray = y.spawn_ray(y.to_world(sample.wo))
-        hit = scene.ray_intersect_preliminary(ray)
+        hit = scene.ray_intersect_preliminary(ray, active=found)
         y1 = hit.compute_surface_interaction(ray)
-        reaches = y1.is_valid()
+        reaches = found & y1.is_valid()
         light = mi.DirectionSample3f(scene, y1, y)
         p_light = scene.pdf_emitter_direction(y, light, kind == SMOOTH)
-        Le = light.emitter.eval(y1, reaches | step.seen)
-        inverts = replay_inverts(
-            step.kind, kind, step.x_connectable, connectable, ~reaches | materials.connectable(y1.bsdf())
-        )
+        Le = light.emitter.eval(y1, reaches | (found & seen))
         return Move(
             ray=ray,
             hit=hit,
-            f_p=f_p * step.survival,
+            f_p=dr.select(found, f_p * step.survival, 0),
             r=mi.Float(1),
+            seen=seen,
             L_bsdf=Le * mis_weight(sample.pdf, p_light),
-            good=inverts & (sample.pdf > 0) & (reaches == step.x1.is_valid()),
+            reaches=reaches,
+            good=replay_inverts(
+                kind, connectable, ~reaches | materials.connectable(y1.bsdf()), step.x_connectable
+            ),
         )
 
     def step_joined(self, step: Step, path: Offset) -> Offset:
@@ -398,6 +418,7 @@ class GPT(mi.SamplingIntegrator):
             r=r1,
             apart=mi.Bool(False),
             joined=mi.Bool(False),
+            seen=path.seen,
             a=w2 * (β1 - step.β1),
             Δ=Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf),
         )

@@ -97,33 +97,25 @@ def escapes_from(reconnects, replay_inverts):
     kind, offset_kind = mi.UInt32(states[:, 0]), mi.UInt32(states[:, 5])
     base, base_next, offset, offset_next = (mi.Bool(states[:, i].astype(bool)) for i in range(1, 5))
     joins = reconnects(kind, base, base_next, offset)
-    replays = ~joins & replay_inverts(kind, offset_kind, base, offset, offset_next)
+    replays = ~joins & replay_inverts(offset_kind, offset, offset_next, base)
     # The reverse of a reconnection reconnects, having been sampled as a smooth event at the offset path's vertex.
     joins_back = reconnects(kind, offset, base_next, base)
     # The reverse of a replay replays, under the same rule.
     replays_back = ~reconnects(offset_kind, offset, offset_next, base)
-    replays_back &= replay_inverts(offset_kind, kind, offset, base, base_next)
+    replays_back &= replay_inverts(kind, base, base_next, offset)
     return int(dr.count((joins & ~joins_back) | (replays & ~replays_back))[0])
 
 
 def test_the_shift_of_the_shift_is_the_path(renderer):
+    import mitsuba as mi
+
     from data_gen.shift import reconnects, replay_inverts
 
     assert escapes_from(reconnects, replay_inverts) == 0
-    # Without the test of the reverse shift, with events of different kinds, with a rule that is not symmetric
-    assert escapes_from(reconnects, lambda kind, offset_kind, *_: kind == offset_kind)
-    assert escapes_from(reconnects, lambda k, l, base, offset, after: ~reconnects(l, offset, after, base) | (k != l))
+    # Without the test of the reverse shift; without the kind of event in it; with a rule that is not symmetric
+    assert escapes_from(reconnects, lambda *_: mi.Bool(True))
+    assert escapes_from(reconnects, lambda kind, offset, after, base: ~(offset & after & base) | (kind == 2))
     assert escapes_from(lambda kind, base, after, offset: (kind == 0) & base & after, replay_inverts)
-
-
-def test_events_of_different_kinds_are_not_replayed(renderer):
-    from data_gen.shift import replay_inverts
-    from data_gen.vertex import DELTA, NULL, SMOOTH
-
-    no = renderer.Bool(False)
-    for a in (SMOOTH, DELTA, NULL):
-        for b in (SMOOTH, DELTA, NULL):
-            assert replay_inverts(renderer.UInt32(a), renderer.UInt32(b), no, no, no)[0] == (a == b)
 
 
 def random_geometry(mi, n=4096):
@@ -351,6 +343,6 @@ def test_polarised_light_is_declined(renderer):
         with pytest.raises(NgptError, match="polarised"):
             render_stack(scene, 1, sampler="gpt")
         with pytest.raises(NgptError, match="use variant 'llvm_ad_spectral', or sampler 'gpt-basic'"):
-            mi.render(scene, integrator=mi.load_dict({"type": "gpt"}), spp=1)
+            mi.load_dict({"type": "gpt"}).render(scene, spp=1)
     finally:
         use_variant("llvm_ad_rgb")
