@@ -7,9 +7,9 @@ three things (survey, sections 3.1 and 3.3):
     replay      sample the next direction from the same random numbers
     reject      give up: no offset path corresponds to this base path
 
-Gradients are unbiased if the shift is an involution, T(T(x)) = x: shifting the offset path back must give the base path,
-with the inverse Jacobian, or be rejected from either side. So each rule below is symmetric, or comes with the test of
-what the reverse shift would have done.
+Gradients are unbiased if the shift is an involution, T(T(x)) = x: shifting the offset path back must give the base
+path, with the inverse Jacobian, or be rejected from either side. So each rule below is symmetric, or comes with the
+test of what the reverse shift would have done.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bo
 def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
     """Whether the replay of an event would be undone by the reverse shift.
 
-    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else it
-    replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
+    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else
+    it replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
     """
     return ~reconnects(offset_kind, offset, offset_next, base)
 

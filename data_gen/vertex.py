@@ -8,8 +8,8 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Kinds of scattering events: only after a smooth one can another path have gone the same way. One that found no direction
-# at all counts as DELTA.
+# Kinds of scattering events: only after a smooth one can another path have gone the same way. An event that found no
+# direction at all counts as DELTA.
 SMOOTH, DELTA, NULL = 0, 1, 2
 
 # Parameters that hold a microfacet roughness, as mi.traverse() spells them: constants and textures, at any nesting.

@@ -16,13 +16,15 @@ four offsets cost about as much as the base path and not four times that.
     m                 MIS weight of emitter against BSDF sampling, each path's own
     Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x), the sum over all lengths of paths and over the two
                       techniques, which are shifted separately: C is the contribution f m of one
-    a                 once a path is settled, Δ of all that follows is a times the radiance that arrives by the base path
+    a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
-from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that has ended while offset paths are
-apart walks on as a ghost: its offset paths replay numbers that it has no use for, so that their pixels' samples serve
-this pixel too, with w = 1/2, as they do in random sequence replay. Russian roulette looks at all five paths, so that none is
-starved, and leaves r as it is: w need not know of it for the two directions of a difference to sum to the whole.
+from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
+apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
+this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
+
+Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
+directions of a difference sum to one whatever paths survive.
 
 [Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
 sections 3 and 4.1]
@@ -179,7 +181,7 @@ class GPT(mi.SamplingIntegrator):
         """L, Le and the four Δ, in the order of SHIFTS, of base paths that begin with ``ray``."""
         x = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray))
         seen = mi.Bool(not self.hide_emitters)
-        Le = importance * x.emitter(scene).eval(x, x.is_valid() | seen)
+        Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (self.max_depth > 0))
         L = mi.Spectrum(0)
         β = dr.select(x.is_valid(), importance, 0)
         η = mi.Float(1)
@@ -390,9 +392,7 @@ class GPT(mi.SamplingIntegrator):
             seen=seen,
             L_bsdf=Le * mis_weight(sample.pdf, p_light),
             reaches=reaches,
-            good=replay_inverts(
-                kind, connectable, ~reaches | materials.connectable(y1.bsdf()), step.x_connectable
-            ),
+            good=replay_inverts(kind, connectable, ~reaches | materials.connectable(y1.bsdf()), step.x_connectable),
         )
 
     def step_joined(self, step: Step, path: Offset) -> Offset:

@@ -76,10 +76,10 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     from data_gen.integrators import gpt
 
     scene = load(renderer, "diffuse", (32, 32))
-    references = render_references(renderer, scene, spp=64)
+    references = render_references(renderer, scene, spp=128)
     monkeypatch.setattr(gpt, function, partial(mutant, renderer, dr) if callable(mutant) else mutant)
-    failed = [name for name, passed in verdicts(render_ours(scene, "gpt", spp=32), references).items() if not passed]
-    assert failed and "primal" not in failed
+    passed = verdicts(render_ours(scene, "gpt"), references)
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
 def escapes_from(reconnects, replay_inverts):
@@ -239,7 +239,7 @@ def test_less_noise_than_replay_alone(renderer):
     scene = load(renderer, "diffuse", (64, 64))
     ours, theirs = (render_stack(scene, 16, 0, sampler) for sampler in ("gpt", "gpt-basic"))
     for name in ("dx_var", "dy_var"):
-        assert ours[name].mean() < 0.5 * theirs[name].mean()
+        assert ours[name].mean() < 0.75 * theirs[name].mean()
 
 
 def test_same_seed_same_bits(renderer):
@@ -321,7 +321,7 @@ def test_the_choice_of_a_sampler(renderer):
     assert inspect_scene("diffuse")["plan"][1] == "because the integrator is 'path' and there are no media"
     foggy = load(renderer, fog, (4, 4))
     assert choose_sampler(*describe(foggy))[0] == "gpt-basic"
-    with pytest.raises(NgptError, match="'gpt' cannot render this scene: .*'VolumetricPath.*--sampler gpt-basic"):
+    with pytest.raises(NgptError, match=r"'gpt' cannot render this scene: .*'VolumetricPath.*--sampler gpt-basic"):
         render_stack(foggy, 1, sampler="gpt")
 
     def unseen_fog():

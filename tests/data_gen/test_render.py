@@ -131,7 +131,11 @@ def test_integrators_without_camera_paths(scene_file):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"spp": 0}, "0 samples"), ({"spp": 1, "seed": -1}, "seed -1"), ({"spp": 1, "sampler": "x"}, "auto, gpt, gpt-basic")],
+    [
+        ({"spp": 0}, "0 samples"),
+        ({"spp": 1, "seed": -1}, "seed -1"),
+        ({"spp": 1, "sampler": "x"}, "auto, gpt, gpt-basic"),
+    ],
 )
 def test_bad_options(renderer, options, message):
     from data_gen.render import load_scene, render_stack
