@@ -38,7 +38,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         mi.set_variant(name)
         # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
-        for module in ("data_gen.integrators.gpt_basic",):
+        for module in ("data_gen.integrators.gpt_basic", "data_gen.integrators.gpt"):
             if module in sys.modules:
                 importlib.reload(sys.modules[module])
             else:

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.builtin import SCENES
-from data_gen.render import DEFAULT_SAMPLER, SAMPLERS
+from data_gen.render import SAMPLERS, choose_sampler
 from ngpt.errors import NgptError
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
@@ -38,21 +38,20 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             plugins[kind][node.props.plugin_name()] += 1
         if kind == "Film" and "width" in node.props and "height" in node.props:
             size = (int(node.props["width"]), int(node.props["height"]))
+    integrator = next(iter(plugins["Integrator"]), "path")
+    sampler, reason = choose_sampler(integrator, bool(plugins["Medium"]))
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
         "size": size,
-        "sampler": DEFAULT_SAMPLER,
-        "plan": _plan(plugins),
+        "sampler": sampler,
+        "plan": [f"{sampler}: {SAMPLERS[sampler]}", f"because {reason}", *_plan(plugins, integrator, sampler)],
     }
 
 
-def _plan(plugins: dict[str, Counter]) -> list[str]:
+def _plan(plugins: dict[str, Counter], integrator: str, sampler: str) -> list[str]:
     """What the sampler will do about the scene, a line for each thing that matters to it."""
-    integrator = next(iter(plugins["Integrator"]), "path")
-    lines = [
-        f"{DEFAULT_SAMPLER}: {SAMPLERS[DEFAULT_SAMPLER]}",
-        f"transport: Mitsuba's '{integrator}', replayed as a whole",
-    ]
+    how = "offset paths join it where materials are rough" if sampler == "gpt" else "replayed as a whole"
+    lines = [f"transport: Mitsuba's '{integrator}', {how}"]
     if plugins["Medium"]:
         lines.append("media: replayed with everything else; features are those of the surfaces behind them")
     if plugins["Medium"] and not integrator.startswith("vol"):
@@ -63,6 +62,8 @@ def _plan(plugins: dict[str, Counter]) -> list[str]:
         lines.append("depth of field: base and offset paths share their lens samples")
     if any(name in plugins["BSDF"] for name in ("dielectric", "thindielectric", "conductor")):
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
+        if sampler == "gpt":
+            lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
     if plugins["Emitter"]:
         lines.append("lights: where the camera sees one, its emission goes into the 'direct' layer")
     return lines

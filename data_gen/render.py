@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 from functools import partial
 from pathlib import Path
@@ -19,10 +20,10 @@ from ngpt.stack import GradientStack
 
 # Name -> what it renders, as the command line explains it.
 SAMPLERS = {
+    "gpt": "gradients by shifted paths that join their base path (surfaces; the sampler to use)",
     "gpt-basic": "gradients by random sequence replay (five paths per sample; the teaching sampler)",
     "primal": "the scene's own integrator without gradients (references, primal denoisers)",
 }
-DEFAULT_SAMPLER = "gpt-basic"
 
 
 def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
@@ -73,6 +74,45 @@ def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
     return integrator
 
 
+def describe(scene: mi.Scene) -> tuple[str, bool]:
+    """What the choice of a sampler depends on: the scene's integrator, as a plugin name, and whether it has media."""
+    integrator = scene.integrator()
+    # A loaded integrator knows its class, not its plugin; only this one matters here.
+    name = "path" if integrator is None or integrator.class_name() == "PathIntegrator" else integrator.class_name()
+    media = any(shape.is_medium_transition() for shape in scene.shapes())
+    return name, media or scene.sensors()[0].get_medium() is not None
+
+
+def choose_sampler(integrator: str, media: bool) -> tuple[str, str]:
+    """The sampler that "auto" stands for, and why, for what ``describe`` tells of a scene."""
+    if mi.is_polarized:
+        return "gpt-basic", f"variant '{mi.variant()}' is polarised, which 'gpt' does not follow"
+    if integrator != "path":
+        return "gpt-basic", f"the integrator is '{integrator}', and 'gpt' knows only 'path'"
+    if media:
+        return "gpt-basic", "there are media, which 'gpt' does not see"
+    return "gpt", "the integrator is 'path' and there are no media"
+
+
+def gpt_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
+    """Our integrator with the parameters of the scene's own; raises NgptError where it cannot stand in for that."""
+    name, media = describe(scene)
+    sampler, reason = choose_sampler(name, media)
+    if sampler != "gpt":
+        raise NgptError(f"sampler 'gpt' cannot render this scene: {reason}; use --sampler gpt-basic")
+    path = reference_integrator(scene)
+    # Mitsuba exposes neither depth as a parameter, only in print.
+    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
+    if depths.keys() != {"max_depth", "rr_depth"}:
+        raise NgptError(
+            f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
+            "use --sampler gpt-basic"
+        )
+    unlimited = depths["max_depth"] >= 0x7FFFFFFF
+    depths["max_depth"] = -1 if unlimited else depths["max_depth"]
+    return mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths})
+
+
 def render_stack(
     scene: mi.Scene,
     spp: int,
@@ -90,7 +130,8 @@ def render_stack(
         raise NgptError(f"{spp} samples per pixel: at least 1 is needed")
     if not 0 <= seed < 2**64:
         raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
-    sampler = DEFAULT_SAMPLER if sampler == "auto" else sampler
+    if sampler == "auto":
+        sampler, _ = choose_sampler(*describe(scene))
     start = time.perf_counter()
     film = render_film(sampler, scene, seed, spp, progress)
     layers = film.develop()
@@ -110,6 +151,8 @@ def render_film(sampler: str, scene: mi.Scene, seed: int, spp: int, progress: Pr
     """Runs the sampler of that name; see ``SAMPLERS``."""
     sensor = scene.sensors()[0]
     integrator = reference_integrator(scene)
+    if sampler == "gpt":
+        return gpt_integrator(scene).render_film(scene, sensor, seed, spp, progress=progress)
     if sampler == "gpt-basic":
         gpt = mi.load_dict({"type": "gpt_basic", "integrator": integrator})
         return gpt.render_film(scene, sensor, seed, spp, progress=progress)

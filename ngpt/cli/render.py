@@ -15,7 +15,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--output", metavar="FILE", help="stack to write (default: SCENE.exr in this folder)")
     parser.add_argument("--spp", type=positive, default=32, help="paths per pixel (default: 32)")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
-    parser.add_argument("--sampler", default="auto", help="auto, gpt-basic, or primal: no gradients (default: auto)")
+    parser.add_argument(
+        "--sampler", default="auto", help="auto, gpt, gpt-basic, or primal: no gradients (default: auto)"
+    )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(

@@ -61,7 +61,95 @@ def hidden_lamp():
     return scene
 
 
+def one_sided(side):
+    """A scene without symmetry, of which ``side`` = -1 is the mirror image of ``side`` = 1."""
+    from data_gen.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.5, 0.5, 0.5)),
+        "wall": _wall([side * 1.2, 1, 0], [-side, 0, 0], (6, 2), _diffuse(0.7, 0.2, 0.2)),
+        "ball": _sphere([-side * 0.4, 0.5, 0], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.1}),
+        "lamp": _light([-side * 0.6, 2.4, 0.8], [0, -1, 0], (1.2, 1.2), (5, 5, 5)),
+    }
+
+
+def furnace():
+    """The inside of a ball whose wall glows and reflects half of what it gets: radiance is 1 everywhere."""
+    from data_gen.builtin import _camera, _diffuse, _rgb, _sphere
+
+    wall = _sphere([0, 0, 0], 2, _diffuse(0.5, 0.5, 0.5)) | {"flip_normals": True}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 40, "rr_depth": 5},
+        "sensor": _camera([0.4, 0.2, 1.2], [0, 0, 0], 60),
+        "wall": wall | {"emitter": {"type": "area", "radiance": _rgb(0.5, 0.5, 0.5)}},
+        "ball": _sphere([0, -0.3, 0], 0.5, _diffuse(0.5, 0.5, 0.5))
+        | {"emitter": {"type": "area", "radiance": _rgb(0.5, 0.5, 0.5)}},
+    }
+
+
+def polished(alpha):
+    """A metal floor of the given roughness beside a lacquered ball, under a lamp of radiance 1."""
+    from data_gen.builtin import _camera, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), {"type": "roughconductor", "material": "Ag", "alpha": alpha}),
+        "ball": _sphere([0.4, 0.5, 0], 0.5, {"type": "roughplastic", "alpha": alpha}),
+        "lamp": _light([0, 2.4, 0], [0, -1, 0], (3, 3), (1, 1, 1)),
+    }
+
+
 def _scale(factor):
     import mitsuba as mi
 
     return mi.ScalarTransform4f().scale(factor)
+
+
+def plenty():
+    """One of everything: a lens, lamps of all kinds, textures, bumps, coats, holes, and glass with a rough surface."""
+    import mitsuba as mi
+    import numpy as np
+
+    from data_gen.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _transform, _wall
+
+    tiles = {"type": "checkerboard", "to_uv": _transform().scale([3, 3, 1])}
+    waves = np.sin(np.linspace(0, 12, 32, dtype=np.float32)) * np.ones((32, 1), np.float32)
+    waves = {"type": "bitmap", "bitmap": mi.Bitmap(waves[..., None]), "raw": True}
+    painted = {"type": "principled", "base_color": _rgb(0.6, 0.3, 0.1), "roughness": 0.35, "clearcoat": 0.4}
+    coated = {"type": "roughplastic", "diffuse_reflectance": tiles, "alpha": 0.2}
+    bumpy = {"type": "bumpmap", "arbitrary": waves, "scale": 0.05, "bsdf": _diffuse(0.3, 0.5, 0.4)}
+    holes = {"type": "mask", "opacity": tiles, "nested": {"type": "twosided", "nested": _diffuse(0.4, 0.6, 0.6)}}
+    blend = {
+        "type": "blendbsdf",
+        "weight": 0.4,
+        "a": {"type": "roughconductor", "alpha": 0.02},
+        "b": _diffuse(0.5, 0.2, 0.2),
+    }
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 7, "rr_depth": 3},
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.0, 0], 50)
+        | {"type": "thinlens", "aperture_radius": 0.04, "focus_distance": 4.0},
+        **_room(1.5, coated),
+        "sky": {"type": "constant", "radiance": _rgb(0.3, 0.4, 0.5)},
+        "lamp": _light([0.3, 2.3, 0], [0, -1, 0], (1.5, 1.5), (3, 3, 2.5)),
+        "bulb": _sphere([-1.1, 1.9, -0.6], 0.15, _diffuse(0, 0, 0))
+        | {"emitter": {"type": "area", "radiance": _rgb(6, 4, 2)}},
+        "point": {"type": "point", "position": [0.8, 2.0, 1.6], "intensity": _rgb(1.5, 1.5, 1.8)},
+        "principled": _sphere([-0.9, 0.5, -0.2], 0.5, painted),
+        "glass": _sphere([0.1, 0.4, 0.4], 0.4, {"type": "roughdielectric", "alpha": 0.15}),
+        "bumpy": _box([0.95, 0.5, -0.4], [0.6, 1.0, 0.6], 25, bumpy),
+        "blend": _sphere([0.8, 0.25, 0.7], 0.25, blend),
+        "holes": _wall([-0.3, 1.5, -0.6], [0.2, 0, 1], (0.9, 0.7), holes),
+        "pane": {
+            "type": "rectangle",
+            "to_world": mi.ScalarTransform4f().translate([-0.7, 0.9, 1.0]).scale(0.35),
+            "bsdf": {"type": "thindielectric"},
+        },
+    }

@@ -7,37 +7,12 @@ a whole. The slow versions take 16 times the samples at 64x64.
 import numpy as np
 import pytest
 from data_gen_scenes import fog, glass, hidden_lamp, within_fog
-
-from ngpt.gradients import forward_differences
-from ngpt.testing import z_test
-
-
-def load(mi, scene, size):
-    from data_gen.builtin import SCENES
-    from data_gen.render import set_film_size
-
-    scene = mi.load_dict(SCENES[scene]() if isinstance(scene, str) else scene())
-    set_film_size(scene, size)
-    return scene
+from unbiased import gradient_tests, load, render_ours, render_references
 
 
 def render_both(mi, scene, batches=16, spp=64, reference_batches=24, reference_spp=256):
     """Independent stacks of our sampler (dictionaries of layers) and references (batches, H, W, 3) of Mitsuba's."""
-    from data_gen.render import render_stack
-
-    stacks = [render_stack(scene, spp, seed).layers for seed in range(batches)]
-    references = [np.array(mi.render(scene, spp=reference_spp, seed=1000 + i)) for i in range(reference_batches)]
-    return stacks, np.stack(references)
-
-
-def gradient_tests(stacks, references):
-    """(name, z-test) of the primal and of the gradients, those of the direct emission included."""
-    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references)
-    slopes = [forward_differences(reference) for reference in references]
-    for axis, name in enumerate(("dx", "dy")):
-        # The contract keeps direct emission out of dx and dy; its own differences put it back.
-        ours = np.stack([stack[name] + forward_differences(stack["direct"])[axis] for stack in stacks])
-        yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]))
+    return render_ours(scene, "gpt-basic", batches, spp), render_references(mi, scene, reference_batches, reference_spp)
 
 
 @pytest.mark.parametrize("scene", ["diffuse", "glossy", "environment", "lens", glass, fog, within_fog, hidden_lamp])
@@ -73,7 +48,7 @@ def test_the_z_test_would_see_a_wrong_gradient(renderer):
 def test_gradients_have_less_variance_than_differences_of_pixels(renderer):
     from data_gen.render import render_stack
 
-    stack = render_stack(load(renderer, "diffuse", (96, 96)), 16)
+    stack = render_stack(load(renderer, "diffuse", (96, 96)), 16, sampler="gpt-basic")
     lit = stack["direct"].sum(axis=-1) == 0  # pixels at the lamp have the variance of its edge in the primal
     independent = (stack["primal_var"][:, 1:] + stack["primal_var"][:, :-1])[lit[:, 1:] & lit[:, :-1]]
     correlated = stack["dx_var"][:, :-1][lit[:, 1:] & lit[:, :-1]]
@@ -84,7 +59,7 @@ def test_variances_predict_the_spread(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "environment", (24, 24))
-    stacks = [render_stack(scene, 64, seed) for seed in range(64)]
+    stacks = [render_stack(scene, 64, seed, "gpt-basic") for seed in range(64)]
     for name in ("primal", "dx", "dy"):
         spread = np.stack([stack[name] for stack in stacks]).var(axis=0, ddof=1).sum()
         predicted = np.stack([stack[f"{name}_var"] for stack in stacks]).mean(axis=0).sum()
@@ -98,15 +73,15 @@ def test_same_seed_same_bits_and_passes_do_not_repeat(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (16, 12))
     monkeypatch.setattr(camera, "LANES_PER_PASS", 16 * 12 * 3)
     calls = []
-    a = render_stack(scene, 10, seed=7, progress=lambda done, total: calls.append((done, total)))
-    b = render_stack(scene, 10, seed=7)
-    c = render_stack(scene, 10, seed=8)
+    a = render_stack(scene, 10, 7, "gpt-basic", progress=lambda done, total: calls.append((done, total)))
+    b = render_stack(scene, 10, 7, "gpt-basic")
+    c = render_stack(scene, 10, 8, "gpt-basic")
     assert calls == [(0, 10), (2, 10), (5, 10), (7, 10), (10, 10)]
     for name in a.names:
         assert np.array_equal(a[name], b[name]), name
     assert not np.array_equal(a["primal"], c["primal"])
     # If passes repeated their random numbers, the variance would not fall with their number.
-    one = render_stack(scene, 3, seed=7)
+    one = render_stack(scene, 3, 7, "gpt-basic")
     assert not np.array_equal(a["primal"], one["primal"])
 
 

@@ -63,7 +63,7 @@ def test_attributes_tell_how_it_was_made(renderer):
 
     attributes = render_stack(load_scene("lens", (8, 8)), 3, seed=2**63).attributes
     assert attributes["ngpt:spp"] == 3 and attributes["ngpt:seed"] == str(2**63)
-    assert attributes["ngpt:sampler"] == "gpt-basic" and attributes["ngpt:normalSpace"] == "camera"
+    assert attributes["ngpt:sampler"] == "gpt" and attributes["ngpt:normalSpace"] == "camera"
     assert attributes["ngpt:seconds"] > 0 and attributes["ngpt:discarded"] == 0
 
 
@@ -131,7 +131,11 @@ def test_integrators_without_camera_paths(scene_file):
 
 @pytest.mark.parametrize(
     ("options", "message"),
-    [({"spp": 0}, "0 samples"), ({"spp": 1, "seed": -1}, "seed -1"), ({"spp": 1, "sampler": "x"}, "auto, gpt-basic")],
+    [
+        ({"spp": 0}, "0 samples"),
+        ({"spp": 1, "seed": -1}, "seed -1"),
+        ({"spp": 1, "sampler": "x"}, "auto, gpt, gpt-basic"),
+    ],
 )
 def test_bad_options(renderer, options, message):
     from data_gen.render import load_scene, render_stack

@@ -1,0 +1,86 @@
+"""Path vertices: whether a shifted path may connect to one, and what kind of event scatters light there."""
+
+from __future__ import annotations
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# Kinds of scattering events: only after a smooth one can another path have gone the same way. An event that found no
+# direction at all counts as DELTA.
+SMOOTH, DELTA, NULL = 0, 1, 2
+
+# Parameters that hold a microfacet roughness, as mi.traverse() spells them: constants and textures, at any nesting.
+_ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.data)?$")
+
+
+class Materials:
+    """Which materials of a scene scatter so widely that any two directions may be joined at them.
+
+    A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness over
+    all such components exceeds ``threshold``. It is a property of the material alone, of neither the direction nor the
+    lobe that was sampled: a path and its shifted copy then agree on it, which keeps the shift invertible. Textured
+    roughness counts with its smallest texel. Materials with no parameter for their roughness (``diffuse``,
+    ``measured``) count as rough.
+    """
+
+    def __init__(self, scene: mi.Scene, threshold: float):
+        smallest = {}
+        for shape in scene.shapes():
+            bsdf = shape.bsdf()
+            if bsdf is not None:
+                smallest[int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])] = smallest_roughness(bsdf)
+        # Indexed by Dr.Jit's number of the material. Materials inside shape groups are not listed and count as rough.
+        table = np.ones(max(smallest, default=0) + 1, bool)
+        for index, roughness in smallest.items():
+            table[index] = roughness > threshold
+        self.size = len(table)
+        self.rough = mi.Bool(table)
+        dr.eval(self.rough)
+
+    def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
+        """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
+        index = dr.reinterpret_array(mi.UInt32, bsdf)
+        rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
+
+
+def smallest_roughness(bsdf: mi.BSDF) -> float:
+    """The smallest microfacet roughness (Beckmann or GGX α) among all parameters of a material, 1 if it has none."""
+    roughness = 1.0
+    params = mi.traverse(bsdf)
+    for key in params.keys():  # noqa: SIM118 - not a dict: iterating it yields pairs
+        match = _ROUGHNESS.search(key)
+        if match:
+            value = float(np.min(np.array(params[key])))
+            # The principled materials' parameter is perceptual: α is its square.
+            roughness = min(roughness, value**2 if match[1] == "roughness" else value)
+    return roughness
+
+
+def event_kind(sampled_type: mi.UInt32) -> mi.UInt32:
+    """SMOOTH, DELTA or NULL, of the ``sampled_type`` of a BSDF sample."""
+    null = mi.has_flag(sampled_type, mi.BSDFFlags.Null)
+    delta = mi.has_flag(sampled_type, mi.BSDFFlags.Delta)
+    return dr.select(null, mi.UInt32(NULL), dr.select(delta, mi.UInt32(DELTA), mi.UInt32(SMOOTH)))
+
+
+def seen_from(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.SurfaceInteraction3f:
+    """The same vertex, reached along ``direction`` (world space) instead. Escaped paths keep theirs."""
+    other = mi.SurfaceInteraction3f(si)
+    other.wi = dr.select(si.is_valid(), si.to_local(-direction), si.wi)
+    return other
+
+
+def evaluate(
+    bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
+) -> tuple[mi.Spectrum, mi.Float]:
+    """f cos θ of a material and the density of sampling ``wo``, for directions that nobody sampled there.
+
+    Such directions may lie below the horizon, where some materials (``roughplastic``) answer with NaN: zero it is.
+    """
+    f, p = bsdf.eval_pdf(mi.BSDFContext(), si, wo, active)
+    good = dr.isfinite(p) & dr.isfinite(dr.sum(f))
+    return dr.select(good, f, 0), dr.select(good, p, 0)

@@ -1,0 +1,38 @@
+"""How the statistical tests render and compare: stacks of one of our samplers against Mitsuba's own integrator."""
+
+import numpy as np
+
+from ngpt.gradients import forward_differences
+from ngpt.testing import z_test
+
+
+def load(mi, scene, size):
+    """A built-in scene by name, or one that a function describes, at (width, height) pixels."""
+    from data_gen.builtin import SCENES
+    from data_gen.render import set_film_size
+
+    scene = mi.load_dict(SCENES[scene]() if isinstance(scene, str) else scene())
+    set_film_size(scene, size)
+    return scene
+
+
+def render_ours(scene, sampler, batches=16, spp=64):
+    """Layers of independent stacks."""
+    from data_gen.render import render_stack
+
+    return [render_stack(scene, spp, seed, sampler).layers for seed in range(batches)]
+
+
+def render_references(mi, scene, batches=24, spp=256):
+    """Independent images, (batches, H, W, 3)."""
+    return np.stack([np.array(mi.render(scene, spp=spp, seed=1000 + i)) for i in range(batches)])
+
+
+def gradient_tests(stacks, references):
+    """(name, z-test) of the primal and of the gradients, those of the direct emission included."""
+    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references)
+    slopes = [forward_differences(reference) for reference in references]
+    for axis, name in enumerate(("dx", "dy")):
+        # The contract keeps direct emission out of dx and dy; its own differences put it back.
+        ours = np.stack([stack[name] + forward_differences(stack["direct"])[axis] for stack in stacks])
+        yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]))
