@@ -21,10 +21,11 @@ class Materials:
 
     A vertex is *connectable* if its material has a component without a Dirac delta, none that mirrors or refracts like
     clear glass, and the smallest roughness of all components exceeds ``threshold``. (Where both are mixed, as in
-    ``plastic``, a reconnection would fail each time the mirror is sampled next, on the paths that are brightest.) It is a property of the material alone, of neither the direction nor the
-    lobe that was sampled: a path and its shifted copy then agree on it, which keeps the shift invertible. Textured
-    roughness counts with its smallest texel. Materials with no parameter for their roughness (``diffuse``,
-    ``measured``) count as rough.
+    ``plastic``, a reconnection would fail each time the mirror is sampled next, on the paths that are brightest.)
+
+    It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
+    shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
+    Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
     """
 
     def __init__(self, scene: mi.Scene, threshold: float):
