@@ -19,9 +19,9 @@ _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.
 class Materials:
     """Which materials of a scene scatter so widely that any two directions may be joined at them.
 
-    A vertex is *connectable* if its material has a component without a Dirac delta, none that mirrors or refracts like
-    clear glass, and the smallest roughness of all components exceeds ``threshold``. (Where both are mixed, as in
-    ``plastic``, a reconnection would fail each time the mirror is sampled next, on the paths that are brightest.)
+    A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
+    such components exceeds ``threshold``. That includes materials that mirror as well (``plastic``), though the shift
+    is rejected when the mirror is sampled at the shared vertex: to replay them instead costs more than it gains.
 
     It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
@@ -46,9 +46,7 @@ class Materials:
         """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
         index = dr.reinterpret_array(mi.UInt32, bsdf)
         rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
-        flags = bsdf.flags()
-        mirror = mi.has_flag(flags, mi.BSDFFlags.DeltaReflection) | mi.has_flag(flags, mi.BSDFFlags.DeltaTransmission)
-        return mi.has_flag(flags, mi.BSDFFlags.Smooth) & rough & ~mirror
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
 
 
 def smallest_roughness(bsdf: mi.BSDF) -> float:

@@ -184,7 +184,7 @@ def test_connectable_materials(renderer):
         "smooth": (smooth, 0.01, False),
         "streaked": ({"type": "roughconductor", "alpha_u": 0.3, "alpha_v": 0.02}, 0.02, False),
         "mirror": ({"type": "conductor"}, 1, False),
-        "lacquer": ({"type": "plastic"}, 1, False),
+        "lacquer": ({"type": "plastic"}, 1, True),
         "nested": ({"type": "twosided", "nested": smooth}, 0.01, False),
         "blend": ({"type": "blendbsdf", "weight": 0.5, "a": rough, "b": smooth}, 0.01, False),
         "principled": ({"type": "principled", "roughness": 0.2}, 0.04, False),
