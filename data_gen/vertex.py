@@ -19,11 +19,13 @@ _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.
 class Materials:
     """Which materials of a scene scatter so widely that any two directions may be joined at them.
 
-    A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness over
-    all such components exceeds ``threshold``. It is a property of the material alone, of neither the direction nor the
-    lobe that was sampled: a path and its shifted copy then agree on it, which keeps the shift invertible. Textured
-    roughness counts with its smallest texel. Materials with no parameter for their roughness (``diffuse``,
-    ``measured``) count as rough.
+    A vertex is *connectable* if its material has a component without a Dirac delta, and the smallest roughness of all
+    such components exceeds ``threshold``. That includes materials that mirror as well (``plastic``), though the shift
+    is rejected when the mirror is sampled at the shared vertex: to replay them instead costs more than it gains.
+
+    It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
+    shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
+    Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
     """
 
     def __init__(self, scene: mi.Scene, threshold: float):

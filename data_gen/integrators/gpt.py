@@ -406,7 +406,7 @@ class GPT(mi.SamplingIntegrator):
         f, p = evaluate(bsdf, y, step.wo, step.goes_on)
         β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
         r1 = path.r * p / step.p
-        # A mirror component sends light from elsewhere elsewhere.
+        # A mirror or a hole sends light from elsewhere elsewhere.
         good = (step.kind == SMOOTH) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
         β1 = dr.select(good, β1, 0)
         L_bsdf = step.Le * mis_weight(p, step.p_light)
