@@ -20,6 +20,7 @@ check: setup-dev
 
 bench: setup-dev
 	$(PY) -m bench.sampler -o bench/results/sampler.json
+	$(PY) -m bench.reconstruction -o bench/results/reconstruction.json
 
 setup-demo:
 	@scripts/setup render llvm

@@ -42,7 +42,7 @@ def main() -> None:
     args.cache.mkdir(parents=True, exist_ok=True)
     names = {scene: scene_name(scene) for scene in args.scenes}
     references = {names[s]: cached(s, args.reference_spp, "primal", 1, args) for s in args.scenes}
-    stacks = {(names[s], spp): cached(s, spp, "gpt-basic", 0, args) for s in args.scenes for spp in args.spp}
+    stacks = {(names[s], spp): cached(s, spp, "auto", 0, args) for s in args.scenes for spp in args.spp}
     images, cells = {}, {}
     for (name, spp), stack in stacks.items():
         for method, entry in METHODS.items():
