@@ -36,16 +36,15 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from data_gen.camera import CameraSamples, render_passes
 from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
+from data_gen.integrators.common import GradientIntegrator
 from data_gen.shift import gradient_weight, mis_weight, reconnection_jacobian, reconnects, replay_inverts
 from data_gen.spectrum import to_rgb
 from data_gen.vertex import DELTA, NULL, SMOOTH, Materials, evaluate, event_kind, seen_from
 from ngpt.errors import NgptError
-from ngpt.layers import LAYERS
 
 # α of Beckmann and GGX above which a material is connectable.
 ROUGHNESS_THRESHOLD = 0.05
@@ -112,13 +111,12 @@ class Move:
     good: mi.Bool
 
 
-class GPT(mi.SamplingIntegrator):
+class GPT(GradientIntegrator):
     """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces.
 
     Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``: ``max_depth`` (default: -1, no limit),
     ``rr_depth`` (5), ``hide_emitters`` (false), and ``roughness_threshold``, the microfacet roughness above which
-    materials are connectable. ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()``
-    lists, in the order of the layers of a gradient stack; the film's reconstruction filter is not used.
+    materials are connectable.
 
     Not handled: media (they are not seen), and polarised variants, for which rendering raises NgptError.
     """
@@ -129,25 +127,12 @@ class GPT(mi.SamplingIntegrator):
         self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
         self.rr_depth = props.get("rr_depth", 5)
         self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
-        self.channels: list[str] = []
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone, by Mitsuba's ``path``."""
         depths = {"max_depth": self.max_depth if self.max_depth < 0xFFFFFFFF else -1, "rr_depth": self.rr_depth}
         path = mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters, **depths})
         return path.sample(scene, sampler, ray, medium, active)
-
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        spp = spp or sensor.sampler().sample_count()
-        film = self.render_film(scene, sensor, seed, spp)
-        layers = film.develop()
-        self.channels = [f"{name}.{c}" for name in layers for c in LAYERS[name].channels]
-        return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
-
-    def aov_names(self):
-        return self.channels
 
     def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
         """Renders pass by pass: see ``data_gen.camera.render_passes()``."""

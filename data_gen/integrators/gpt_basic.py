@@ -18,22 +18,19 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from data_gen.camera import CameraSamples, render_passes
 from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
+from data_gen.integrators.common import GradientIntegrator
 from data_gen.spectrum import to_rgb
-from ngpt.layers import LAYERS
 
 
-class GPTBasic(mi.SamplingIntegrator):
+class GPTBasic(GradientIntegrator):
     """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
 
     Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
-    is rendered; ``path`` and ``volpath`` are the usual ones. ``render()`` returns a tensor (height, width, channels)
-    whose channels ``aov_names()`` lists, in the order of the layers of a gradient stack; the film's reconstruction
-    filter is not used, since a gradient is a difference of box-filtered pixels.
+    is rendered; ``path`` and ``volpath`` are the usual ones.
 
     Not meant for production: shifted paths part for good at the first reflection that differs, which makes gradients
     noisier than those of a shift that reconnects.
@@ -43,23 +40,10 @@ class GPTBasic(mi.SamplingIntegrator):
         super().__init__(props)
         nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
         self.nested = nested[0] if nested else mi.load_dict({"type": "path"})
-        self.channels: list[str] = []
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone: see the nested integrator."""
         return self.nested.sample(scene, sampler, ray, medium, active)
-
-    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
-        """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
-        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
-        spp = spp or sensor.sampler().sample_count()
-        film = self.render_film(scene, sensor, seed, spp)
-        layers = film.develop()
-        self.channels = [f"{name}.{c}" for name in layers for c in LAYERS[name].channels]
-        return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
-
-    def aov_names(self):
-        return self.channels
 
     def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
         """Renders pass by pass: see ``data_gen.camera.render_passes()``."""
