@@ -46,7 +46,7 @@ def main() -> None:
     images, cells = {}, {}
     for (name, spp), stack in stacks.items():
         for method, entry in METHODS.items():
-            if all(layer in stack for layer in entry.needs):
+            if not entry.missing() and all(layer in stack for layer in entry.needs):
                 result = reconstruct(stack, method)
                 images[name, spp, method] = result.image
                 reference = references[name]["primal"]

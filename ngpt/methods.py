@@ -6,6 +6,8 @@ A new method is one more entry in ``METHODS``; the command line, the reports and
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,12 +27,14 @@ class Method:
     ``needs``    layers of the stack it cannot do without
     ``run``      Repaired, options -> (H, W, 3) float32 without direct emission
     ``options``  the options it takes, with their defaults
+    ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
     """
 
     summary: str
     needs: tuple[str, ...]
     run: Callable[..., np.ndarray]
     options: dict[str, Any]
+    missing: Callable[[], str] = lambda: ""
 
 
 @dataclass(frozen=True)
@@ -83,7 +87,30 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     return auto_alpha(primal_var, dx_var, dy_var, norm)
 
 
+def _neural(name: str) -> dict[str, Any]:
+    """The part of an entry that all networks share: the weights of that name in the package, unless others are given."""
+    shipped = WEIGHTS / f"{name}.safetensors"
+
+    def missing() -> str:
+        if find_spec("torch") is None or find_spec("safetensors") is None:
+            return "PyTorch is not installed: pip install 'ngpt-recon[train]'"
+        return "" if shipped.is_file() else f"no weights are shipped for it: pass weights=FILE, as train.py makes them"
+
+    def run(data: Repaired, weights: str, device: str) -> np.ndarray:
+        lack = missing()
+        if lack and ("PyTorch" in lack or not weights):
+            raise NgptError(f"method '{name}': {lack}")
+        # torch takes seconds to come in.
+        from ngpt.network import inference
+
+        return inference.run(data, weights or shipped, device)
+
+    return {"run": run, "options": {"weights": "", "device": "auto"}, "missing": missing}
+
+
+WEIGHTS = Path(__file__).parent / "weights"
 _GRADIENTS = ("primal", "dx", "dy")
+_FEATURES = ("albedo", "normal", "depth")
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 METHODS = {
@@ -101,6 +128,10 @@ METHODS = {
         {},
     ),
     "wl2": Method("least squares weighted by variance", (*_GRADIENTS, *_VARIANCES), _with_variances(weighted.wl2), {}),
+    "ngpt-fast": Method(
+        "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES), **_neural("ngpt-fast")
+    ),
+    "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
 }
 
 

@@ -1,6 +1,6 @@
 """Non-finite pixels: repaired from their neighbours, and their gradients trusted no more."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ class Repaired:
     ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
+    ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
     """
 
     image: np.ndarray
@@ -31,6 +32,7 @@ class Repaired:
     variances: Any
     pixels: int
     gradients: int
+    features: dict[str, np.ndarray] = field(default_factory=dict)
 
 
 def repair(stack: GradientStack) -> Repaired:
@@ -46,8 +48,9 @@ def repair(stack: GradientStack) -> Repaired:
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
     image = primal - direct if good.all() else _from_neighbours(primal, direct, good)
     direct = np.where(good[..., None], direct, 0)
+    features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
     if "dx" not in stack or "dy" not in stack:
-        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0)
+        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features)
     gradients, trusted = [], []
     for name, axis in (("dx", 1), ("dy", 0)):
         both = good.copy()
@@ -63,7 +66,12 @@ def repair(stack: GradientStack) -> Repaired:
     flags = (trusted[0], trusted[1]) if lost else None
     variances = _variances(stack, good & ~direct.any(axis=-1), trusted)
     dx, dy = gradients
-    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost)
+    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features)
+
+
+def _finite(layer: np.ndarray) -> np.ndarray:
+    good = np.isfinite(layer)
+    return layer if good.all() else np.where(good, layer, np.float32(0))
 
 
 def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]) -> tuple | None:

@@ -90,7 +90,9 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     write(targets["ref"], reference, overwrite=args.force)
     entries = []
     for method, entry in METHODS.items():
-        if all(layer in stack for layer in entry.needs):
+        if lack := entry.missing():
+            console.say(f"{name}: without {method}: {lack}")
+        elif all(layer in stack for layer in entry.needs):
             entries.append(demo_method(method, stack, reference, targets[method], args.force))
     caption = (
         f"{stack.width}x{stack.height}, {args.spp} spp, rendered in {stack.attributes['ngpt:seconds']:.1f} s; "

@@ -25,6 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-m", "--method", default="auto", choices=["auto", *METHODS], help=f"default: auto. {methods}")
     parser.add_argument("--alpha", type=alpha, help="weight of the primal image in l2 and l1: a number, or auto")
+    parser.add_argument("--weights", metavar="FILE", help="weights for ngpt and ngpt-fast instead of those shipped")
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_layers(parser)
     add_force(parser)
@@ -36,7 +37,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for _, target in pairs:
         check_output(target, args.force)
     reference = read_image(args.ref) if args.ref else None
-    options = {} if args.alpha is None else {"alpha": args.alpha}
+    options = {name: value for name in ("alpha", "weights") if (value := getattr(args, name)) is not None}
     reports = []
     for i, (source, target) in enumerate(pairs, 1):
         try:

@@ -1,0 +1,97 @@
+"""Augmentation of training examples, as of NGPT: each transform keeps differences the differences of the image.
+
+An example is a dict of layers (C, H, W), radiance over exposure, among them "target". The transforms take and return
+such dicts. [Kettunen et al. 2019, section 5.2 and their code]
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+Layers = dict[str, Tensor]
+
+# Layers with three colours that change with those of the light, and with those of the surfaces.
+_LIGHT = frozenset({"primal", "dx", "dy", "base", "target", "primal_se", "dx_se", "dy_se"})
+_COLOR = _LIGHT | {"albedo"}
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """What is done to each example when it is read.
+
+    ``geometry``    flips and transposition, each with probability 1/2
+    ``colors``      permutation of RGB, and a factor for each of mean 1, 0..3, uniform on the simplex
+    ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
+    ``depth``       factor of depth, uniform between these
+    """
+
+    geometry: bool = True
+    colors: bool = True
+    brightness: float = 1.0
+    depth: tuple[float, float] = (0.1, 1.1)
+
+    def __call__(self, layers: Mapping[str, Tensor], rng: np.random.Generator) -> Layers:
+        result = dict(layers)
+        if self.geometry:
+            for transform in (flip_x, flip_y, transpose):
+                if rng.random() < 0.5:
+                    result = transform(result)
+        if self.colors:
+            factors = 3 * rng.dirichlet((1.0, 1.0, 1.0))
+            result = color(result, rng.permutation(3), factors)
+        if self.brightness:
+            result = scale(result, float(np.exp(self.brightness * rng.standard_normal() - self.brightness**2 / 2)))
+        if "depth" in result:
+            result["depth"] = result["depth"] * float(rng.uniform(*self.depth))
+        return result
+
+
+def flip_x(layers: Mapping[str, Tensor]) -> Layers:
+    """Mirrored left to right: I'[x] = I[W-1-x], so dx'[x] = -dx[W-2-x] with its unused column last again."""
+    return _flip(layers, -1, "dx", 0)
+
+
+def flip_y(layers: Mapping[str, Tensor]) -> Layers:
+    """Mirrored top to bottom."""
+    return _flip(layers, -2, "dy", 1)
+
+
+def _flip(layers: Mapping[str, Tensor], axis: int, difference: str, normal: int) -> Layers:
+    result = {name: layer.flip(axis) for name, layer in layers.items()}
+    for name, sign in ((difference, -1), (f"{difference}_se", 1)):
+        if name in result:
+            result[name] = sign * result[name].roll(-1, axis)
+    if "normal" in result:
+        signs = torch.ones(3, 1, 1)
+        signs[normal] = -1
+        result["normal"] = result["normal"] * signs
+    return result
+
+
+def transpose(layers: Mapping[str, Tensor]) -> Layers:
+    """Mirrored at the diagonal: rows become columns, dx becomes dy; x and y of camera space change places.
+
+    Image y points down and camera y up: the mirror takes (x, y) to (-y, -x).
+    """
+    result = {name: layer.transpose(-1, -2) for name, layer in layers.items()}
+    for a, b in (("dx", "dy"), ("dx_se", "dy_se")):
+        if a in result:
+            result[a], result[b] = result[b], result[a]
+    if "normal" in result:
+        x, y, z = result["normal"]
+        result["normal"] = torch.stack([-y, -x, z])
+    return result
+
+
+def color(layers: Mapping[str, Tensor], order: np.ndarray, factors: np.ndarray) -> Layers:
+    """The channels in another order, and each multiplied by its factor; albedo may exceed 1 after it."""
+    index, factor = torch.as_tensor(order), torch.as_tensor(factors, dtype=torch.float32).reshape(3, 1, 1)
+    return {name: layer[index] * factor if name in _COLOR else layer for name, layer in layers.items()}
+
+
+def scale(layers: Mapping[str, Tensor], factor: float) -> Layers:
+    """All light ``factor`` times as bright."""
+    return {name: layer * factor if name in _LIGHT else layer for name, layer in layers.items()}

@@ -1,0 +1,196 @@
+"""Training examples from crops: datasets on disk, folders of stacks with references, or anything with that interface."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.utils.data import Dataset as TorchDataset
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS
+from ngpt.network import features, padding
+from ngpt.network.augment import Augmentation, Layers
+from ngpt.network.model import ModelConfig
+from ngpt.repair import Repaired, repair
+from ngpt.stack import GradientStack
+
+# Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
+JITTER = 7
+
+
+class Crop(Protocol):
+    """One view with a reference and several inputs; what ``ngpt.dataset`` gives, and ``StackFolder``."""
+
+    scene: str
+    inputs: int
+    spp: tuple[int, ...]
+
+    def stack(self, k: int) -> GradientStack: ...
+
+    @property
+    def reference(self) -> np.ndarray: ...
+
+    @property
+    def reference_direct(self) -> np.ndarray: ...
+
+
+class StackCrop:
+    """The stacks of one folder and the reference they share."""
+
+    def __init__(self, folder: Path, stacks: list[Path], reference: Path):
+        self.scene, self.inputs = folder.name, len(stacks)
+        self._stacks, self._reference = stacks, reference
+        self.spp = tuple(int(ngpt.read(str(path)).attributes.get("ngpt:spp", 0)) for path in stacks)
+
+    def stack(self, k: int) -> GradientStack:
+        return ngpt.read(str(self._stacks[k]))
+
+    @property
+    def reference(self) -> np.ndarray:
+        return ngpt.read(str(self._reference))["primal"]
+
+    @property
+    def reference_direct(self) -> np.ndarray:
+        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
+        most = self._stacks[int(np.argmax(self.spp))]
+        for path in (self._reference, most):
+            stack = ngpt.read(str(path))
+            if "direct" in stack:
+                return stack["direct"]
+        return np.zeros_like(stack["primal"])
+
+
+class StackFolder(Sequence[StackCrop]):
+    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
+
+    Raises NgptError where a folder has stacks without a reference, or sizes differ.
+    """
+
+    def __init__(self, folder: str | Path):
+        self._crops = []
+        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
+            stacks = sorted(path for path in view.glob("*.exr") if path.name != "reference.exr")
+            reference = view / "reference.exr"
+            if not stacks:
+                continue
+            if not reference.is_file():
+                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
+            self._crops.append(StackCrop(view, stacks, reference))
+        if not self._crops:
+            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
+
+    def __len__(self) -> int:
+        return len(self._crops)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        return self._crops[index]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
+
+
+def open_crops(folder: str | Path) -> Sequence[Any]:
+    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
+    path = Path(folder)
+    if not path.is_dir():
+        raise NgptError(
+            f"{folder}: no such folder; make a dataset with: python -m data_gen --config ... --out {folder}"
+        )
+    if (path / "manifest.json").is_file():
+        from ngpt.dataset import Dataset
+
+        return Dataset(path)
+    return StackFolder(path)
+
+
+def layers_of(data: Repaired, config: ModelConfig, base: np.ndarray | None = None) -> Layers:
+    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); ``base`` unless needed."""
+    arrays: dict[str, np.ndarray] = {"primal": data.image, **data.features}
+    if data.dx is not None:
+        arrays |= {"dx": data.dx, "dy": data.dy}
+    if data.variances is not None:
+        # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
+        errors = (np.sqrt(np.nan_to_num(np.maximum(v, 0), nan=0, posinf=0)) for v in data.variances)
+        arrays |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
+    if config.base:
+        arrays["base"] = base_image(data, config) if base is None else base
+    return {name: torch.from_numpy(np.ascontiguousarray(arrays[name].transpose(2, 0, 1))) for name in config.inputs}
+
+
+def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:
+    """The reconstruction the network starts from, (H, W, 3), without direct emission."""
+    method = METHODS[config.base]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return method.run(data, **method.options).astype(np.float32, copy=False)
+
+
+class Examples(TorchDataset):
+    """Endless training examples, each a function of its index and the seed: whoever asks, and when.
+
+    Example ``i`` is one crop with one of its inputs, at random, normalised, augmented and padded: a dict of layers
+    (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the middle of that, where no padding is
+    whatever its jitter [NGPT's code]. ``size`` divides the crops: larger ones are cut at random.
+    """
+
+    def __init__(self, crops: Sequence[Any], config: ModelConfig, augmentation: Augmentation, size: int, seed: int):
+        self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
+        self._bases: dict[tuple[int, int], np.ndarray] = {}
+
+    def __len__(self) -> int:
+        return 2**62
+
+    def __getitem__(self, index: int) -> Layers:
+        rng = np.random.default_rng((self.seed, index))
+        # Uniform over crops, whatever the number of their inputs.
+        which = int(rng.integers(len(self.crops)))
+        crop = self.crops[which]
+        k = int(rng.integers(crop.inputs))
+        layers = self._layers(which, k)
+        layers["target"] = torch.from_numpy(
+            np.ascontiguousarray((crop.reference - crop.reference_direct).transpose(2, 0, 1))
+        )
+        layers = self.augmentation(_scaled(self._cut(layers, rng)), rng)
+        top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
+        padded = padding.pad(layers, (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left))
+        edge = padding.MARGIN + JITTER
+        padded["target"] = padded["target"][..., edge:-edge, edge:-edge]
+        return {name: layer.contiguous() for name, layer in padded.items()}
+
+    def _layers(self, which: int, k: int) -> Layers:
+        data = repair(self.crops[which].stack(k))
+        base = None
+        if self.config.base:
+            # Seen again and again, and dear; what augmentation does to the input it does to the base.
+            if (which, k) not in self._bases:
+                self._bases[which, k] = base_image(data, self.config)
+            base = self._bases[which, k]
+        return layers_of(data, self.config, base)
+
+    def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
+        height, width = layers["primal"].shape[-2:]
+        if height < self.size or width < self.size:
+            raise NgptError(
+                f"a crop is {width}x{height}, smaller than the {self.size} pixels of an example; lower 'crop'"
+            )
+        y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
+        return {name: layer[..., y : y + self.size, x : x + self.size] for name, layer in layers.items()}
+
+
+def _scaled(layers: Layers) -> Layers:
+    batch = {name: layer[None] for name, layer in layers.items()}
+    target = batch.pop("target")
+    scaled, exposure = features.normalised(batch)
+    return {name: layer[0] for name, layer in (scaled | {"target": target / exposure}).items()}
+
+
+def split(crops: Sequence[Any], validation: tuple[str, ...]) -> tuple[list[Any], list[Any]]:
+    """Training and validation crops; whole scenes of which the name starts with one of ``validation`` are kept out."""
+    held = [crop.scene.startswith(tuple(validation)) if validation else False for crop in crops]
+    return [c for c, out in zip(crops, held, strict=True) if not out], [
+        c for c, out in zip(crops, held, strict=True) if out
+    ]

@@ -1,0 +1,122 @@
+"""A neural reconstruction as a whole: its configuration, the network, and what is around it."""
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+
+from ngpt.errors import NgptError
+from ngpt.network import features, padding
+from ngpt.network.transfer import signed_exp, signed_log
+from ngpt.network.unet import DenseUNet, PlainUNet
+
+NETWORKS = ("dense", "plain")
+# The classical reconstructions a network can start from: those that cost less than itself.
+BASES = ("l2", "cv", "wcv")
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a reconstruction is made of.
+
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain)
+    ``units``     for each level, units on the way down and again on the way up (dense only)
+    ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
+    ``base``      the method whose result it corrects, in the logarithm; "" predicts the image itself, as NGPT does
+    """
+
+    network: str
+    channels: tuple[int, ...]
+    units: tuple[int, ...]
+    inputs: tuple[str, ...]
+    base: str = ""
+
+    def __post_init__(self) -> None:
+        if self.network not in NETWORKS:
+            raise NgptError(f"network '{self.network}': choose one of: {', '.join(NETWORKS)}")
+        for name in ("channels", "units", "inputs"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in self.inputs:
+            if name not in features.CHANNELS:
+                raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
+        if "primal" not in self.inputs or len(set(self.inputs)) < len(self.inputs):
+            raise NgptError(f"inputs {', '.join(self.inputs)}: each once, and 'primal' among them")
+        if not self.channels or min(self.channels) < 1:
+            raise NgptError(f"channels {list(self.channels)}: give a positive number for each level")
+        if self.network == "dense" and (len(self.units) != len(self.channels) or min(self.units) < 1):
+            raise NgptError(f"units {list(self.units)}: give a positive number for each of {len(self.channels)} levels")
+        if self.base and self.base not in BASES:
+            raise NgptError(f"base '{self.base}': choose one of: {', '.join(BASES)}")
+        if bool(self.base) != ("base" in self.inputs):
+            raise NgptError(f"base is '{self.base}' while inputs are {', '.join(self.inputs)}: give both or none")
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The layers a stack must hold, by the names of the contract."""
+        names = {"primal"}
+        for name in self.inputs:
+            names |= {name.replace("_se", "_var")} - {"base"}
+        if self.base:
+            names |= {"dx", "dy"}
+        if self.base == "wcv":
+            names |= {"primal_var", "dx_var", "dy_var"}
+        order = ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var")
+        return tuple(name for name in order if name in names)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as TOML and JSON have them."""
+        return asdict(self)
+
+
+class Reconstructor(nn.Module):
+    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear, without direct emission.
+
+        exposure, depth scale -> padding -> channels -> network -> (+ log of the base) -> exp -> crop -> exposure
+
+    Any H and W. Proportional to the exposure: what goes in ``k`` times as bright comes out ``k`` times as bright. The
+    result is bounded by the range of the primal, and 0. Layers hold finite values; see ``ModelConfig.inputs``.
+    """
+
+    def __init__(self, config: ModelConfig):
+        super().__init__()
+        self.config = config
+        inputs, correction = features.channels(config.inputs), bool(config.base)
+        self.network = (
+            DenseUNet(inputs, config.channels, config.units, zero=correction)
+            if config.network == "dense"
+            else PlainUNet(inputs, config.channels, zero=correction)
+        )
+
+    @property
+    def alignment(self) -> int:
+        """What both sides of the padded image are divisible by."""
+        return self.network.alignment
+
+    def forward(self, layers: Mapping[str, Tensor]) -> Tensor:
+        height, width = layers["primal"].shape[-2:]
+        scaled, exposure = features.normalised({name: layers[name] for name in self.config.inputs})
+        bounds = self.bounds(scaled["primal"])
+        pads = padding.pads(height, width, self.alignment)
+        logarithm = padding.crop(self.predict(padding.pad(scaled, pads)), pads)
+        return signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1])) * exposure
+
+    def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
+        """The signed log of the image, unbounded, from layers that are normalised and padded; float32."""
+        # Channels last is the layout convolutions are fastest in, by half on CPUs.
+        x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
+        logarithm = self.network(x).float()
+        return logarithm + signed_log(scaled["base"]) if self.config.base else logarithm
+
+    @staticmethod
+    def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:
+        """The least and the largest logarithm that images of such a primal (N, 3, H, W) may have, (N, 1, 1, 1)."""
+        low, high = torch.aminmax(primal.flatten(1), dim=1)
+        return tuple(signed_log(bound).reshape(-1, 1, 1, 1) for bound in (low.clamp(max=0), high.clamp(min=0)))
+
+
+def parameters(module: nn.Module) -> int:
+    """The number of trainable numbers."""
+    return sum(p.numel() for p in module.parameters())

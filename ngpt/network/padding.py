@@ -1,0 +1,65 @@
+"""Padding by reflection to sizes a U-Net takes, for images and, with the right signs, for their gradients."""
+
+from collections.abc import Mapping
+
+import torch
+from torch import Tensor
+
+# Pixels added on every side at least, so that borders look like the inside of an image [NGPT's code].
+MARGIN = 8
+
+Pads = tuple[int, int, int, int]
+
+
+def pads(height: int, width: int, alignment: int, margin: int = MARGIN) -> Pads:
+    """(top, bottom, left, right): ``margin`` all around, and more below and right up to multiples of ``alignment``."""
+    return (
+        margin,
+        margin + -(height + 2 * margin) % alignment,
+        margin,
+        margin + -(width + 2 * margin) % alignment,
+    )
+
+
+def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
+    """The layers (..., H, W) with reflected borders; the border pixels themselves are not repeated.
+
+    dx and dy become the differences of the reflected image: across a mirror their sign is the other one, and the unused
+    last column of dx (row of dy), inside the image now, is that of its mirror. Sizes smaller than the padding are
+    reflected to and fro.
+    """
+    height, width = next(iter(layers.values())).shape[-2:]
+    device = next(iter(layers.values())).device
+    rows, columns = _mirror(height, *pads[:2], device), _mirror(width, *pads[2:], device)
+    padded = {}
+    for name, layer in layers.items():
+        if name in ("dx", "dx_se"):
+            padded[name] = _differences(layer, columns, -1, signed=name == "dx").index_select(-2, rows[:-1])
+        elif name in ("dy", "dy_se"):
+            padded[name] = _differences(layer, rows, -2, signed=name == "dy").index_select(-1, columns[:-1])
+        else:
+            padded[name] = layer.index_select(-2, rows[:-1]).index_select(-1, columns[:-1])
+    return padded
+
+
+def crop(image: Tensor, pads: Pads) -> Tensor:
+    """What ``pad`` was given, back from (..., H + top + bottom, W + left + right)."""
+    top, bottom, left, right = pads
+    return image[..., top : image.shape[-2] - bottom, left : image.shape[-1] - right]
+
+
+def _mirror(size: int, before: int, after: int, device: torch.device) -> Tensor:
+    """Which pixel lies at -before, ..., size - 1 + after, and one beyond."""
+    period = max(2 * (size - 1), 1)
+    wave = torch.arange(-before, size + after + 1, device=device) % period
+    return torch.where(wave < size, wave, period - wave)
+
+
+def _differences(layer: Tensor, pixels: Tensor, axis: int, signed: bool) -> Tensor:
+    """Differences (or their standard errors) between each of ``pixels`` and the next."""
+    here, there = pixels[:-1], pixels[1:]
+    values = layer.index_select(axis, torch.minimum(here, there))
+    # 0 only where the image is one pixel wide.
+    step = (there - here).to(layer.dtype)
+    step = step if signed else step.abs()
+    return values * (step if axis == -1 else step[:, None])

@@ -1,0 +1,187 @@
+"""The networks: the dense U-Net of NGPT and a plain one of equal capacity.
+
+    level 0   input ─ units ───────────────────────────────┬─ units ─ head ─ RGB
+                         └─ pool                        unpool
+    level 1                └─ units ────────────┬─ units ─┘
+                                └─ pool      unpool
+    level 2                       └─ units ─ units ┘          (... one block more for each level)
+
+At every level of the dense U-Net there is one list of tensors, which only grows: its input, what each unit adds, the
+tensor that comes up from below, what the later units add. Each unit, the pool, the unpool and the head read the whole
+list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU with slope 0.01,
+convolutions pad with zeros.
+
+Any size whose sides are divisible by 2^(levels - 1) goes in; ``ngpt.network.padding`` sees to that.
+"""
+
+import math
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import conv2d, conv_transpose2d, leaky_relu
+
+SLOPE = 0.01
+
+
+class Convolution(nn.Module):
+    """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
+
+    √2 keeps the variance of what passes leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
+    2015]. ``kernel`` 1 and 3 keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose and
+    doubles it.
+    """
+
+    def __init__(self, inputs: int, outputs: int, kernel: int | str, activation: bool = True):
+        super().__init__()
+        self.kernel, self.activation = kernel, activation
+        size = 2 if isinstance(kernel, str) else kernel
+        self.transposed = kernel == "unpool"
+        shape = (inputs, outputs, size, size) if self.transposed else (outputs, inputs, size, size)
+        self.v = nn.Parameter(torch.empty(shape))
+        self.s = nn.Parameter(torch.ones(outputs))
+        self.bias = nn.Parameter(torch.zeros(outputs))
+        # The function depends on v's direction only, but the speed at which Adam turns it on its length.
+        std = 1.612 / math.sqrt(inputs * size * size)
+        nn.init.trunc_normal_(self.v, std=std, a=-2 * std, b=2 * std)
+
+    def weight(self) -> Tensor:
+        """The normalised weights, in the layout of PyTorch's convolutions."""
+        output = 1 if self.transposed else 0
+        others = [axis for axis in range(4) if axis != output]
+        norm = torch.sqrt(1e-8 + torch.sum(self.v * self.v, others, keepdim=True))
+        shape = [1, 1, 1, 1]
+        shape[output] = -1
+        return self.v * (math.sqrt(2) * self.s.reshape(shape) / norm)
+
+    def forward(self, x: Tensor) -> Tensor:
+        if self.kernel == "unpool":
+            x = conv_transpose2d(x, self.weight(), self.bias, stride=2)
+        elif self.kernel == "pool":
+            x = conv2d(x, self.weight(), self.bias, stride=2)
+        else:
+            x = conv2d(x, self.weight(), self.bias, padding=self.kernel // 2)
+        return leaky_relu(x, SLOPE) if self.activation else x
+
+
+class Head(nn.Module):
+    """The last 1x1 convolution, to ``outputs`` channels: float32, whatever autocast does, and not activated.
+
+    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for networks that predict a correction: it
+    starts as none, and its weights are not normalised, since what is to be small should not need a direction first.
+    """
+
+    def __init__(self, inputs: int, outputs: int, zero: bool):
+        super().__init__()
+        if zero:
+            self.convolution: nn.Module = nn.Conv2d(inputs, outputs, 1)
+            nn.init.zeros_(self.convolution.weight)
+            nn.init.zeros_(self.convolution.bias)
+        else:
+            self.convolution = Convolution(inputs, outputs, 1, activation=False)
+
+    def forward(self, x: Tensor) -> Tensor:
+        with torch.autocast(x.device.type, enabled=False):
+            return self.convolution(x.float())
+
+
+class Unit(nn.Module):
+    """What a dense block is made of: 1x1 to 2g channels, 3x3 to the g channels that the unit adds to the list."""
+
+    def __init__(self, inputs: int, growth: int):
+        super().__init__()
+        self.squeeze = Convolution(inputs, 2 * growth, 1)
+        self.grow = Convolution(2 * growth, growth, 3)
+
+    def forward(self, tensors: list[Tensor]) -> Tensor:
+        return self.grow(self.squeeze(torch.cat(tensors, 1)))
+
+
+def radius(convolutions: list[int]) -> int:
+    """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
+
+    One reaches as far as its level's pixels are wide; the coarsest pixel spreads what any pixel in it holds to all of it.
+    """
+    return sum(n << level for level, n in enumerate(convolutions)) + (1 << len(convolutions) - 1) - 1
+
+
+class DenseUNet(nn.Module):
+    """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
+
+    ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
+    on the way down and again on the way up. ``zero`` as of ``Head``. ``radius`` is that of the receptive field.
+    """
+
+    def __init__(
+        self, inputs: int, growth: tuple[int, ...], units: tuple[int, ...], outputs: int = 3, zero: bool = False
+    ):
+        super().__init__()
+        levels = len(growth)
+        self.alignment = 2 ** (levels - 1)
+        self.radius = radius([2 * n for n in units])
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        self.pool, self.unpool = nn.ModuleList(), nn.ModuleList()
+        channels, dense = inputs, []
+        for level, (g, n) in enumerate(zip(growth, units, strict=True)):
+            self.down.append(nn.ModuleList(Unit(channels + i * g, g) for i in range(n)))
+            dense.append(channels + n * g)
+            if level + 1 < levels:
+                channels = 2 * growth[level + 1]
+                self.pool.append(Convolution(dense[level], channels, "pool"))
+        for level in reversed(range(levels)):
+            g, n = growth[level], units[level]
+            if level + 1 < levels:
+                self.unpool.insert(0, Convolution(dense[level + 1], 2 * g, "unpool"))
+                dense[level] += 2 * g
+            self.up.insert(0, nn.ModuleList(Unit(dense[level] + i * g, g) for i in range(n)))
+            dense[level] += n * g
+        self.head = Head(dense[0], outputs, zero)
+
+    def forward(self, x: Tensor) -> Tensor:
+        lists = []
+        for level, units in enumerate(self.down):
+            tensors = [x]
+            for unit in units:
+                tensors.append(unit(tensors))
+            lists.append(tensors)
+            if level < len(self.pool):
+                x = self.pool[level](torch.cat(tensors, 1))
+        for level in reversed(range(len(lists))):
+            if level < len(self.unpool):
+                lists[level].append(self.unpool[level](torch.cat(lists[level + 1], 1)))
+            for unit in self.up[level]:
+                lists[level].append(unit(lists[level]))
+        return self.head(torch.cat(lists[0], 1))
+
+
+class PlainUNet(nn.Module):
+    """The ablation partner: two 3x3 convolutions per level and direction, one skip connection per level.
+
+    (N, inputs, H, W) to (N, outputs, H, W), as ``DenseUNet``, with the same building stones.
+    """
+
+    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int = 3, zero: bool = False):
+        super().__init__()
+        self.alignment = 2 ** (len(widths) - 1)
+        self.radius = radius([4] * (len(widths) - 1) + [2])
+        self.down, self.up = nn.ModuleList(), nn.ModuleList()
+        self.pool, self.unpool = nn.ModuleList(), nn.ModuleList()
+        channels = inputs
+        for level, width in enumerate(widths):
+            self.down.append(nn.Sequential(Convolution(channels, width, 3), Convolution(width, width, 3)))
+            if level + 1 < len(widths):
+                self.pool.append(Convolution(width, width, "pool"))
+                self.unpool.append(Convolution(widths[level + 1], width, "unpool"))
+                self.up.append(nn.Sequential(Convolution(2 * width, width, 3), Convolution(width, width, 3)))
+            channels = width
+        self.head = Head(widths[0], outputs, zero)
+
+    def forward(self, x: Tensor) -> Tensor:
+        skips = []
+        for level, block in enumerate(self.down):
+            x = block(x)
+            if level < len(self.pool):
+                skips.append(x)
+                x = self.pool[level](x)
+        for level in reversed(range(len(skips))):
+            x = self.up[level](torch.cat([skips[level], self.unpool[level](x)], 1))
+        return self.head(x)

@@ -1,0 +1,87 @@
+"""Weights on disk: safetensors with the whole configuration in the header. Nothing is ever unpickled."""
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+from torch import Tensor
+
+from ngpt.errors import NgptError
+from ngpt.files import atomic_output
+from ngpt.network.model import ModelConfig, Reconstructor
+
+FORMAT = 1
+
+
+def write_tensors(
+    path: str | Path, tensors: dict[str, Tensor], header: dict[str, Any], overwrite: bool = False
+) -> None:
+    """Tensors and ``header`` (anything JSON can hold) in one file, complete or not there at all."""
+    tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    with atomic_output(path, overwrite) as temporary:
+        save_file(tensors, str(temporary), metadata={"ngpt": json.dumps({"format": FORMAT} | header)})
+
+
+def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    """What ``write_tensors`` wrote. Raises NgptError for anything else."""
+    if not Path(path).is_file():
+        raise NgptError(f"{path}: no such file")
+    try:
+        with safe_open(str(path), framework="pt") as file:
+            header = json.loads((file.metadata() or {}).get("ngpt", "null"))
+            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
+    except (SafetensorError, OSError, ValueError) as error:
+        raise NgptError(f"{path}: not a readable safetensors file: {error}") from error
+    if not isinstance(header, dict) or "format" not in header:
+        raise NgptError(f"{path}: holds no configuration of ngpt in its header; it was written by something else")
+    if header["format"] != FORMAT:
+        raise NgptError(f"{path}: is of format {header['format']}, this version reads {FORMAT}; update ngpt-recon")
+    return tensors, header
+
+
+def save_weights(path: str | Path, model: Reconstructor, provenance: dict[str, Any], overwrite: bool = False) -> None:
+    """A model that ``load_weights`` reads back; ``provenance`` says how it was trained."""
+    header = {"kind": "weights", "model": model.config.to_dict(), "training": provenance}
+    write_tensors(path, model.state_dict(), header, overwrite)
+
+
+def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
+    """The model, ready for inference, and the header of its file.
+
+    Raises NgptError where the file is no weights of ngpt, tensors are missing, superfluous, of another shape, or hold
+    values that are not finite.
+    """
+    tensors, header = read_tensors(path)
+    if header.get("kind") != "weights":
+        raise NgptError(f"{path}: holds a {header.get('kind', 'something')}, not weights; pass weights.safetensors")
+    try:
+        model = Reconstructor(ModelConfig(**header["model"]))
+    except (TypeError, KeyError, ValueError) as error:
+        raise NgptError(f"{path}: its configuration cannot be read: {error}") from error
+    fill(model, tensors, str(path))
+    return model.eval(), header
+
+
+def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None:
+    """Sets all of a module's parameters; ``path`` is for messages."""
+    own = module.state_dict()
+    missing, extra = own.keys() - tensors.keys(), tensors.keys() - own.keys()
+    if missing or extra:
+        what = "lacks" if missing else "has an unexpected"
+        name = sorted(missing or extra)[0]
+        raise NgptError(f"{path}: {what} tensor '{name}' ({len(missing)} missing, {len(extra)} too many)")
+    for name, tensor in tensors.items():
+        if tensor.shape != own[name].shape:
+            raise NgptError(f"{path}: tensor '{name}' is {list(tensor.shape)}, the model's is {list(own[name].shape)}")
+        if not torch.isfinite(tensor).all():
+            raise NgptError(f"{path}: tensor '{name}' holds values that are not finite; the file is damaged")
+    module.load_state_dict(tensors)
+
+
+def random_state(seed: int, step: int) -> int:
+    """A seed for everything random that belongs to one training step."""
+    return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)

@@ -1,0 +1,201 @@
+"""The networks: their size, what they see, and the reconstruction around them."""
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from ngpt.errors import NgptError  # noqa: E402
+from ngpt.network import features, padding  # noqa: E402
+from ngpt.network.cost import per_pixel  # noqa: E402
+from ngpt.network.inference import reconstruct  # noqa: E402
+from ngpt.network.model import ModelConfig, Reconstructor, parameters  # noqa: E402
+from ngpt.network.unet import Convolution, DenseUNet, PlainUNet  # noqa: E402
+
+NGPT = ("primal", "dx", "dy", "albedo", "normal", "depth")
+PAPER = {"network": "dense", "channels": (40, 80, 80, 80), "units": (4, 3, 2, 2)}
+
+
+def tiny(network="dense", inputs=NGPT, base=""):
+    torch.manual_seed(0)
+    config = ModelConfig(network, (4, 6, 8), (1, 2, 1), inputs + (("base",) if base else ()), base)
+    model = Reconstructor(config)
+    if base:
+        torch.nn.init.normal_(model.network.head.convolution.weight, std=0.1)
+    return model.eval()
+
+
+def layers(height, width, inputs=NGPT, seed=0):
+    generator = torch.Generator().manual_seed(seed)
+    return {name: torch.rand(1, features.CHANNELS[name], height, width, generator=generator) for name in inputs}
+
+
+def test_the_papers_network_has_the_papers_parameters():
+    # Read from the released checkpoints.
+    model = Reconstructor(ModelConfig(**PAPER, inputs=NGPT))
+    net = model.network
+    assert parameters(model) == 4_358_534
+    assert [parameters(block) for block in net.down] == [140_480, 462_240, 295_360, 295_360]
+    assert [parameters(block) for block in net.up] == [217_280, 654_240, 397_760, 346_560]
+    assert [parameters(pool) for pool in net.pool] == [112_960, 256_320, 205_120]
+    assert [parameters(unpool) for unpool in net.unpool] == [256_160, 409_920, 307_520]
+    assert parameters(net.head) == 1_254
+    assert len([m for m in model.modules() if isinstance(m, Convolution)]) == 51
+    assert round(per_pixel(model)[0] / 1000) == 830
+
+
+def test_without_gradients_it_has_fewer():
+    model = Reconstructor(ModelConfig(**PAPER, inputs=("primal", "albedo", "normal", "depth")))
+    assert parameters(model) == 4_350_836
+
+
+@pytest.mark.parametrize("kernel", [1, 3, "pool", "unpool"])
+def test_weights_have_norm_root_two_whatever_their_scale(kernel):
+    convolution = Convolution(5, 7, kernel)
+    torch.nn.init.normal_(convolution.v, std=123)
+    output = 1 if kernel == "unpool" else 0
+    norms = convolution.weight().transpose(0, output).flatten(1).norm(dim=1)
+    assert torch.allclose(norms, torch.full((7,), 2**0.5), rtol=1e-5)
+
+
+@pytest.mark.parametrize("network", ["dense", "plain"])
+def test_the_receptive_field_is_as_stated_and_no_smaller_than_needed(network):
+    torch.manual_seed(1)
+    net = DenseUNet(3, (4, 4, 4), (1, 2, 1)) if network == "dense" else PlainUNet(3, (4, 4, 4))
+    size = 8 * net.alignment * 4
+    x = torch.rand(1, 3, size, size, requires_grad=True)
+    reach = 0
+    # The reach depends on where in its coarsest pixel the output lies.
+    for offset in range(net.alignment):
+        center = size // 2 + offset
+        (gradient,) = torch.autograd.grad(net(x)[0, :, center, center].sum(), x)
+        seen = torch.nonzero(gradient[0].abs().sum(0))
+        reach = max(reach, int((seen - center).abs().max()))
+    assert reach == net.radius
+
+
+@pytest.mark.parametrize("network", ["dense", "plain"])
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 16), (37, 53)])
+def test_any_size_goes_in(network, size):
+    model = tiny(network)
+    with torch.no_grad():
+        assert model(layers(*size)).shape == (1, 3, *size)
+
+
+def test_tiles_do_not_show():
+    model = tiny(base="wcv")
+    data = layers(90, 130, model.config.inputs)
+    with torch.no_grad():
+        whole = model(data)
+    assert model.network.radius < 40
+    tiled = reconstruct(model, data, tile=96)
+    assert torch.allclose(tiled, whole, rtol=1e-5, atol=1e-6)
+    # The test would see tiles that overlap too little.
+    model.network.radius = 0
+    assert not torch.allclose(reconstruct(model, data, tile=96), whole, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("base", ["", "wcv"])
+@pytest.mark.parametrize("stops", [-10, -1, 10, 40])
+def test_exposure_changes_nothing(base, stops):
+    model = tiny(base=base)
+    data = layers(24, 40, model.config.inputs)
+    k = 2.0**stops
+    scaled = {name: layer * k if name in features.RADIANCE else layer for name, layer in data.items()}
+    with torch.no_grad():
+        assert torch.allclose(model(scaled), k * model(data), rtol=1e-4)
+
+
+def test_a_firefly_stays_local():
+    model = tiny()
+    data = layers(64, 256)
+    # So that an untrained network's bounds are out of the way.
+    data["primal"][..., 0, 0] = 1e6
+    lit = {name: layer.clone() for name, layer in data.items()}
+    lit["primal"][..., 30, 40] = 1e6
+    with torch.no_grad():
+        before, after = model(data), model(lit)
+    far = slice(40 + model.network.radius + 16, None)
+    # Where an untrained network's image crosses zero, one percent of a pixel is nothing.
+    assert ((after - before).abs() <= 0.01 * (before.abs() + 0.1))[..., far].all()
+    assert torch.isfinite(after).all()
+
+
+@pytest.mark.parametrize("value", [0.0, 65504.0, 1e12])
+def test_extreme_radiance_is_bounded_by_itself(value):
+    model = tiny()
+    data = layers(16, 24)
+    data["primal"] = torch.full_like(data["primal"], value)
+    data["dx"], data["dy"] = torch.randn_like(data["dx"]) * value, torch.randn_like(data["dy"]) * value
+    with torch.no_grad():
+        image = model(data)
+    assert torch.isfinite(image).all() and image.min() >= 0 and image.max() <= value * 1.0001
+
+
+@pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.1), ("float16", 0.02)])
+def test_sixteen_bits_are_close(precision, bound):
+    model = tiny()
+    data = layers(32, 32)
+    with torch.no_grad():
+        exact = model(data)
+        with torch.autocast("cpu", getattr(torch, precision)):
+            rounded = model(data)
+    assert rounded.dtype == torch.float32
+    error = ((rounded - exact).abs() / exact.abs().clamp(min=0.1)).max()
+    assert 0 < error < bound
+
+
+def test_an_untrained_correction_is_its_base():
+    config = ModelConfig("dense", (4, 6), (1, 1), (*NGPT, "base"), "wcv")
+    data = layers(20, 20, config.inputs)
+    data["base"] = data["base"] * data["primal"].amax()
+    with torch.no_grad():
+        assert torch.allclose(Reconstructor(config)(data), data["base"], rtol=1e-4, atol=1e-5)
+
+
+def test_exposure_is_the_typical_radiance():
+    image = torch.full((2, 3, 64, 64), 0.5)
+    image[1] = 0
+    scale = features.exposure(image)
+    assert scale.flatten().tolist() == pytest.approx([0.5 / features.KEY, 1])
+    image[0, :, :16] = 1e9
+    assert features.exposure(image)[0].item() == pytest.approx(0.5 / features.KEY)
+    # Black surroundings do not count.
+    image[0, :, 20:] = 0
+    image[0, :, :20] = 0.25
+    assert features.exposure(image)[0].item() == pytest.approx(0.25 / features.KEY, rel=0.8)
+
+
+def test_channels_are_where_the_paper_has_them():
+    data = layers(8, 8)
+    data["primal"] -= 0.5
+    data["dx"] -= 0.5
+    x = features.encode(data, NGPT)
+    assert x.shape[1] == features.channels(NGPT) == 16
+    assert torch.equal(x[:, :3], torch.log1p(data["primal"].clamp(min=0)))
+    assert torch.equal(x[:, 3:6], data["dx"].sign() * torch.log1p(data["dx"].abs()))
+    assert torch.equal(x[:, 9:12], data["albedo"]) and torch.equal(x[:, 15:], data["depth"])
+
+
+def test_errors_are_explained():
+    with pytest.raises(NgptError, match="network 'round'"):
+        ModelConfig("round", (4,), (1,), NGPT)
+    with pytest.raises(NgptError, match="input 'colour' is unknown"):
+        ModelConfig("dense", (4,), (1,), ("primal", "colour"))
+    with pytest.raises(NgptError, match="'primal' among them"):
+        ModelConfig("dense", (4,), (1,), ("albedo",))
+    with pytest.raises(NgptError, match="each of 2 levels"):
+        ModelConfig("dense", (4, 4), (1,), NGPT)
+    with pytest.raises(NgptError, match="base is 'l2'"):
+        ModelConfig("dense", (4, 4), (1, 1), NGPT, "l2")
+
+
+def test_what_a_stack_must_hold():
+    assert ModelConfig("plain", (4,), (), ("primal", "albedo")).needs == ("primal", "albedo")
+    config = ModelConfig("plain", (4,), (), ("primal", "base", "dx_se"), "wcv")
+    assert config.needs == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
+
+
+def test_alignment_and_padding_fit():
+    for size in range(1, 40):
+        top, bottom, _, _ = padding.pads(size, size, 8)
+        assert (size + top + bottom) % 8 == 0 and top == padding.MARGIN <= bottom < padding.MARGIN + 8
