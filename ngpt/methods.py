@@ -88,13 +88,13 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
 
 
 def _neural(name: str) -> dict[str, Any]:
-    """The part of an entry that all networks share: the weights of that name in the package, unless others are given."""
+    """What the entries of all networks share; they take the weights of that name in the package, or a file."""
     shipped = WEIGHTS / f"{name}.safetensors"
 
     def missing() -> str:
         if find_spec("torch") is None or find_spec("safetensors") is None:
             return "PyTorch is not installed: pip install 'ngpt-recon[train]'"
-        return "" if shipped.is_file() else f"no weights are shipped for it: pass weights=FILE, as train.py makes them"
+        return "" if shipped.is_file() else "no weights are shipped for it: pass weights=FILE, as train.py makes them"
 
     def run(data: Repaired, weights: str, device: str) -> np.ndarray:
         lack = missing()

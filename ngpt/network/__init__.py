@@ -1,1 +1,1 @@
-"""The neural reconstruction: network, training and inference in PyTorch. Nothing here is imported by ``import ngpt``."""
+"""The neural reconstruction: network, training and inference in PyTorch. ``import ngpt`` imports none of it."""

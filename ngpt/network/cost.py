@@ -1,24 +1,29 @@
 """What a network costs, before one trains it."""
 
+from typing import Any
+
 import torch
 
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.settings import Settings
+from ngpt.network.unet import Convolution
 
 
 def per_pixel(model: Reconstructor) -> tuple[float, float]:
     """For each pixel of the (padded) image: multiplications, and numbers that go in and out of convolutions."""
     size, macs, numbers = 8 * model.alignment, 0, 0
 
-    def count(module: torch.nn.Module, args: tuple, output: torch.Tensor) -> None:
+    def count(module: Any, args: tuple, output: torch.Tensor) -> None:
         nonlocal macs, numbers
+        weight = module.v if isinstance(module, Convolution) else module.weight
         # Of a transposed 2x2 kernel with stride 2 each output pixel sees one tap, of any other all of them.
-        taps = module.v.shape[0] if module.transposed else module.v[0].numel()
+        taps = weight.shape[0] if getattr(module, "kind", "") == "unpool" else weight[0].numel()
         macs += taps * output.numel()
         numbers += args[0].numel() + output.numel()
 
-    hooks = [m.register_forward_hook(count) for m in model.modules() if hasattr(m, "transposed")]
+    kinds = (Convolution, torch.nn.Conv2d)
+    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds)]
     with torch.no_grad():
         device = next(model.parameters()).device
         model.network(torch.zeros(1, features.channels(model.config.inputs), size, size, device=device))

@@ -1,4 +1,4 @@
-"""Training examples from crops: datasets on disk, folders of stacks with references, or anything with that interface."""
+"""Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -6,7 +6,6 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
-from torch import Tensor
 from torch.utils.data import Dataset as TorchDataset
 
 import ngpt

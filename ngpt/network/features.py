@@ -10,7 +10,8 @@
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
 [Kettunen et al. 2019, section 4.2 and their code; base and standard errors are ours.] Radiance is divided by the
-exposure before. What a configuration does not list, the network does not see: absent layers are never filled with zeros.
+exposure before. What a configuration does not list, the network does not see: absent layers are never filled with
+zeros.
 """
 
 from collections.abc import Mapping
@@ -67,7 +68,8 @@ def exposure(primal: Tensor) -> Tensor:
     """The typical radiance of images (N, 3, H, W), over ``KEY``: (N, 1, 1, 1), positive; 1 for black images.
 
     The median over blocks of 16x16 pixels, those that are not black, of their means: proportional to the image's
-    brightness, the same at any sample count but for noise, and indifferent to what a few pixels hold. Wants finite values.
+    brightness, the same at any sample count but for noise, and indifferent to what a few pixels hold. Wants finite
+    values.
     """
     size = min(_BLOCK, primal.shape[-2]), min(_BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)

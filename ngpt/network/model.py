@@ -114,7 +114,8 @@ class Reconstructor(nn.Module):
     def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:
         """The least and the largest logarithm that images of such a primal (N, 3, H, W) may have, (N, 1, 1, 1)."""
         low, high = torch.aminmax(primal.flatten(1), dim=1)
-        return tuple(signed_log(bound).reshape(-1, 1, 1, 1) for bound in (low.clamp(max=0), high.clamp(min=0)))
+        low, high = low.clamp(max=0), high.clamp(min=0)
+        return signed_log(low).reshape(-1, 1, 1, 1), signed_log(high).reshape(-1, 1, 1, 1)
 
 
 def parameters(module: nn.Module) -> int:

@@ -74,7 +74,7 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """All of a run. ``loss`` is read by ``ngpt.network.losses.make_loss``; ``initial`` is a file of weights to start from."""
+    """All of a run. ``loss`` is for ``ngpt.network.losses.make_loss``; ``initial`` names weights to start from."""
 
     model: ModelConfig
     data: DataSettings = field(default_factory=DataSettings)

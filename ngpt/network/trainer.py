@@ -214,8 +214,8 @@ class Trainer:
         path = self.out / f"bad-batch-{self.step:07d}.safetensors"
         weights.write_tensors(path, batch, {"kind": "batch", "step": self.step}, overwrite=True)
         raise NgptError(
-            f"step {self.step}: the loss is {total:.3g} and its gradient's norm {norm:.3g}; the batch is in {path}, the "
-            f"weights before it in {self.checkpoint}; lower the learning rate, set optimizer.clip, or use float32"
+            f"step {self.step}: the loss is {total:.3g} and its gradient's norm {norm:.3g}; the batch is in {path}, "
+            f"the weights before it in {self.checkpoint}; lower the learning rate, set optimizer.clip, or use float32"
         )
 
     def _start_from(self, path: str) -> None:

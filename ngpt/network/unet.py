@@ -8,8 +8,8 @@
 
 At every level of the dense U-Net there is one list of tensors, which only grows: its input, what each unit adds, the
 tensor that comes up from below, what the later units add. Each unit, the pool, the unpool and the head read the whole
-list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU with slope 0.01,
-convolutions pad with zeros.
+list [Kettunen et al. 2019, section 4.1 and figure 5]. Weights are normalised, activations are leaky ReLU with slope
+0.01, convolutions pad with zeros.
 
 Any size whose sides are divisible by 2^(levels - 1) goes in; ``ngpt.network.padding`` sees to that.
 """
@@ -27,15 +27,15 @@ class Convolution(nn.Module):
     """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
 
     √2 keeps the variance of what passes leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
-    2015]. ``kernel`` 1 and 3 keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose and
-    doubles it.
+    2015]. ``kind`` "1x1" and "3x3" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose
+    and doubles it.
     """
 
-    def __init__(self, inputs: int, outputs: int, kernel: int | str, activation: bool = True):
+    def __init__(self, inputs: int, outputs: int, kind: str, activation: bool = True):
         super().__init__()
-        self.kernel, self.activation = kernel, activation
-        size = 2 if isinstance(kernel, str) else kernel
-        self.transposed = kernel == "unpool"
+        self.kind, self.activation = kind, activation
+        self.transposed = kind == "unpool"
+        size = {"1x1": 1, "3x3": 3, "pool": 2, "unpool": 2}[kind]
         shape = (inputs, outputs, size, size) if self.transposed else (outputs, inputs, size, size)
         self.v = nn.Parameter(torch.empty(shape))
         self.s = nn.Parameter(torch.ones(outputs))
@@ -54,12 +54,12 @@ class Convolution(nn.Module):
         return self.v * (math.sqrt(2) * self.s.reshape(shape) / norm)
 
     def forward(self, x: Tensor) -> Tensor:
-        if self.kernel == "unpool":
+        if self.transposed:
             x = conv_transpose2d(x, self.weight(), self.bias, stride=2)
-        elif self.kernel == "pool":
+        elif self.kind == "pool":
             x = conv2d(x, self.weight(), self.bias, stride=2)
         else:
-            x = conv2d(x, self.weight(), self.bias, padding=self.kernel // 2)
+            x = conv2d(x, self.weight(), self.bias, padding="same")
         return leaky_relu(x, SLOPE) if self.activation else x
 
 
@@ -72,12 +72,13 @@ class Head(nn.Module):
 
     def __init__(self, inputs: int, outputs: int, zero: bool):
         super().__init__()
+        self.convolution: nn.Module
         if zero:
-            self.convolution: nn.Module = nn.Conv2d(inputs, outputs, 1)
-            nn.init.zeros_(self.convolution.weight)
-            nn.init.zeros_(self.convolution.bias)
+            self.convolution = nn.Conv2d(inputs, outputs, 1)
+            for parameter in self.convolution.parameters():
+                nn.init.zeros_(parameter)
         else:
-            self.convolution = Convolution(inputs, outputs, 1, activation=False)
+            self.convolution = Convolution(inputs, outputs, "1x1", activation=False)
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
@@ -89,8 +90,8 @@ class Unit(nn.Module):
 
     def __init__(self, inputs: int, growth: int):
         super().__init__()
-        self.squeeze = Convolution(inputs, 2 * growth, 1)
-        self.grow = Convolution(2 * growth, growth, 3)
+        self.squeeze = Convolution(inputs, 2 * growth, "1x1")
+        self.grow = Convolution(2 * growth, growth, "3x3")
 
     def forward(self, tensors: list[Tensor]) -> Tensor:
         return self.grow(self.squeeze(torch.cat(tensors, 1)))
@@ -99,7 +100,7 @@ class Unit(nn.Module):
 def radius(convolutions: list[int]) -> int:
     """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
 
-    One reaches as far as its level's pixels are wide; the coarsest pixel spreads what any pixel in it holds to all of it.
+    One reaches as far as its level's pixels are wide; a coarsest pixel spreads what any pixel in it holds to all of it.
     """
     return sum(n << level for level, n in enumerate(convolutions)) + (1 << len(convolutions) - 1) - 1
 
@@ -140,7 +141,7 @@ class DenseUNet(nn.Module):
         lists = []
         for level, units in enumerate(self.down):
             tensors = [x]
-            for unit in units:
+            for unit in units:  # type: ignore[attr-defined]
                 tensors.append(unit(tensors))
             lists.append(tensors)
             if level < len(self.pool):
@@ -148,7 +149,7 @@ class DenseUNet(nn.Module):
         for level in reversed(range(len(lists))):
             if level < len(self.unpool):
                 lists[level].append(self.unpool[level](torch.cat(lists[level + 1], 1)))
-            for unit in self.up[level]:
+            for unit in self.up[level]:  # type: ignore[attr-defined]
                 lists[level].append(unit(lists[level]))
         return self.head(torch.cat(lists[0], 1))
 
@@ -167,11 +168,11 @@ class PlainUNet(nn.Module):
         self.pool, self.unpool = nn.ModuleList(), nn.ModuleList()
         channels = inputs
         for level, width in enumerate(widths):
-            self.down.append(nn.Sequential(Convolution(channels, width, 3), Convolution(width, width, 3)))
+            self.down.append(nn.Sequential(Convolution(channels, width, "3x3"), Convolution(width, width, "3x3")))
             if level + 1 < len(widths):
                 self.pool.append(Convolution(width, width, "pool"))
                 self.unpool.append(Convolution(widths[level + 1], width, "unpool"))
-                self.up.append(nn.Sequential(Convolution(2 * width, width, 3), Convolution(width, width, 3)))
+                self.up.append(nn.Sequential(Convolution(2 * width, width, "3x3"), Convolution(width, width, "3x3")))
             channels = width
         self.head = Head(widths[0], outputs, zero)
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -229,7 +230,7 @@ def test_the_cosine_schedule():
     s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
     rates = [learning_rate(s, i, 110) for i in range(110)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
-    assert all(a >= b for a, b in zip(rates[10:], rates[11:], strict=False))
+    assert all(a >= b for a, b in pairwise(rates[10:]))
 
 
 def test_settings_are_checked(tmp_path):
@@ -293,7 +294,7 @@ def test_damaged_weights_are_explained(tmp_path):
         with pytest.raises(NgptError, match=complaint):
             weights.load_weights(path)
     weights.write_tensors(path, {k: v for k, v in tensors.items() if k != name}, header, overwrite=True)
-    with pytest.raises(NgptError, match="lacks tensor 'network.head.convolution.bias'"):
+    with pytest.raises(NgptError, match=r"lacks tensor 'network.head.convolution.bias'"):
         weights.load_weights(path)
     weights.write_tensors(path, tensors, header | {"format": 99}, overwrite=True)
     with pytest.raises(NgptError, match="format 99"):

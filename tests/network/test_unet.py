@@ -48,11 +48,11 @@ def test_without_gradients_it_has_fewer():
     assert parameters(model) == 4_350_836
 
 
-@pytest.mark.parametrize("kernel", [1, 3, "pool", "unpool"])
-def test_weights_have_norm_root_two_whatever_their_scale(kernel):
-    convolution = Convolution(5, 7, kernel)
+@pytest.mark.parametrize("kind", ["1x1", "3x3", "pool", "unpool"])
+def test_weights_have_norm_root_two_whatever_their_scale(kind):
+    convolution = Convolution(5, 7, kind)
     torch.nn.init.normal_(convolution.v, std=123)
-    output = 1 if kernel == "unpool" else 0
+    output = 1 if kind == "unpool" else 0
     norms = convolution.weight().transpose(0, output).flatten(1).norm(dim=1)
     assert torch.allclose(norms, torch.full((7,), 2**0.5), rtol=1e-5)
 
