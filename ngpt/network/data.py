@@ -107,8 +107,8 @@ def open_crops(folder: str | Path) -> Sequence[Any]:
     return StackFolder(path)
 
 
-def layers_of(data: Repaired, config: ModelConfig, base: np.ndarray | None = None) -> Layers:
-    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); ``base`` unless needed."""
+def layers_of(data: Repaired, config: ModelConfig) -> Layers:
+    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W)."""
     arrays: dict[str, np.ndarray] = {"primal": data.image, **data.features}
     if data.dx is not None:
         arrays |= {"dx": data.dx, "dy": data.dy}
@@ -117,7 +117,7 @@ def layers_of(data: Repaired, config: ModelConfig, base: np.ndarray | None = Non
         errors = (np.sqrt(np.nan_to_num(np.maximum(v, 0), nan=0, posinf=0)) for v in data.variances)
         arrays |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
     if config.base:
-        arrays["base"] = base_image(data, config) if base is None else base
+        arrays["base"] = base_image(data, config)
     return {name: torch.from_numpy(np.ascontiguousarray(arrays[name].transpose(2, 0, 1))) for name in config.inputs}
 
 
@@ -133,12 +133,22 @@ class Examples(TorchDataset):
 
     Example ``i`` is one crop with one of its inputs, at random, normalised, augmented and padded: a dict of layers
     (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the middle of that, where no padding is
-    whatever its jitter [NGPT's code]. ``size`` divides the crops: larger ones are cut at random.
+    whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random. What was read and prepared once is
+    kept in memory, up to ``cache`` bytes.
     """
 
-    def __init__(self, crops: Sequence[Any], config: ModelConfig, augmentation: Augmentation, size: int, seed: int):
+    def __init__(
+        self,
+        crops: Sequence[Any],
+        config: ModelConfig,
+        augmentation: Augmentation,
+        size: int,
+        seed: int,
+        cache: int = 0,
+    ):
         self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
-        self._bases: dict[tuple[int, int], np.ndarray] = {}
+        self._cache: dict[tuple[int, int], Layers] = {}
+        self._free = cache
 
     def __len__(self) -> int:
         return 2**62
@@ -149,11 +159,7 @@ class Examples(TorchDataset):
         which = int(rng.integers(len(self.crops)))
         crop = self.crops[which]
         k = int(rng.integers(crop.inputs))
-        layers = self._layers(which, k)
-        layers["target"] = torch.from_numpy(
-            np.ascontiguousarray((crop.reference - crop.reference_direct).transpose(2, 0, 1))
-        )
-        layers = self.augmentation(_scaled(self._cut(layers, rng)), rng)
+        layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
         top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
         padded = padding.pad(layers, (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left))
         edge = padding.MARGIN + JITTER
@@ -161,14 +167,16 @@ class Examples(TorchDataset):
         return {name: layer.contiguous() for name, layer in padded.items()}
 
     def _layers(self, which: int, k: int) -> Layers:
-        data = repair(self.crops[which].stack(k))
-        base = None
-        if self.config.base:
-            # Seen again and again, and dear; what augmentation does to the input it does to the base.
-            if (which, k) not in self._bases:
-                self._bases[which, k] = base_image(data, self.config)
-            base = self._bases[which, k]
-        return layers_of(data, self.config, base)
+        if (which, k) in self._cache:
+            return self._cache[which, k]
+        crop = self.crops[which]
+        layers = layers_of(repair(crop.stack(k)), self.config)
+        target = (crop.reference - crop.reference_direct).transpose(2, 0, 1)
+        layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
+        size = sum(layer.numel() * layer.element_size() for layer in layers.values())
+        if size <= self._free:
+            self._cache[which, k], self._free = layers, self._free - size
+        return layers
 
     def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
         height, width = layers["primal"].shape[-2:]

@@ -21,12 +21,14 @@ class DataSettings:
     ``validation``  beginnings of the names of scenes that are kept out of training
     ``crop``        pixels of an example's side
     ``workers``     processes that prepare examples; 0 prepares them in between
+    ``cache``       MiB of memory, for each of these, to keep what was prepared in
     """
 
     folders: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
     crop: int = 128
     workers: int = 0
+    cache: int = 2048
 
 
 @dataclass(frozen=True)

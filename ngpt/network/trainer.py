@@ -66,7 +66,14 @@ class Trainer:
         self.optimizer = torch.optim.Adam(self.model.parameters(), betas=settings.optimizer.betas, eps=1e-8)
         self.step, self.seconds = 0, 0.0
         self.held_out = views(held_out, settings.run.views)
-        self.examples = Examples(crops, settings.model, settings.augmentation, settings.data.crop, settings.run.seed)
+        self.examples = Examples(
+            crops,
+            settings.model,
+            settings.augmentation,
+            settings.data.crop,
+            settings.run.seed,
+            settings.data.cache << 20,
+        )
         if (settings.data.crop + 2 * padding.MARGIN) % self.model.alignment:
             raise NgptError(
                 f"data.crop = {settings.data.crop}: crop + {2 * padding.MARGIN} must be divisible by "

@@ -38,14 +38,6 @@ SETTINGS = {
 }
 
 
-@pytest.fixture(autouse=True)
-def two_threads():
-    before = torch.get_num_threads()
-    torch.set_num_threads(2)
-    yield
-    torch.set_num_threads(before)
-
-
 def loss(prediction, target, generator):
     """Random, so that resuming must restore the generator too."""
     weight = 1 + 0.1 * torch.rand(target.shape, generator=generator)
@@ -132,7 +124,7 @@ def test_a_killed_run_continues_bit_for_bit(tmp_path):
     """SIGKILL at a moment of its own choosing; what is on disk is whole, and leads to the same weights."""
     program = (
         "import sys; from pathlib import Path; sys.path[:0] = ['tests/network'];"
-        "import torch; torch.set_num_threads(2); import test_training as t;"
+        "import torch; torch.set_num_threads(1); import test_training as t;"
         "r = t.trainer(Path(sys.argv[1]), run_steps=40, run_save=3);"
         "r.resume() if r.checkpoint.exists() else None; r.run()"
     )
