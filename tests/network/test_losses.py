@@ -1,0 +1,298 @@
+"""The losses: distances that are 0 for equal images, with gradients that are finite everywhere."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from scipy.stats import chisquare
+from skimage.metrics import structural_similarity
+
+from ngpt.errors import NgptError
+from ngpt.network.losses import backbones, elpips, ensemble, make_loss, pixelwise
+from ngpt.network.losses.structural import ssim_parts, structural_distance
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def images(*shape, seed=0):
+    return torch.rand(*shape, generator=generator(seed))
+
+
+def random_elpips(kind):
+    """The metric with weights of nobody: its graph is all that can be tested without the fitted ones."""
+    torch.manual_seed(3)
+    backbone = kind()
+    for parameter in backbone.parameters():
+        if parameter.ndim > 1:
+            torch.nn.init.kaiming_normal_(parameter)
+    return elpips.FeatureDistance(backbone, [torch.rand(c) for c in kind.CHANNELS])
+
+
+DISTANCES = {
+    "structural": lambda: structural_distance,
+    "squeeze": lambda: random_elpips(backbones.SqueezeNet),
+    "vgg": lambda: random_elpips(backbones.Vgg16),
+    "l1": lambda: pixelwise.l1,
+    "gradient": lambda: pixelwise.gradient_l1,
+    "relative": lambda: pixelwise.relative,
+    "logarithmic": lambda: pixelwise.logarithmic,
+}
+every_distance = pytest.mark.parametrize("name", DISTANCES)
+
+
+@every_distance
+def test_a_distance_is_zero_for_equal_images_positive_else_and_symmetric(name):
+    distance = DISTANCES[name]()
+    a, b = images(2, 3, 48, 40), images(2, 3, 48, 40, seed=1)
+    assert distance(a, a).item() == pytest.approx(0, abs=1e-6)
+    assert distance(a, b).item() > 1e-3
+    assert distance(a, b).item() == pytest.approx(distance(b, a).item(), rel=1e-4)
+    assert distance(a, a + 0.1 * (b - a)).item() < distance(a, b).item()
+
+
+@every_distance
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_gradients_are_finite_on_flat_images(name, value):
+    distance = DISTANCES[name]()
+    for other in (torch.full((1, 3, 40, 40), value), images(1, 3, 40, 40)):
+        flat = torch.full((1, 3, 40, 40), value, requires_grad=True)
+        distance(flat, other).backward()
+        assert torch.isfinite(flat.grad).all()
+
+
+@every_distance
+def test_gradients_are_those_of_the_value(name):
+    distance = DISTANCES[name]()
+    a, b = images(1, 3, 36, 36).requires_grad_(), images(1, 3, 36, 36, seed=1)
+    distance(a, b).backward()
+    direction = images(1, 3, 36, 36, seed=2) - 0.5
+    step = 1e-3
+    with torch.no_grad():
+        numeric = (distance(a + step * direction, b) - distance(a - step * direction, b)).item() / (2 * step)
+    # The reference's own rounding decides: single precision, piecewise linear networks.
+    assert (a.grad * direction).sum().item() == pytest.approx(numeric, rel=0.06, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 40), (17, 9), (200, 180)])
+def test_the_structural_distance_takes_every_size(size):
+    a, b = images(1, 3, *size), images(1, 3, *size, seed=1)
+    assert 0 < structural_distance(a, b) <= 2 and structural_distance(a, a).abs() < 1e-6
+
+
+def test_ssim_is_that_of_scikit_image():
+    a, b = images(1, 1, 40, 50), images(1, 1, 40, 50, seed=1)
+    b = 0.6 * a + 0.4 * b
+    luminance, structure = ssim_parts(a, b, stride=1)
+    _, expected = structural_similarity(
+        a[0, 0].double().numpy(), b[0, 0].double().numpy(), data_range=1, full=True, use_sample_covariance=False
+    )
+    assert np.allclose((luminance * structure)[0, 0], expected[3:-3, 3:-3], atol=1e-5)
+
+
+def test_ssim_of_bright_flat_images_is_not_rounding():
+    a = torch.full((1, 3, 64, 64), 0.9) + 1e-4 * images(1, 3, 64, 64)
+    assert structural_distance(a, a.clone()) < 1e-7
+    assert structural_distance(a, a + 1e-4 * images(1, 3, 64, 64, seed=1)) < 1e-3
+
+
+# The ensemble
+
+
+def draws(count, batch=4, size=600, **options):
+    g = generator(7)
+    return [ensemble.draw(batch, size, size, g, **options) for _ in range(count)]
+
+
+def agrees(counts, expected):
+    """Whether counts come from a distribution, at the level of one in ten thousand."""
+    return chisquare(counts, np.array(expected) / np.sum(expected) * np.sum(counts)).pvalue > 1e-4
+
+
+def test_transforms_have_the_published_distributions():
+    every = draws(4000)
+    assert agrees(np.bincount([t.scale for t in every], minlength=9)[1:], [1 / k**2 for k in range(1, 9)])
+    assert agrees(np.bincount(torch.cat([t.offset.flatten() for t in every]).numpy()), np.ones(8))
+    assert agrees(np.bincount(torch.cat([t.flip for t in every]).numpy()), np.ones(4))
+    assert agrees(np.bincount([t.transpose for t in every]), np.ones(2))
+    orders = torch.cat([t.order for t in every])
+    assert agrees(np.bincount((orders[:, 0] * 2 + (orders[:, 1] > orders[:, 2])).numpy()), np.ones(6))
+    factors = torch.cat([t.factor for t in every]).flatten()
+    assert agrees(np.histogram(factors, 16, (0.2, 1))[0], np.ones(16))
+    phases = [t.phase for t in every if t.scale == 2]
+    assert agrees(np.bincount([2 * y + x for y, x in phases]), np.ones(4))
+
+
+def test_draws_are_stratified_over_the_batch():
+    for transform in draws(50, batch=12):
+        assert np.bincount(transform.flip, minlength=4).tolist() == [3, 3, 3, 3]
+        assert all(
+            sorted(((column - 0.2) / 0.8 * 12).int().tolist()) == list(range(12)) for column in transform.factor.T
+        )
+        counts = np.unique(transform.order.numpy(), axis=0, return_counts=True)[1]
+        assert counts.tolist() == [2] * 6
+
+
+def test_scales_leave_the_image_large_enough():
+    assert {t.scale for t in draws(300, size=100, smallest=32)} == {1, 2, 3}
+    assert {t.scale for t in draws(300, scales=2)} == {1, 2}
+    assert {t.scale for t in draws(20, size=20)} == {1}
+
+
+def test_the_same_seed_draws_the_same():
+    a, b = ensemble.draw(3, 64, 64, generator(5)), ensemble.draw(3, 64, 64, generator(5))
+    image = images(3, 3, 64, 64)
+    assert torch.equal(a(image), b(image))
+
+
+def test_a_transform_moves_pixels_and_scales_colours():
+    image = images(1, 3, 20, 24)
+    one = torch.ones(1, 3)
+    same = ensemble.Transform(
+        1, (0, 0), torch.zeros(1, 2, dtype=int), torch.zeros(1, dtype=int), False, torch.tensor([[0, 1, 2]]), one
+    )
+    assert torch.equal(same(image), image[..., :13, :17])
+    other = ensemble.Transform(
+        2, (1, 0), torch.tensor([[1, 0]]), torch.tensor([1]), True, torch.tensor([[2, 0, 1]]), 0.5 * one
+    )
+    boxes = torch.nn.functional.avg_pool2d(image[..., 1:, :], 2)[..., 1:3, 0:5]
+    assert torch.allclose(other(image), 0.5 * boxes[:, [2, 0, 1]].flip(-1).transpose(-1, -2))
+
+
+def test_a_mirrored_pair_is_as_far_apart_in_the_mean():
+    loss = make_loss({"evaluations": 40, "l1": 0.0, "gradient": 0.0})
+    a, b = images(4, 3, 64, 64), images(4, 3, 64, 64, seed=1)
+    value = loss(a, b, generator(0))[0]
+    assert value.item() == pytest.approx(loss(a.flip(-1), b.flip(-1), generator(1))[0].item(), rel=0.02)
+
+
+# The composite
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
+def test_the_loss_is_finite_at_the_extremes(value):
+    loss = make_loss({"relative": 1.0, "logarithmic": 1.0})
+    for target in (torch.full((2, 3, 40, 40), value), images(2, 3, 40, 40)):
+        prediction = torch.full((2, 3, 40, 40), value, requires_grad=True)
+        total, parts = loss(prediction, target, generator())
+        total.backward()
+        assert torch.isfinite(total) and torch.isfinite(prediction.grad).all()
+        assert set(parts) == {"perceptual", "l1", "gradient", "relative", "logarithmic"}
+
+
+def test_the_loss_is_the_weighted_sum_of_its_parts():
+    loss = make_loss({"l1": 0.5, "gradient": 0.25, "relative": 2.0})
+    total, parts = loss(images(1, 3, 40, 40), images(1, 3, 40, 40, seed=1), generator())
+    expected = parts["perceptual"] + 0.5 * parts["l1"] + 0.25 * parts["gradient"] + 2 * parts["relative"]
+    assert torch.allclose(total, expected)
+    total, parts = make_loss({"kind": "l1"})(images(1, 3, 40, 40), images(1, 3, 40, 40, seed=1), generator())
+    assert torch.allclose(total, parts["l1"] + 0.01 * parts["gradient"])
+
+
+def test_tone_mapping_is_that_of_ngpt():
+    grey, red = torch.full((1, 3, 1, 1), 1e9), torch.zeros(1, 3, 1, 1)
+    red[:, 0] = 1e9
+    assert pixelwise.tone_mapped(grey).flatten().tolist() == pytest.approx([1, 1, 1])
+    assert pixelwise.tone_mapped(red).flatten().tolist() == pytest.approx([3, 0, 0])
+
+
+# Backbones and their files
+
+SQUEEZENET = {"features.0.weight": [64, 3, 3, 3], "features.3.squeeze.weight": [16, 64, 1, 1]}
+SQUEEZENET |= {"features.12.expand3x3.weight": [256, 64, 3, 3], "features.9.expand1x1.bias": [192]}
+VGG16 = {"features.0.weight": [64, 3, 3, 3], "features.14.weight": [256, 256, 3, 3], "features.28.bias": [512]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "shapes", "parameters", "sizes"),
+    [
+        (backbones.SqueezeNet, SQUEEZENET, 722_496, [64, 31, 15, 15, 7, 7, 3, 3, 3, 3]),
+        (backbones.Vgg16, VGG16, 14_714_688, [64, 64, 64, 32, 32, 16, 16, 16, 8, 8, 8, 4, 4, 4]),
+    ],
+)
+def test_backbones_are_those_of_torchvision(kind, shapes, parameters, sizes):
+    network = kind()
+    state = network.state_dict()
+    assert sum(t.numel() for t in state.values()) == parameters
+    assert all(list(state[name].shape) == shape for name, shape in shapes.items())
+    features = list(network(images(1, 3, 64, 64), lambda x: x))
+    assert tuple(f.shape[1] for f in features) == kind.CHANNELS
+    assert [f.shape[2] for f in features] == sizes
+
+
+def test_dropout_is_shared_by_both_images():
+    distance = random_elpips(backbones.SqueezeNet)
+    a, b = images(1, 3, 64, 64), images(1, 3, 64, 64, seed=1)
+    assert distance(a, a, generator()) == 0
+    values = {distance(a, b, generator(i)).item() for i in range(3)}
+    assert len(values) == 3 and distance(a, b, generator(1)).item() in values
+
+
+def weight_files(folder, kind=backbones.SqueezeNet):
+    network = kind()
+    # As torchvision's files, with the classifier's tensors beside the features'.
+    torch.save(network.state_dict() | {"classifier.1.weight": torch.zeros(1)}, folder / "backbone.pth")
+    save_file({f"lin{i}": torch.rand(1, c, 1, 1) for i, c in enumerate(kind.CHANNELS)}, folder / "lin.safetensors")
+    return {"backbone": str(folder / "backbone.pth"), "weights": str(folder / "lin.safetensors")}
+
+
+def test_elpips_trains_when_its_files_are_there(tmp_path):
+    loss = make_loss({"kind": "elpips-squeeze", **weight_files(tmp_path)})
+    prediction = images(2, 3, 48, 48).requires_grad_()
+    total, parts = loss(prediction, images(2, 3, 48, 48, seed=1), generator())
+    total.backward()
+    assert parts["perceptual"] > 0 and torch.isfinite(prediction.grad).all() and prediction.grad.abs().max() > 0
+
+
+def test_missing_and_damaged_files_are_explained(tmp_path, monkeypatch):
+    files = weight_files(tmp_path)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
+    cases = [
+        ({"backbone": ""}, r"squeezenet1_1-b8a52dc0\.pth: no such file; get .* \"structural\" needs no weights"),
+        ({"weights": ""}, "loss.weights is not set"),
+        ({"weights": "nowhere"}, "nowhere: no such file"),
+        ({"weights": files["backbone"]}, "not a readable safetensors file"),
+        ({"backbone": __file__}, "cannot be read as PyTorch weights"),
+        ({"backbone": files["weights"]}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
+    ]
+    for change, complaint in cases:
+        with pytest.raises(NgptError, match=complaint):
+            make_loss({"kind": "elpips-squeeze", **files, **change})
+    cache = tmp_path / "cache" / "hub" / "checkpoints"
+    cache.mkdir(parents=True)
+    (cache / backbones.SqueezeNet.FILE).write_bytes((tmp_path / "backbone.pth").read_bytes())
+    with pytest.raises(NgptError, match=r"checksum is not b8a52dc0"):
+        make_loss({"kind": "elpips-squeeze", **files, "backbone": ""})
+    save_file({f"lin{i}": -torch.ones(c) for i, c in enumerate(backbones.SqueezeNet.CHANNELS)}, files["weights"])
+    with pytest.raises(NgptError, match="'lin0' holds numbers that are negative"):
+        make_loss({"kind": "elpips-squeeze", **files})
+
+
+class Payload:
+    def __reduce__(self):
+        return (print, ("code was run",))
+
+
+def test_no_code_is_run_from_weight_files(tmp_path, capsys):
+    files = weight_files(tmp_path)
+    torch.save({"features.0.weight": Payload()}, files["backbone"])
+    with pytest.raises(NgptError, match="cannot be read as PyTorch weights"):
+        make_loss({"kind": "elpips-squeeze", **files})
+    assert "code was run" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"kind": "perceptive"}, "choose one of"),
+        ({"kinds": "l1"}, "unknown key 'kinds'"),
+        ({"l1": -1.0}, "must not be negative"),
+        ({"l1": "much"}, "must be like 0.01"),
+        ({"evaluations": 0}, "at least 1"),
+    ],
+)
+def test_settings_are_checked(settings, complaint):
+    with pytest.raises(NgptError, match=complaint):
+        make_loss(settings)
