@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable
 
@@ -17,7 +18,7 @@ Progress = Callable[[int, int], None]
 # What a render may use, in MiB, beside the scene itself; see lanes_within().
 DEFAULT_MEMORY = 4096
 # Bytes that a lane takes in a pass; the most that any sampler was seen to take, and some more.
-_LANE_BYTES = 400
+_LANE_BYTES = 256
 # Lanes of the first pass: enough to render small images at one go, and to judge how long the next may be.
 _FIRST_LANES = 1 << 20
 _FIRST_LANES_TIMED = 1 << 17
@@ -83,11 +84,15 @@ def render_passes(
     film = GradientFilm(width, height)
     most = lanes_within(memory, film) // film.pixels
     total = spp if spp is not None else 1 << 31
-    if seconds is None:
-        report = lambda: progress(film.samples, total)  # noqa: E731
-    else:
-        report = lambda: progress(min(int(seconds), int(time.perf_counter() - start)), int(seconds))  # noqa: E731
     start = now = time.perf_counter()
+
+    def report(finished: bool = False) -> None:
+        if seconds is None:
+            progress(film.samples, total)
+        else:
+            limit = math.ceil(seconds)
+            progress(limit if finished else min(limit - 1, int(now - start)), limit)
+
     n = (_FIRST_LANES if seconds is None else _FIRST_LANES_TIMED) // film.pixels
     report()
     while film.samples < total:
@@ -97,10 +102,11 @@ def render_passes(
         film.end_pass()
         dr.sync_thread()
         now = time.perf_counter()
-        report()
         left = float("inf") if seconds is None else seconds - (now - start)
         each = (now - begin) / n
-        if stop() or left < each:
+        finished = stop() or left < each
+        report(finished)
+        if finished:
             break
         n = int(min(left, _PASS_SECONDS) / each)
     return film

@@ -149,7 +149,9 @@ class GradientFilm:
         means = np.stack([np.array(c) for c in moments.mean], axis=-1).reshape(*shape, -1)
         count = counts.sum(axis=1)
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = (counts * means).sum(axis=1) / count if self.strands > 1 else np.where(count > 0, means[:, 0], np.nan)
+            mean = (
+                (counts * means).sum(axis=1) / count if self.strands > 1 else np.where(count > 0, means[:, 0], np.nan)
+            )
             if not moments.m2:
                 return count, mean, None
             m2 = np.stack([np.array(c) for c in moments.m2], axis=-1).reshape(*shape, -1).sum(axis=1)
