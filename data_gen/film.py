@@ -35,7 +35,7 @@ class Moments:
 
 
 class GradientFilm:
-    """Collects samples, in lanes ordered pixel by pixel, and develops them into the layers of a gradient stack.
+    """Collects samples, in the order of ``CameraSamples``, and develops them into the layers of a gradient stack.
 
     Samples that are not finite get zero weight: they are left out of the mean and counted. Which sample is added to
     which sum, and in what order, depends on its number alone: the same samples give the same bits, whatever the passes.
@@ -46,6 +46,7 @@ class GradientFilm:
         self.pixels = width * height
         self.strands = max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel
+        self.blocks = 0  # of samples, each of which goes to one strand
         # Dr.Jit gives each array the next power of two of bytes.
         self.bytes = _STRAND_BYTES * (1 << (self.pixels * self.strands - 1).bit_length())
         self.moments: dict[str, Moments] = {}
@@ -54,9 +55,8 @@ class GradientFilm:
     def put(self, name: str, value, active: bool | mi.Bool = True) -> None:
         """Adds the samples of one pass.
 
-        ``value`` is a Float or Color3f with ``width * height * k`` lanes, those of a pixel next to each other, and
-        ``active`` says which of them exist (an offset outside the image does not). What is put under one name again
-        belongs to the next pass.
+        ``value`` is a Float or Color3f with ``width * height * spp`` lanes, and ``active`` says which of them exist (an
+        offset outside the image does not). What is put under one name again belongs to the next pass.
         """
         if name in self._pass:
             self.end_pass()
@@ -68,27 +68,33 @@ class GradientFilm:
         for name, value in values.items():
             self.put(name, value)
 
-    def end_pass(self) -> None:
-        """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace."""
+    def end_pass(self, block: int | None = None) -> None:
+        """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
+
+        ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side.
+        """
         if not self._pass:
             return
         values, self._pass = self._pass, {}
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
         dr.eval(values)
-        spp = dr.width(values) // self.pixels
+        lanes = dr.width(values)
+        spp = lanes // self.pixels
+        block = block or spp
+        # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
         strand = dr.arange(mi.UInt32, self.pixels * self.strands)
         pixel, strand = strand // self.strands, strand % self.strands
-        # Sample s of a pixel goes to strand s mod strands. Opaque: a literal would be compiled into the kernel.
-        behind = dr.opaque(mi.UInt32, self.strands - self.samples % self.strands)
-        lanes = dr.opaque(mi.UInt32, spp)
-        first, end = pixel * lanes + (strand + behind) % self.strands, (pixel + 1) * lanes
-        dr.eval(first, end)
+        behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
+        first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
+        dr.eval(first)
+        where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
         for name, (components, active) in values.items():
             moments = self.moments.get(name) or self._nothing(len(components), name in _WITH_VARIANCE)
-            self.moments[name] = accumulate(moments, components, active, first, end, self.strands)
+            self.moments[name] = accumulate(moments, components, active, *where)
             # One by one: the old moments and the new ones are in memory together.
             dr.eval(self.moments[name])
         self.samples += spp
+        self.blocks += spp // block
 
     def _nothing(self, channels: int, variance: bool) -> Moments:
         width = self.pixels * self.strands
@@ -178,15 +184,16 @@ class GradientFilm:
         return columns.reshape(self.height, self.width, -1)
 
 
-def accumulate(moments: Moments, components: list, active, first: mi.UInt32, end: mi.UInt32, stride: int) -> Moments:
-    """Adds to each lane's moments the samples ``first``, ``first + stride`` ... below ``end``.
+def accumulate(moments: Moments, components: list, active, first, end, block, stride) -> Moments:
+    """Adds samples to each lane's moments: ``block`` of them from ``first`` on, again from ``first + stride`` on, and
+    so forth below ``end``, all UInt32.
 
     Welford 1962, "Note on a method for calculating corrected sums of squares and products", in double precision: sums
     of squares would lose all digits where the variance is small beside the mean.
     """
     Float64 = dr.float64_array_t(mi.Float)
 
-    def add(i: mi.UInt32, old: Moments):
+    def add(i: mi.UInt32, n: mi.UInt32, old: Moments):
         x = [dr.gather(mi.Float, component, i) for component in components]
         exists = mi.Bool(True) if active is True else dr.gather(mi.Bool, active, i)
         finite = dr.all([dr.isfinite(component) for component in x])
@@ -198,6 +205,8 @@ def accumulate(moments: Moments, components: list, active, first: mi.UInt32, end
         mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
         # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
         m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
-        return i + stride, Moments(count, lost, mean, m2)
+        last = n + 1 == block
+        i = i + dr.select(last, stride - block + 1, 1)  # not in place: that would move `first` too
+        return i, dr.select(last, 0, n + 1), Moments(count, lost, mean, m2)
 
-    return dr.while_loop((first, moments), lambda i, _: i < end, add, label="film")[1]
+    return dr.while_loop((first, mi.UInt32(0), moments), lambda i, *_: i < end, add, label="film")[2]

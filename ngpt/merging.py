@@ -78,13 +78,13 @@ def _mean(layers: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
 def _variance(stacks: Sequence[GradientStack], counts: Sequence[int], name: str, variance: str) -> np.ndarray:
     mean = _mean([stack[name] for stack in stacks], counts)
     squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
-    for stack, n in zip(stacks, counts, strict=True):
-        values = stack[name].astype(np.float64)
-        there = ~np.isnan(values)
-        within = n * (n - 1) * stack[variance].astype(np.float64) if n > 1 else 0.0
-        squares += np.where(there, within + n * (values - mean) ** 2, 0)
-        total += n * there
     with np.errstate(invalid="ignore", divide="ignore"):
+        for stack, n in zip(stacks, counts, strict=True):
+            values = stack[name].astype(np.float64)
+            there = ~np.isnan(values)
+            within = n * (n - 1) * stack[variance].astype(np.float64) if n > 1 else 0.0
+            squares += np.where(there, within + n * (values - mean) ** 2, 0)
+            total += n * there
         return np.where(total > 1, squares / (total * (total - 1)), np.nan)
 
 
