@@ -82,8 +82,8 @@ class GradientFilm:
         spp = lanes // self.pixels
         block = block or spp
         # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
-        strand = dr.arange(mi.UInt32, self.pixels * self.strands)
-        pixel, strand = strand // self.strands, strand % self.strands
+        pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
+        strand, pixel = pixel // self.pixels, pixel % self.pixels
         behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
         first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
         dr.eval(first)
@@ -137,7 +137,7 @@ class GradientFilm:
             sum(np.array(getattr(moments, field), np.int64) for moments in self.moments.values())
             for field in ("lost", "count")
         )
-        lost, count = (n.reshape(self.pixels, self.strands).sum(axis=1) for n in (lost, count))
+        lost, count = (n.reshape(self.strands, self.pixels).sum(axis=0) for n in (lost, count))
         images[DISCARDED] = lost / np.maximum(lost + count, 1)
         return {
             name: np.ascontiguousarray(np.nan_to_num(image.reshape(self.height, self.width)), np.float32)
@@ -150,20 +150,22 @@ class GradientFilm:
         Unknown must not look like zero: the mean of no sample is NaN, and so is the variance of fewer than two. Chan,
         Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
         """
-        moments, shape = self.moments[name], (self.pixels, self.strands)
-        counts = np.array(moments.count, np.float64).reshape(*shape, 1)
-        means = np.stack([np.array(c) for c in moments.mean], axis=-1).reshape(*shape, -1)
-        count = counts.sum(axis=1)
+        moments, shape = self.moments[name], (self.strands, self.pixels)
+        counts = np.array(moments.count, np.float64).reshape(shape)
+        count = counts.sum(axis=0)
+        means, variances = [], []
         with np.errstate(invalid="ignore", divide="ignore"):
-            mean = (
-                (counts * means).sum(axis=1) / count if self.strands > 1 else np.where(count > 0, means[:, 0], np.nan)
-            )
-            if not moments.m2:
-                return count, mean, None
-            m2 = np.stack([np.array(c) for c in moments.m2], axis=-1).reshape(*shape, -1).sum(axis=1)
-            if self.strands > 1:
-                m2 += (counts * np.square(means - mean[:, None])).sum(axis=1)
-            return count, mean, np.where(count > 1, m2 / (count - 1) / count, np.nan)
+            for channel in moments.mean:
+                strands = np.array(channel).reshape(shape)
+                # 0 / 0 is NaN, as it should be. A single strand keeps its mean to the last bit.
+                mean = strands[0] * (count / count) if self.strands == 1 else (counts * strands).sum(axis=0) / count
+                means.append(mean)
+                if moments.m2:
+                    m2 = np.array(moments.m2[len(variances)]).reshape(shape).sum(axis=0)
+                    if self.strands > 1:
+                        m2 += (counts * np.square(strands - mean)).sum(axis=0)
+                    variances.append(np.where(count > 1, m2 / (count - 1) / count, np.nan))
+        return count[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
 
     def _gradient(self, forward: str, backward: str, axis: int) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
