@@ -1,6 +1,6 @@
 """What gradients cost and what they are worth, scene by scene, in one run: the table of docs/sampler-table.md.
 
-    python -m bench.sampler --folder SCENES --cache CACHE [--maps NAME ...]
+    python -m bench.sampler --folder SCENES [--maps NAME ...]
 
 Rendered are the built-in scenes and each FOLDER/*/scene.xml that is without media (the others are named and left out):
 
@@ -52,7 +52,7 @@ def main() -> None:
     )
     parser.add_argument("--repeats", type=int, default=3, help="of times and of errors")
     parser.add_argument("--reference-seconds", type=float, default=30.0)
-    parser.add_argument("--cache", type=Path, required=True, help="folder for references")
+    parser.add_argument("--cache", type=Path, default=Path("out/bench"), help="folder for references")
     parser.add_argument("--maps", nargs="*", default=[], metavar="NAME", help="write a map of the gradients' worth")
     parser.add_argument("--docs", type=Path, default=Path("docs"))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/sampler.json"))
@@ -220,11 +220,11 @@ def table(result: dict) -> str:
         cells = [label, "", f"{cost:.2f}", "", "", "", f"{dx:.1f}", f"{dy:.1f}", "", *(f"{e:.2f}" for e in errors), ""]
         lines.append(f"| {' | '.join(cells)} |")
     where, (width, height) = result["metadata"], result["size"]
+    versions = " ".join(f"{name} {where['versions'][name]}" for name in ("mitsuba", "drjit"))
     note = (
         f"{width}x{height}, {result['spp']} spp (times: {result['timing spp']}), {result['repeats']} renders of each. "
-        "Columns `l2`, `l1` and `wcv`: their relMSE over that of `path` at equal rendering time, below 1 where gradients "
-        f"pay; `path` has {result['spp']} spp times the cost. Mitsuba "
-        f"{where['versions']['mitsuba']}, Dr.Jit {where['versions']['drjit']}, {where['threads']} threads of "
+        "Columns `l2`, `l1` and `wcv`: their relMSE over that of `path` at equal rendering time, below 1 where "
+        f"gradients pay; `path` has {result['spp']} spp times the cost. {versions}, {where['threads']} threads of "
         f"{where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.sampler`, which explains it."
     )
     return "\n".join(lines) + f"\n\n{note}\n"
