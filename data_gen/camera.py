@@ -16,7 +16,7 @@ from ngpt.errors import NgptError
 Progress = Callable[[int, int], None]
 
 # What a render may use, in MiB, beside the scene itself; see lanes_within().
-DEFAULT_MEMORY = 4096
+DEFAULT_MEMORY = 6144
 # Bytes that a lane takes in a pass: the most that any sampler was seen to take, 200, and some more.
 _LANE_BYTES = 256
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument(
-        "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 4096)"
+        "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 6144)"
     )
     parser.add_argument(
         "--diagnostics",
