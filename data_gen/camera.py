@@ -22,6 +22,8 @@ _LANE_BYTES = 256
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
 _PACKET = 16
 _BLOCK_LANES = 1 << 21
+# Lanes are numbered with 32 bits.
+_MOST_LANES = 1 << 30
 # Lanes of the first pass: enough to render small images at one go, and to judge how long the next may be.
 _FIRST_LANES = 1 << 20
 # A pass this long makes little of the time that it takes to start one, and reacts soon enough.
@@ -115,7 +117,7 @@ def render_passes(
         now = time.perf_counter()
         time_left = float("inf") if seconds is None else seconds - (now - start)
         each = (now - begin) / n * block
-        finished = stop() or time_left < each
+        finished = film.samples >= total or stop() or time_left < each
         report(finished)
         if finished:
             break
@@ -142,7 +144,7 @@ def blocks_within(memory: int, film: GradientFilm, block: int) -> int:
     """
     lanes = film.pixels * block
     # Dr.Jit gives each array the next power of two of bytes.
-    available = (memory * 2**20 - film.bytes) // _LANE_BYTES
+    available = min((memory * 2**20 - film.bytes) // _LANE_BYTES, _MOST_LANES)
     blocks = (1 << (available.bit_length() - 1)) // lanes if available > 0 else 0
     if blocks < 1:
         needed = -(-(film.bytes + _LANE_BYTES * (1 << (lanes - 1).bit_length())) // 2**20)

@@ -47,6 +47,15 @@ def test_large_images_with_small_blocks(renderer, monkeypatch):
     same(whole, render_stack(scene, 14, 7))
 
 
+def test_passes_do_not_move_blocks_within_packets(renderer):
+    from data_gen.camera import blocks_within
+    from data_gen.film import GradientFilm
+
+    assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
+    # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.
+    assert blocks_within(1000, GradientFilm(33, 21), 4) == 1
+
+
 def test_samples_are_independent(renderer):
     from data_gen.render import render_stack
 
