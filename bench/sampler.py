@@ -1,77 +1,233 @@
-"""Cost of our samplers as a ratio to Mitsuba's own `path` at the same samples per pixel, in one run, and what
-gradients are worth: the variance of a difference of pixels over that of `dx` and `dy`.
+"""What gradients cost and what they are worth, scene by scene, in one run: the table of docs/sampler-table.md.
 
-    python -m bench.sampler -o bench/results/sampler.json
+    python -m bench.sampler --folder SCENES [--maps NAME ...]
 
-Times are of whole renders, features and film included, with kernels compiled before. Variances leave out pixels where
-the camera sees a light, whose emission is in the primal but not in the gradients.
+Rendered are the built-in scenes and each FOLDER/*/scene.xml that is without media (the others are named and left out):
+
+    cost       time of `gpt`, whole stacks with features, variances and film, over that of Mitsuba's C++ `path` at the
+               same samples per pixel, --timing-spp of them; alternating, kernels compiled before
+    compile    seconds to compile the kernels of either, from an empty cache
+    variance   of independent differences of neighbouring pixels over that of `dx` and of `dy`, summed over the image.
+               Pixels where the camera sees a light are left out: its emission is in the primal, not in the gradients
+    relMSE     (without the worst 0.1 % of the pixels) of reconstructions from `gpt`, over that of `path` with as many
+               more samples as it has time for; time to reconstruct is not counted, and listed in the results
+
+References are rendered for a fixed time, kept in CACHE, and taken from there the next time. A run that was broken off
+goes on where it ended if it is started with the same arguments. Written are bench/results/sampler.json, the table, and
+for each scene named by --maps docs/images/NAME-gradients.png, see bench/gradientmap.py.
 """
 
 import argparse
-from functools import partial
+import json
+import os
+import statistics
+import tempfile
+import time
+from pathlib import Path
 
 import numpy as np
 
-from bench.common import measure, metadata, save
+import ngpt
+from bench.common import metadata, save, summary
+from bench.gradientmap import variances_of_differences, write_map
+from bench.methods import reference_noise, scene_name, write_text
+from ngpt.methods import reconstruct
+from ngpt.metrics import compare
+from ngpt.stack import GradientStack
 
-SAMPLERS = ("primal", "gpt-basic", "gpt")
-
-
-def variance_ratios(layers: dict[str, np.ndarray]) -> dict[str, float]:
-    """Sum over the image of the variance of independent differences of neighbours, over that of the gradients."""
-    dark = layers["direct"].sum(axis=-1) == 0
-    ratios = {}
-    for axis, name in ((1, "dx"), (0, "dy")):
-        here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
-        used = dark[here] & dark[there]
-        independent = (layers["primal_var"][here] + layers["primal_var"][there])[used]
-        ratios[name] = float(independent.sum() / layers[f"{name}_var"][here][used].sum())
-    return ratios
+METHODS = ("l2", "l1", "wcv")
+METRIC = "relMSE trimmed"
+# Far from the seeds 0, 1 ... of what is judged.
+REFERENCE_SEED, EQUAL_TIME_SEED = 1 << 20, 1 << 21
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", required=True)
-    parser.add_argument("--size", default="256x256", help="WxH in pixels")
-    parser.add_argument("--scenes", nargs="*", help="scene files or built-in scenes (default: the built-in ones)")
-    parser.add_argument("--spp", type=int, default=16)
-    parser.add_argument("--repeats", type=int, default=7)
+    parser.add_argument("--folder", type=Path, help="folder with a folder for each scene, which holds scene.xml")
+    parser.add_argument("--scenes", nargs="*", help="scene files and built-in scenes (default: all)")
+    parser.add_argument("--size", type=int, nargs=2, default=(160, 90), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--spp", type=int, default=16, help="of the stacks that are judged")
+    parser.add_argument(
+        "--timing-spp", type=int, default=64, help="enough to make little of what a render costs to start"
+    )
+    parser.add_argument("--repeats", type=int, default=3, help="of times and of errors")
+    parser.add_argument("--reference-seconds", type=float, default=30.0)
+    parser.add_argument("--cache", type=Path, default=Path("out/bench"), help="folder for references")
+    parser.add_argument("--maps", nargs="*", default=[], metavar="NAME", help="write a map of the gradients' worth")
+    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/sampler.json"))
     args = parser.parse_args()
+    # Kernels from an earlier run would hide what it takes to compile them. To be set before Dr.Jit is loaded.
+    with tempfile.TemporaryDirectory() as empty:
+        os.environ["DRJIT_CACHE_DIR"] = empty
+        run(args)
 
+
+def run(args: argparse.Namespace) -> None:
     from data_gen.backend import use_variant
 
     use_variant()
+    from data_gen.builtin import SCENES
+
+    args.cache.mkdir(parents=True, exist_ok=True)
+    files = [str(path) for path in sorted(args.folder.glob("*/scene.xml"))] if args.folder else []
+    scenes = args.scenes or [*SCENES, *files]
+    setup = {"size": list(args.size), "spp": args.spp, "timing spp": args.timing_spp, "repeats": args.repeats}
+    result = {"benchmark": "sampler"} | setup | {"metadata": metadata("mitsuba", "drjit"), "scenes": {}}
+    if args.output.exists():
+        earlier = json.loads(args.output.read_text())
+        if all(earlier.get(key) == result[key] for key in ("metadata", *setup)):
+            result["scenes"] = earlier["scenes"]
+    for scene in scenes:
+        name = scene_name(scene)
+        if name not in result["scenes"] or name in args.maps:
+            start = time.perf_counter()
+            row = bench_scene(scene, name, args)
+            if row is None:
+                print(f"{name}: left out, it has media", flush=True)
+                continue
+            result["scenes"][name] = row
+            save(args.output, result)
+            print(f"{line(name, row)} {time.perf_counter() - start:.0f} s", flush=True)
+    write_text(args.docs / "sampler-table.md", table(result))
+
+
+def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | None:
+    """All numbers of one scene; None if `gpt` cannot render it."""
     import drjit as dr
     import mitsuba as mi
 
-    from data_gen.builtin import SCENES
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import choose_sampler, describe, load_scene, render_stack
 
-    width, height = (int(n) for n in args.size.split("x"))
-    result = {"benchmark": "sampler", "size": [width, height], "spp": args.spp, "scenes": {}}
-    for name in args.scenes or SCENES:
-        scene = load_scene(name, (width, height))
-        stacks = {}
+    size = (args.size[0], args.size[1])
+    scene = load_scene(scene_file, size)
+    if choose_sampler(*describe(scene))[0] != "gpt":
+        return None
 
-        def path(scene=scene):
-            dr.eval(mi.render(scene, spp=args.spp))
-            dr.sync_thread()
+    def path(seed: int) -> None:
+        dr.eval(mi.render(scene, spp=args.timing_spp, seed=seed))
+        dr.sync_thread()
 
-        def stack(sampler, scene=scene, stacks=stacks):
-            stacks[sampler] = render_stack(scene, args.spp, sampler=sampler).layers
+    compiled = {"path": compile_seconds(lambda: path(0))}
+    compiled["gpt"] = compile_seconds(lambda: render_stack(scene, args.spp, 0))
+    seconds: dict[str, list[float]] = {"path": [], "gpt": []}
+    for seed in range(args.repeats):
+        start = time.perf_counter()
+        path(seed)
+        between = time.perf_counter()
+        render_stack(scene, args.timing_spp, seed)
+        seconds["path"].append(between - start)
+        seconds["gpt"].append(time.perf_counter() - between)
+    ratios = [ours / theirs for ours, theirs in zip(seconds["gpt"], seconds["path"], strict=True)]
+    cost = summary(ratios)
+    spp = max(1, round(args.spp * cost["median"]))
+    stacks = [render_stack(scene, args.spp, seed) for seed in range(args.repeats)]
+    reference = cached_reference(scene, name, size, args)
+    errors = {"path": [render_stack(scene, spp, EQUAL_TIME_SEED + i, "primal")["primal"] for i in range(args.repeats)]}
+    solver = {}
+    for method in METHODS:
+        results = [reconstruct(stack, method) for stack in stacks]
+        errors[method] = [result.image for result in results]
+        solver[method] = statistics.median(result.seconds for result in results)
+    merged = ngpt.merge(stacks)
+    if name in args.maps:
+        write_map(args.docs / "images" / f"{name}-gradients.png", merged)
+    return {
+        "seconds": {key: summary(values) for key, values in seconds.items()},
+        "seconds per sample": {
+            key: statistics.median(values) / (size[0] * size[1] * args.timing_spp) for key, values in seconds.items()
+        },
+        "cost": cost,
+        "compile seconds": compiled,
+        "variance": variance_ratios(merged),
+        "spp at equal time": spp,
+        "relMSE": {
+            key: summary([compare(image, reference["primal"])["relMSE"] for image in images])
+            for key, images in errors.items()
+        },
+        METRIC: {
+            key: summary([compare(image, reference["primal"])[METRIC] for image in images])
+            for key, images in errors.items()
+        },
+        "reconstruction seconds": solver,
+        "reference": {"spp": int(reference.attributes["ngpt:spp"]), "noise": reference_noise(reference)},
+    }
 
-        times = measure({"path": path} | {sampler: partial(stack, sampler) for sampler in SAMPLERS}, args.repeats)
-        cost = {sampler: times[sampler]["median"] / times["path"]["median"] for sampler in SAMPLERS}
-        variance = {sampler: variance_ratios(stacks[sampler]) for sampler in ("gpt-basic", "gpt")}
-        result["scenes"][name] = {"seconds": times, "ratio to path": cost, "variance ratio": variance}
-        print(
-            f"{name:12} "
-            + "  ".join(f"{sampler} {ratio:.2f} x path" for sampler, ratio in cost.items())
-            + "; variance "
-            + "  ".join(f"{sampler} {v['dx']:.1f} {v['dy']:.1f}" for sampler, v in variance.items()),
-            flush=True,
-        )
-    save(args.output, result | {"metadata": metadata("mitsuba", "drjit")})
+
+def compile_seconds(call) -> float:
+    """Seconds that ``call`` spends on generating and compiling kernels."""
+    import drjit as dr
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        dr.kernel_history_clear()
+        call()
+        kernels = dr.kernel_history([dr.KernelType.JIT])
+    return sum(kernel["codegen_time"] + kernel["backend_time"] for kernel in kernels) / 1000
+
+
+def cached_reference(scene, name: str, size: tuple[int, int], args: argparse.Namespace) -> GradientStack:
+    """A long render by the scene's own integrator, from the cache if it is there."""
+    from data_gen.render import render_stack
+
+    file = args.cache / f"{name}-reference-{size[0]}x{size[1]}-{args.reference_seconds:g}s.exr"
+    if not file.exists():
+        stack = render_stack(scene, None, REFERENCE_SEED, "primal", seconds=args.reference_seconds)
+        ngpt.write(file, stack)
+    return ngpt.read(file)
+
+
+def variance_ratios(stack: GradientStack) -> dict[str, float]:
+    """Sum over the image of the variance of independent differences of neighbours, over that of the gradients."""
+    ratios = {}
+    for name, independent in zip(("dx", "dy"), variances_of_differences(stack), strict=True):
+        used = np.isfinite(independent) & np.isfinite(stack[f"{name}_var"])
+        ratios[name] = float(independent[used].sum() / stack[f"{name}_var"][used].sum())
+    return ratios
+
+
+def relative_errors(row: dict) -> dict[str, float]:
+    return {method: row[METRIC][method]["median"] / row[METRIC]["path"]["median"] for method in METHODS}
+
+
+def line(name: str, row: dict) -> str:
+    errors = "  ".join(f"{method} {ratio:.2f}" for method, ratio in relative_errors(row).items())
+    return (
+        f"{name:16} cost {row['cost']['median']:.2f}  variance dx {row['variance']['dx']:.1f} "
+        f"dy {row['variance']['dy']:.1f}  error over path: {errors}"
+    )
+
+
+def table(result: dict) -> str:
+    """Markdown: a row for each scene, and what is in the middle and worst."""
+    rows = result["scenes"]
+    heads = ["scene", "ns / sample, `path`", "cost", "quartiles", "compile s, `path`", "`gpt`", "variance dx", "dy"]
+    heads += ["relMSE `path`", *(f"`{method}`" for method in METHODS), "reference noise"]
+    lines = [f"| {' | '.join(heads)} |", "|---" + "|--:" * (len(heads) - 1) + "|"]
+    for name, row in rows.items():
+        cost, compiled, errors = row["cost"], row["compile seconds"], relative_errors(row)
+        cells = [name, f"{row['seconds per sample']['path'] * 1e9:.0f}", f"{cost['median']:.2f}"]
+        cells += [f"{cost['low']:.2f} .. {cost['high']:.2f}", f"{compiled['path']:.1f}", f"{compiled['gpt']:.1f}"]
+        cells += [f"{row['variance']['dx']:.1f}", f"{row['variance']['dy']:.1f}"]
+        cells += [f"{row[METRIC]['path']['median']:.4f}"]
+        # Worse than plain path tracing: what must not be overlooked.
+        cells += [f"{ratio:.2f}" if ratio < 1 else f"**{ratio:.2f}**" for ratio in errors.values()]
+        lines.append(f"| {' | '.join(cells)} | {row['reference']['noise']:.5f} |")
+    picks = [lambda row: row["cost"]["median"], lambda row: row["variance"]["dx"], lambda row: row["variance"]["dy"]]
+    picks += [lambda row, method=method: relative_errors(row)[method] for method in METHODS]
+    middle = [statistics.median(pick(row) for row in rows.values()) for pick in picks]
+    worst = [(min if i in (1, 2) else max)(pick(row) for row in rows.values()) for i, pick in enumerate(picks)]
+    for label, (cost, dx, dy, *errors) in (("*median*", middle), ("*worst*", worst)):
+        cells = [label, "", f"{cost:.2f}", "", "", "", f"{dx:.1f}", f"{dy:.1f}", "", *(f"{e:.2f}" for e in errors), ""]
+        lines.append(f"| {' | '.join(cells)} |")
+    where, (width, height) = result["metadata"], result["size"]
+    versions = " ".join(f"{name} {where['versions'][name]}" for name in ("mitsuba", "drjit"))
+    note = (
+        f"{width}x{height}, {result['spp']} spp (times: {result['timing spp']}), {result['repeats']} renders of each. "
+        "Columns `l2`, `l1` and `wcv`: their relMSE over that of `path` at equal rendering time, below 1 where "
+        f"gradients pay; `path` has {result['spp']} spp times the cost. {versions}, {where['threads']} threads of "
+        f"{where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.sampler`, which explains it."
+    )
+    return "\n".join(lines) + f"\n\n{note}\n"
 
 
 if __name__ == "__main__":

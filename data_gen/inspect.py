@@ -1,4 +1,4 @@
-"""What a scene is made of, read from its description without loading meshes or textures."""
+"""What a scene is made of, and what that means for rendering it, without loading meshes or textures."""
 
 from __future__ import annotations
 
@@ -8,17 +8,20 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.builtin import SCENES
-from data_gen.render import SAMPLERS, choose_sampler
+from data_gen.render import SAMPLERS, choose_sampler, complaint
 from ngpt.errors import NgptError
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
+_MIRRORS = ("conductor", "dielectric", "thindielectric")
+_POINTS = ("point", "spot", "directional", "projector")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     """Counts a scene's plugins by kind and says how it would be sampled.
 
     ``name`` and ``parameters`` are those of ``load_scene``. Returns {"plugins": {kind: {plugin: count}}, "size":
-    (width, height) or None where the scene leaves it to Mitsuba, "sampler": name, "plan": lines of text}.
+    (width, height) or None where the scene leaves it to Mitsuba, "media": names, "lens": whether there is depth of
+    field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
     """
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -29,41 +32,72 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         else:
             raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
     except RuntimeError as error:
-        raise NgptError(f"{name}: not a scene Mitsuba can read: {' '.join(str(error).split())}") from error
+        raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
     plugins = {kind: Counter() for kind in _KINDS}
-    size = None
+    size, shutter, media = None, 0.0, []
     for node in nodes:
-        kind = node.type.name
+        kind, props = node.type.name, node.props
         if kind in plugins:
-            plugins[kind][node.props.plugin_name()] += 1
-        if kind == "Film" and "width" in node.props and "height" in node.props:
-            size = (int(node.props["width"]), int(node.props["height"]))
+            plugins[kind][props.plugin_name()] += 1
+        if kind == "Film" and "width" in props and "height" in props:
+            size = (int(props["width"]), int(props["height"]))
+        if kind == "Sensor":
+            shutter = float(props.get("shutter_close", 0.0)) - float(props.get("shutter_open", 0.0))
+        if kind == "Medium":
+            media.append(props.id() or props.plugin_name())
     integrator = next(iter(plugins["Integrator"]), "path")
-    sampler, reason = choose_sampler(integrator, bool(plugins["Medium"]))
+    lens = "thinlens" in plugins["Sensor"]
+    sampler, reason = choose_sampler(integrator, media)
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
         "size": size,
+        "media": media,
+        "lens": lens,
+        "shutter": shutter,
         "sampler": sampler,
-        "plan": [f"{sampler}: {SAMPLERS[sampler]}", f"because {reason}", *_plan(plugins, integrator, sampler)],
+        "plan": [
+            f"{sampler}: {SAMPLERS[sampler]}",
+            f"because {reason}",
+            *_transport(plugins, media, integrator, sampler),
+            *_camera(lens, shutter),
+        ],
     }
 
 
-def _plan(plugins: dict[str, Counter], integrator: str, sampler: str) -> list[str]:
-    """What the sampler will do about the scene, a line for each thing that matters to it."""
-    how = "offset paths join it where materials are rough" if sampler == "gpt" else "replayed as a whole"
+def _transport(plugins: dict[str, Counter], media: list[str], integrator: str, sampler: str) -> list[str]:
+    """What the sampler will do about materials, lights and media, a line for each thing that matters to it."""
+    gpt = sampler == "gpt"
+    how = "offset paths join it where materials are rough" if gpt else "replayed as a whole"
     lines = [f"transport: Mitsuba's '{integrator}', {how}"]
-    if plugins["Medium"]:
+    if media:
         lines.append("media: replayed with everything else; features are those of the surfaces behind them")
-    if plugins["Medium"] and not integrator.startswith("vol"):
-        lines.append(
-            f"media are in the scene, but '{integrator}' does not render them: use -D integrator=volpath or alike"
-        )
-    if "thinlens" in plugins["Sensor"]:
-        lines.append("depth of field: base and offset paths share their lens samples")
-    if any(name in plugins["BSDF"] for name in ("dielectric", "thindielectric", "conductor")):
+        lines.append("media: `--sampler gpt` refuses them; `--sampler primal` renders without gradients, in a fifth")
+        if not integrator.startswith("vol"):
+            lines.append(
+                f"media are in the scene, but '{integrator}' does not render them: use -D integrator=volpath or alike"
+            )
+    if any(name in plugins["BSDF"] for name in _MIRRORS):
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
-        if sampler == "gpt":
+        if gpt:
             lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
-    if plugins["Emitter"]:
+    if any(name in plugins["BSDF"] for name in ("mask", "null")):
+        lines.append("holes: features are those of what is seen through them")
+    if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):
+        lines.append("bump or normal maps: in the normals, except where they are inside another material")
+    if any(name not in _POINTS for name in plugins["Emitter"]):
         lines.append("lights: where the camera sees one, its emission goes into the 'direct' layer")
+    if not plugins["Emitter"]:
+        lines.append("lights: none, so the image will be black")
+    return lines
+
+
+def _camera(lens: bool, shutter: float) -> list[str]:
+    """What base and offset paths share beside random numbers."""
+    lines = []
+    if lens:
+        lines.append("depth of field: base and offset paths share their lens samples")
+    if shutter > 0:
+        lines.append(
+            f"shutter: open for {shutter:g} s and sampled, but nothing moves: Mitsuba {mi.__version__} has no animation"
+        )
     return lines

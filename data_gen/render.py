@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -11,11 +12,12 @@ import mitsuba as mi
 
 import ngpt
 from data_gen.builtin import SCENES
-from data_gen.camera import CameraSamples, Progress, render_passes
+from data_gen.camera import DEFAULT_MEMORY, CameraSamples, Progress, render_passes
 from data_gen.features import features
 from data_gen.film import GradientFilm
 from data_gen.spectrum import to_rgb
 from ngpt.errors import NgptError
+from ngpt.exr import with_channels
 from ngpt.stack import GradientStack
 
 # Name -> what it renders, as the command line explains it.
@@ -45,7 +47,7 @@ def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[
     except (RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, NgptError):
             raise
-        raise NgptError(f"{name}: Mitsuba cannot load it: {' '.join(str(error).split())}") from error
+        raise NgptError(f"{name}: Mitsuba cannot load it: {complaint(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")
     if not scene.sensors():
@@ -53,6 +55,14 @@ def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[
     if size is not None:
         set_film_size(scene, size)
     return scene
+
+
+def complaint(error: Exception) -> str:
+    """What Mitsuba says is wrong with a scene, in one line, and in our words where its own do not help."""
+    text = " ".join(str(error).split())
+    if "<animation>" in text:
+        return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
+    return text
 
 
 def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
@@ -74,32 +84,40 @@ def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
     return integrator
 
 
-def describe(scene: mi.Scene) -> tuple[str, bool]:
-    """What the choice of a sampler depends on: the scene's integrator, as a plugin name, and whether it has media."""
+def describe(scene: mi.Scene) -> tuple[str, list[str]]:
+    """What the choice of a sampler depends on: the scene's integrator, as a plugin name, and the names of its media."""
     integrator = scene.integrator()
     # A loaded integrator knows its class, not its plugin; only this one matters here.
     name = "path" if integrator is None or integrator.class_name() == "PathIntegrator" else integrator.class_name()
-    media = any(shape.is_medium_transition() for shape in scene.shapes())
-    return name, media or scene.sensors()[0].get_medium() is not None
+    media = [scene.sensors()[0].get_medium()]
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            media += [shape.interior_medium(), shape.exterior_medium()]
+    return name, sorted({medium.id() or medium.class_name() for medium in media if medium is not None})
 
 
-def choose_sampler(integrator: str, media: bool) -> tuple[str, str]:
+def choose_sampler(integrator: str, media: list[str]) -> tuple[str, str]:
     """The sampler that "auto" stands for, and why, for what ``describe`` tells of a scene."""
     if mi.is_polarized:
         return "gpt-basic", f"variant '{mi.variant()}' is polarised, which 'gpt' does not follow"
     if integrator != "path":
         return "gpt-basic", f"the integrator is '{integrator}', and 'gpt' knows only 'path'"
     if media:
-        return "gpt-basic", "there are media, which 'gpt' does not see"
+        return "gpt-basic", f"there are media ({', '.join(media)}), which 'gpt' does not see"
     return "gpt", "the integrator is 'path' and there are no media"
 
 
-def gpt_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
-    """Our integrator with the parameters of the scene's own; raises NgptError where it cannot stand in for that."""
+def gpt_integrator(scene: mi.Scene, diagnostics: bool = False) -> mi.SamplingIntegrator:
+    """Our integrator with the parameters of the scene's own; raises NgptError where it cannot stand in for that.
+
+    With ``diagnostics`` it also records which share of each sample's shifts failed.
+    """
     name, media = describe(scene)
     sampler, reason = choose_sampler(name, media)
     if sampler != "gpt":
-        raise NgptError(f"sampler 'gpt' cannot render this scene: {reason}; use --sampler gpt-basic")
+        raise NgptError(
+            f"sampler 'gpt' cannot render this scene: {reason}; use --sampler gpt-basic, or primal: no gradients"
+        )
     path = reference_integrator(scene)
     # Mitsuba exposes neither depth as a parameter, only in print.
     depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
@@ -110,33 +128,42 @@ def gpt_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
         )
     unlimited = depths["max_depth"] >= 0x7FFFFFFF
     depths["max_depth"] = -1 if unlimited else depths["max_depth"]
-    return mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths})
+    gpt = mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths})
+    gpt.diagnostics = diagnostics
+    return gpt
 
 
 def render_stack(
     scene: mi.Scene,
-    spp: int,
+    spp: int | None,
     seed: int = 0,
     sampler: str = "auto",
     progress: Progress = lambda done, total: None,
+    *,
+    seconds: float | None = None,
+    memory: int = DEFAULT_MEMORY,
+    stop: Callable[[], bool] = lambda: False,
+    diagnostics: bool = False,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
-    ``spp`` is the number of (base) paths per pixel, ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is
-    called with (samples done, spp) before the first pass and after each. The scene's reconstruction filter is not used:
-    the pixels of a stack, and so their differences, are box-filtered.
+    ``spp`` is the number of (base) paths per pixel, ``seconds`` a limit of wall-clock time (one of them may be None),
+    ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is called with (samples done, spp) before the first pass
+    and after each; for it, ``memory`` and ``stop`` see ``data_gen.camera.render_passes()``. With ``diagnostics`` the
+    stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels. The scene's
+    reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
+
+    The same seed and number of samples give the same bits, however they came about.
     """
-    if spp < 1:
-        raise NgptError(f"{spp} samples per pixel: at least 1 is needed")
-    if not 0 <= seed < 2**64:
-        raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
+    check_options(spp, seed, sampler, seconds, memory)
     if sampler == "auto":
         sampler, _ = choose_sampler(*describe(scene))
     start = time.perf_counter()
-    film = render_film(sampler, scene, seed, spp, progress)
+    passes = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop}
+    film = render_film(sampler, scene, seed, spp, diagnostics, passes)
     layers = film.develop()
     attributes = {
-        "ngpt:spp": spp,
+        "ngpt:spp": film.samples,
         "ngpt:seed": str(seed),
         "ngpt:sampler": sampler,
         "ngpt:seconds": time.perf_counter() - start,
@@ -144,21 +171,38 @@ def render_stack(
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {ngpt.__version__}, Mitsuba {mi.__version__} {mi.variant()}",
     }
-    return GradientStack(layers, attributes=attributes)
+    stack = GradientStack(layers, attributes=attributes)
+    return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 
-def render_film(sampler: str, scene: mi.Scene, seed: int, spp: int, progress: Progress) -> GradientFilm:
-    """Runs the sampler of that name; see ``SAMPLERS``."""
-    sensor = scene.sensors()[0]
+def check_options(spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int) -> None:
+    """Raises NgptError for what no scene could be rendered with."""
+    if spp is None and seconds is None:
+        raise NgptError("neither a number of samples per pixel nor a time to render for is given")
+    if spp is not None and not 1 <= spp < 2**31:
+        raise NgptError(f"{spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
+    if seconds is not None and not 0 < seconds < float("inf"):
+        raise NgptError(f"cannot render for {seconds:g} s; give a positive number of seconds")
+    if not 0 <= seed < 2**64:
+        raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
+    if memory < 1:
+        raise NgptError(f"{memory} MiB of memory: give a positive number")
+    if sampler not in ("auto", *SAMPLERS):
+        raise NgptError(f"unknown sampler '{sampler}'; choose one of: auto, {', '.join(SAMPLERS)}")
+
+
+def render_film(
+    sampler: str, scene: mi.Scene, seed: int, spp: int | None, diagnostics: bool = False, passes: dict | None = None
+) -> GradientFilm:
+    """Runs the sampler of that name; ``passes`` are options of ``data_gen.camera.render_passes()``."""
+    sensor, passes = scene.sensors()[0], passes or {}
     integrator = reference_integrator(scene)
     if sampler == "gpt":
-        return gpt_integrator(scene).render_film(scene, sensor, seed, spp, progress=progress)
+        return gpt_integrator(scene, diagnostics).render_film(scene, sensor, seed, spp, **passes)
     if sampler == "gpt-basic":
         gpt = mi.load_dict({"type": "gpt_basic", "integrator": integrator})
-        return gpt.render_film(scene, sensor, seed, spp, progress=progress)
-    if sampler == "primal":
-        return render_passes(partial(sample_primal, scene, integrator), sensor, seed, spp, progress)
-    raise NgptError(f"unknown sampler '{sampler}'; choose one of: auto, {', '.join(SAMPLERS)}")
+        return gpt.render_film(scene, sensor, seed, spp, **passes)
+    return render_passes(partial(sample_primal, scene, integrator), sensor, seed, spp, **passes)
 
 
 def sample_primal(scene, integrator, camera: CameraSamples, film: GradientFilm) -> None:

@@ -9,6 +9,7 @@ __version__ = "0.1.0"
 
 from ngpt.errors import NgptError
 from ngpt.exr import read, read_image, write
+from ngpt.merging import merge
 from ngpt.methods import METHODS, Result, denoise, reconstruct
 from ngpt.stack import GradientStack
 
@@ -18,6 +19,7 @@ __all__ = [
     "NgptError",
     "Result",
     "denoise",
+    "merge",
     "read",
     "read_image",
     "reconstruct",

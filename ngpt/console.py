@@ -66,5 +66,8 @@ class _Lines:
         now = time.monotonic()
         if done in (0, total) or now - self.last >= SECONDS_BETWEEN_LINES:
             self.last = now
-            elapsed = f", {now - self.start:.1f} s" if done else ""
-            self.console.say(f"{self.label}: {done}/{total} {self.unit}{elapsed}")
+            elapsed = now - self.start
+            times = f", {elapsed:.1f} s" if done else ""
+            if 0 < done < total:
+                times += f", about {elapsed * (total - done) / done:.0f} s left"
+            self.console.say(f"{self.label}: {done}/{total} {self.unit}{times}")

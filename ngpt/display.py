@@ -77,7 +77,7 @@ def error_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
     low, high = np.log10(ERROR_RANGE)
     with np.errstate(divide="ignore"):
         place = (np.log10(error) - low) / (high - low)
-    return _coloured(place, heat_table())
+    return coloured(place, heat_table())
 
 
 def signed_map(gradient: np.ndarray) -> np.ndarray:
@@ -90,15 +90,15 @@ def signed_map(gradient: np.ndarray) -> np.ndarray:
     scale = np.percentile(magnitude, 99.0) if magnitude.size else 0.0
     if scale == 0.0:  # a layer that is zero nearly everywhere still has its peak
         scale = magnitude.max(initial=0.0) or 1.0
-    return _coloured(0.5 + 0.5 * value / scale, _table(_DIVERGING, 255))  # odd: zero has an entry of its own
+    return coloured(0.5 + 0.5 * value / scale, colour_table(_DIVERGING, 255))  # odd: zero has an entry of its own
 
 
 def heat_table() -> np.ndarray:
     """(256, 3) uint8 sRGB from black over red to pale yellow."""
-    return _table(_INFERNO, 256)
+    return colour_table(_INFERNO, 256)
 
 
-def _table(anchors: tuple[str, ...], size: int) -> np.ndarray:
+def colour_table(anchors: tuple[str, ...], size: int) -> np.ndarray:
     """(size, 3) uint8: the anchors at even steps, straight lines between them."""
     colours = np.array([list(bytes.fromhex(anchor)) for anchor in anchors], dtype=np.float64)
     place = np.linspace(0.0, len(anchors) - 1, size)
@@ -106,7 +106,7 @@ def _table(anchors: tuple[str, ...], size: int) -> np.ndarray:
     return np.rint(np.stack(table, axis=1)).astype(np.uint8)
 
 
-def _coloured(place: np.ndarray, table: np.ndarray) -> np.ndarray:
+def coloured(place: np.ndarray, table: np.ndarray) -> np.ndarray:
     """(H, W) positions in [0, 1], clamped, looked up in a (N, 3) table; NaN is magenta."""
     index = np.rint((len(table) - 1) * np.clip(np.nan_to_num(place, nan=0.0), 0.0, 1.0))
     out = table[index.astype(np.uint8)]

@@ -18,7 +18,18 @@ from ngpt.exrfile import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.layers import LAYERS, RGB, Found, Resolution, resolve
 from ngpt.stack import GradientStack
 
-__all__ = ["ExrImage", "ExrPart", "StackSource", "read", "read_exr", "read_image", "write", "write_exr"]
+__all__ = [
+    "ExrImage",
+    "ExrPart",
+    "StackSource",
+    "pass_through",
+    "read",
+    "read_exr",
+    "read_image",
+    "with_channels",
+    "write",
+    "write_exr",
+]
 
 # Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
 _STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
@@ -109,6 +120,35 @@ def write(
         result, _, main = _image_of(GradientStack.from_arrays(path=str(path), primal=image), str(path))
     result.parts[main].header["ngpt:version"] = ngpt.__version__
     return write_exr(path, result, overwrite)
+
+
+def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
+    """Returns a stack that was made, not read, with further channels, (H, W) each, to be written beside its layers.
+
+    They go by names outside the contract, ``diagnostics.discarded`` for one, and are carried along as such channels of
+    a file are. ``pass_through`` reads them.
+    """
+    stack.require("primal", why="carrying further channels")
+    part, found = ExrPart("", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {}), {}
+    for name in stack.names:
+        prefix = "" if name in ("primal", "alpha") else f"{name}."
+        found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
+        _scatter(part, found[name].channels, stack[name], half=False)
+    part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
+    return GradientStack(stack.layers, stack.attributes, StackSource(ExrImage([part]), found), stack.path)
+
+
+def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
+    """The channels that a stack carries along beside the layers of the contract: name -> (H, W), as in the file."""
+    if stack.source is None:
+        return {}
+    known = {(found.part, channel) for found in stack.source.resolution.values() for channel in found.channels}
+    return {
+        name: channel
+        for i, part in enumerate(stack.source.image.parts)
+        for name, channel in part.channels.items()
+        if (i, name) not in known
+    }
 
 
 def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:

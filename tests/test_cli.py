@@ -233,16 +233,78 @@ def test_render_denoise_diff(renderer, tmp_path, capsys):
 def test_render_errors(renderer, tmp_path, capfd, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.xml").write_text('<scene version="3.0.0"><shape type="nonsense"/></scene>')
+    (tmp_path / "moving.xml").write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><animation name="to_world"/></sensor></scene>'
+    )
     for arguments, message in (
         (["render", "s.xml"], '"nonsense" not found'),
         (["render", "t.xml"], "t.xml: no such file"),
         (["render", "diffuse", "--variant", "scalar_rgb"], "'scalar_rgb' is not one"),
         (["render", "diffuse", "--sampler", "best"], "unknown sampler 'best'"),
+        (["render", "diffuse", "--size", "30000x30000"], "pass --memory"),
+        (["render", "t.xml", "--spp", "9999999999"], "9999999999 samples per pixel"),
+        (["render", "diffuse", "-o", "no/s.exr"], "the folder no does not exist"),
+        (["info", "moving.xml"], "animated transforms"),
+        (["render", "moving.xml"], "animated transforms"),
         (["demo", "--scene", "attic"], "no built-in scene is called 'attic'"),
     ):
         assert main(arguments) == 2
         assert message in one_line_error(capfd)
-    assert os.listdir(tmp_path) == ["s.xml"]
+    assert sorted(os.listdir(tmp_path)) == ["moving.xml", "s.xml"]
+    for option in (["--time", "0"], ["--time", "-3"], ["--spp", "-1"], ["--memory", "0"], ["--seed", "-1"]):
+        with pytest.raises(SystemExit) as exit:
+            main(["render", "diffuse", *option])
+        assert exit.value.code == 2
+        assert f"argument {option[0]}: '{option[1]}' is not a" in one_line_error(capfd)
+
+
+def test_render_for_a_given_time(renderer, tmp_path, capsys):
+    stack = str(tmp_path / "s.exr")
+    assert main(["render", "diffuse", "-o", stack, "--time", "1", "--size", "16x12", "--diagnostics", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["spp"] == ngpt.read(stack).attributes["ngpt:spp"] > 1
+    assert "render diffuse: 0/1 s\n" in captured.err and "render diffuse: 1/1 s" in captured.err
+    assert main(["info", stack, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["diagnostics"]["discarded"] == {"mean": 0.0, "max": 0.0, "pixels above 0": 0}
+    assert report["other channels"] == []
+
+
+def test_lines_of_progress_tell_the_time_left(capsys, monkeypatch):
+    import ngpt.console as console
+
+    clock = iter((0.0, 1.0, 8.0, 30.0))
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with console.Console().progress("render", "spp") as update:
+        for done in (0, 25, 100):
+            update(done, 100)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["render: 0/100 spp", "render: 25/100 spp, 8.0 s, about 24 s left", "render: 100/100 spp, 30.0 s"]
+
+
+@pytest.mark.parametrize("presses", [1, 2])
+def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path, presses):
+    # In a process of its own, with a sampler that presses the keys once the first pass is done.
+    code = (
+        "import data_gen.camera as c, os, signal, sys\n"
+        "def end_pass(film, *block):\n"
+        "    presses = int(sys.argv[1]) if film._pass else 0\n"
+        "    old(film, *block)\n"
+        "    for _ in range(presses): os.kill(os.getpid(), signal.SIGINT)\n"
+        "old, c.GradientFilm.end_pass = c.GradientFilm.end_pass, end_pass\n"
+        "from ngpt.cli import main; sys.exit(main(sys.argv[2:]))"
+    )
+    code = f"from data_gen.backend import use_variant; use_variant()\n{code}"
+    target = tmp_path / "s.exr"
+    arguments = ["render", "diffuse", "-o", str(target), "--size", "8x8", "--spp", "100000000", "--sampler", "primal"]
+    run = subprocess.run([sys.executable, "-c", code, str(presses), *arguments], capture_output=True, text=True)
+    assert run.returncode == 130, run.stderr
+    assert "press Ctrl-C again to discard" in run.stderr and "Traceback" not in run.stderr
+    if presses == 1:
+        spp = ngpt.read(target).attributes["ngpt:spp"]
+        assert spp > 1 and f"holds the {spp} samples per pixel done by then" in run.stderr
+    else:
+        assert os.listdir(tmp_path) == [] and "error: interrupted" in run.stderr
 
 
 def test_rendering_without_llvm_says_what_to_install(tmp_path):

@@ -17,6 +17,7 @@ from ngpt.errors import NgptError
 VERBS = {
     "demo": "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
     "render": "render a scene to a gradient stack",
+    "merge": "merge stacks of one scene, rendered with different seeds, into one of all their samples",
     "denoise": "reconstruct images from gradient stacks",
     "info": "say what a file holds, or what a scene requires",
     "diff": "compare two images",

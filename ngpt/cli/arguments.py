@@ -59,6 +59,17 @@ def natural(text: str) -> int:
     return int(text)
 
 
+def duration(text: str) -> float:
+    """A positive number of seconds."""
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = 0.0
+    if not 0 < seconds < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is not a positive number of seconds")
+    return seconds
+
+
 def stack_files(names: list[str]) -> list[Path]:
     """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
 

@@ -9,8 +9,9 @@ import ngpt
 from ngpt.cli.arguments import add_json, add_layers, assignment, print_json
 from ngpt.console import Console
 from ngpt.errors import NgptError
-from ngpt.exr import read
+from ngpt.exr import pass_through, read
 from ngpt.layers import LAYERS, format_aliases
+from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
 
@@ -75,7 +76,8 @@ def stack(stack: GradientStack) -> dict:
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
     window = [[int(n) for n in corner] for corner in main.header["dataWindow"]]
-    known = {(found.part, channel) for found in resolution.values() for channel in found.channels}
+    further = pass_through(stack)
+    rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}
     layers = {}
     for name in stack.names:
         found = resolution[name]
@@ -90,17 +92,28 @@ def stack(stack: GradientStack) -> dict:
             "max": float(finite.max()) if finite.size else None,
             "nonfinite": int(np.sum(~np.isfinite(values).all(axis=-1))),
         }
-    return {
+    report = {
         "file": stack.path,
         "size": [stack.width, stack.height],
         "data window": window,
         "parts": len(parts),
         "layers": layers,
-        "other channels": [c for i, part in enumerate(parts) for c in part.channels if (i, c) not in known],
+        "diagnostics": {
+            name.removeprefix(DIAGNOSTICS): {
+                "mean": float(rate.mean(dtype=np.float64)),
+                "max": float(rate.max()),
+                "pixels above 0": int(np.count_nonzero(rate)),
+            }
+            for name, rate in rates.items()
+        },
+        "other channels": [name for name in further if name not in rates],
         "missing": [name for name in LAYERS if name not in stack],
         "methods": [name for name, method in METHODS.items() if all(layer in stack for layer in method.needs)],
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
+    if not rates:
+        del report["diagnostics"]
+    return report
 
 
 def show(report: dict, as_json: bool) -> None:

@@ -1,24 +1,44 @@
 """``ngpt render``: from a scene to a gradient stack."""
 
 import argparse
+import signal
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-from ngpt.cli.arguments import add_force, add_json, assignment, natural, positive, print_json, size
+from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, positive, print_json, size
 from ngpt.console import Console
 from ngpt.errors import NgptError
 from ngpt.exr import write
 from ngpt.files import check_output
 
+DEFAULT_SPP = 32
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="a Mitsuba 3 scene file, or a built-in scene (see `ngpt info`)")
     parser.add_argument("-o", "--output", metavar="FILE", help="stack to write (default: SCENE.exr in this folder)")
-    parser.add_argument("--spp", type=positive, default=32, help="paths per pixel (default: 32)")
+    parser.add_argument("--spp", type=positive, help=f"paths per pixel (default: {DEFAULT_SPP})")
+    parser.add_argument(
+        "--time",
+        type=duration,
+        metavar="SECONDS",
+        help="render for this long, kernel compilation included, instead of a number of paths; with both: until the "
+        "first of them is reached",
+    )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     parser.add_argument(
         "--sampler", default="auto", help="auto, gpt, gpt-basic, or primal: no gradients (default: auto)"
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
+    parser.add_argument(
+        "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 6144)"
+    )
+    parser.add_argument(
+        "--diagnostics",
+        action="store_true",
+        help="write the rates of failed shifts and of discarded values for each pixel too",
+    )
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -35,17 +55,58 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.render import load_scene, render_stack
+    from data_gen.camera import DEFAULT_MEMORY
+    from data_gen.render import check_options, load_scene, render_stack
 
+    spp = args.spp or (DEFAULT_SPP if args.time is None else None)
+    memory = args.memory or DEFAULT_MEMORY
+    # Before the scene is loaded, which may take long.
+    check_options(spp, args.seed, args.sampler, args.time, memory)
     scene = load_scene(args.scene, args.size, dict(args.define))
-    with console.progress(f"render {args.scene}", "spp") as progress:
-        stack = render_stack(scene, args.spp, args.seed, args.sampler, progress)
+    with console.progress(f"render {args.scene}", "s" if args.time else "spp") as progress, stop_on_ctrl_c() as stop:
+        stack = render_stack(
+            scene,
+            spp,
+            args.seed,
+            args.sampler,
+            progress,
+            seconds=args.time,
+            memory=memory,
+            stop=stop,
+            diagnostics=args.diagnostics,
+        )
     if stack.attributes["ngpt:discarded"]:
-        console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite samples were left out")
+        console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
-    seconds = stack.attributes["ngpt:seconds"]
-    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {args.spp} spp, {seconds:.2f} s")
+    done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
+    interrupted = stop() and done != spp
+    if interrupted:
+        console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
+    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {seconds:.2f} s")
     if args.json:
         ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
         print_json({"output": str(target), "width": stack.width, "height": stack.height, "layers": stack.names} | ours)
-    return 0
+    return 130 if interrupted else 0
+
+
+@contextmanager
+def stop_on_ctrl_c() -> Iterator[Callable[[], bool]]:
+    """Yields a function that says whether Ctrl-C was pressed; pressed again, it interrupts as usual."""
+    pressed = False
+
+    def note(number, frame):
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, before)
+        Console().say("interrupted: ending with this pass; press Ctrl-C again to discard it all")
+
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread, where alone signals arrive
+        yield lambda: False
+        return
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)

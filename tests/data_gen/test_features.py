@@ -70,7 +70,7 @@ def test_what_escapes_has_no_features(renderer):
 def test_mirrors_and_glass_show_what_is_behind_them(renderer):
     mi = renderer
     green = plane(mi, 8, {"type": "twosided", "bsdf": diffuse(0.1, 0.7, 0.2)})  # behind the camera
-    mirror = plane(mi, 0, {"type": "twosided", "bsdf": {"type": "conductor"}})
+    mirror = plane(mi, 0, {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}})
     stack = features_of(mi, wall=green, mirror=mirror)
     assert np.allclose(stack["albedo"], [0.1, 0.7, 0.2], atol=1e-5)
     assert stack["depth"][16, 16, 0] == pytest.approx(5 + 8, abs=0.1)
@@ -78,6 +78,69 @@ def test_mirrors_and_glass_show_what_is_behind_them(renderer):
     wall = plane(mi, -2, diffuse(0.3, 0.3, 0.6))
     through = features_of(mi, wall=wall, pane=pane, spp=256)
     assert np.median(through["depth"]) == pytest.approx(7, abs=1.2)
+
+
+def test_albedo_is_tinted_by_what_it_is_seen_through(renderer):
+    mi = renderer
+    wall = plane(mi, -1, diffuse(0.8, 0.5, 0.4))
+    red = {"type": "rgb", "value": [0.9, 0.4, 0.2]}
+    # A pane reflects a small part of what falls on it; the camera looks at the sky then, which has no features.
+    pane = plane(mi, 1, {"type": "thindielectric", "specular_transmittance": red, "int_ior": 1.0001})
+    glass = features_of(mi, wall=wall, pane=pane)
+    assert np.allclose(glass["albedo"], [0.8 * 0.9, 0.5 * 0.4, 0.4 * 0.2], atol=1e-4)
+    twice = features_of(mi, wall=wall, pane=pane, second=pane | {"to_world": plane(mi, 2, {})["to_world"]})
+    assert np.allclose(twice["albedo"], [0.8 * 0.81, 0.5 * 0.16, 0.4 * 0.04], atol=1e-4)
+    # A ball of refracting glass with the camera inside: one surface, whose radiance is scaled by the index squared.
+    ball = sphere({"type": "dielectric", "specular_transmittance": red, "int_ior": 1.0001}, radius=6.0)
+    room = sphere({"type": "twosided", "bsdf": diffuse(0.8, 0.5, 0.4)}, radius=20.0)
+    inside = features_of(mi, ball=ball, room=room, size=(9, 9))
+    assert np.allclose(inside["albedo"], [0.8 * 0.9, 0.5 * 0.4, 0.4 * 0.2], atol=1e-3)
+
+
+def test_mirrors_tint_albedo_and_add_up_depth(renderer):
+    mi = renderer
+    blue = {"type": "conductor", "material": "none", "specular_reflectance": {"type": "rgb", "value": [0.3, 0.5, 0.9]}}
+    mirror = plane(mi, 0, {"type": "twosided", "bsdf": blue})
+    behind = plane(mi, 8, {"type": "twosided", "bsdf": diffuse(0.5, 0.5, 0.5)})
+    stack = features_of(mi, mirror=mirror, behind=behind)
+    assert np.allclose(stack["albedo"], [0.15, 0.25, 0.45], atol=1e-5)
+    assert stack["depth"][16, 16, 0] == pytest.approx(5 + 8, abs=0.01)
+    assert np.allclose(stack["normal"], [0, 0, -1], atol=1e-5)  # of the wall itself: it is not mirrored
+
+
+def tilted(mi, angle, bsdf):
+    """``bsdf`` under a normal map that turns normals by ``angle`` toward the local x axis."""
+    normal = np.array([np.sin(angle), 0, np.cos(angle)]) / 2 + 0.5
+    image = mi.Bitmap(np.broadcast_to(normal, (4, 4, 3)).astype(np.float32))
+    return {"type": "normalmap", "normalmap": {"type": "bitmap", "bitmap": image, "raw": True}, "bsdf": bsdf}
+
+
+def test_normal_maps_turn_normals(renderer):
+    mi = renderer
+    material = tilted(mi, 0.5, {"type": "twosided", "bsdf": diffuse(0.5, 0.5, 0.5)})
+    stack = features_of(mi, wall=plane(mi, 0, material))
+    assert np.allclose(stack["normal"], [np.sin(0.5), 0, np.cos(0.5)], atol=0.01)
+    assert np.allclose(stack["albedo"], 0.5, atol=1e-4)
+    # In camera space: a wall turned by as much the other way faces the viewer again.
+    turned = plane(mi, 0, material)
+    turned["to_world"] = turned["to_world"] @ mi.ScalarTransform4f().rotate([0, 1, 0], np.degrees(-0.5))
+    assert np.allclose(features_of(mi, wall=turned)["normal"], [0, 0, 1], atol=0.01)
+    # Seen in a mirror, x of the picture stays, and z turns round.
+    mirror = plane(mi, 0, {"type": "twosided", "bsdf": {"type": "conductor", "material": "none"}})
+    behind = plane(mi, 8, material)
+    behind["to_world"] = behind["to_world"] @ mi.ScalarTransform4f().rotate([0, 1, 0], 180)
+    seen = features_of(mi, mirror=mirror, behind=behind)["normal"]
+    assert np.allclose(seen, [-np.sin(0.5), 0, -np.cos(0.5)], atol=0.01)
+
+
+def test_bump_maps_turn_normals(renderer):
+    mi = renderer
+    ramp = np.tile(np.linspace(0, 1, 256, dtype=np.float32), (256, 1))[..., None]
+    height = {"type": "bitmap", "bitmap": mi.Bitmap(ramp), "raw": True}
+    wall = plane(mi, 0, {"type": "bumpmap", "arbitrary": height, "scale": 10.0, "bsdf": diffuse(0.5, 0.5, 0.5)})
+    # The ramp rises by 10 over the 20 units of the wall.
+    expected = np.array([-0.5, 0, 1]) / np.sqrt(1.25)
+    assert np.allclose(features_of(mi, wall=wall)["normal"], expected, atol=0.02)
 
 
 def test_holes_of_masks_are_seen_through(renderer):

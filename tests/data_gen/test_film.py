@@ -76,3 +76,48 @@ def test_variance_of_a_gradient_is_that_of_its_mean(renderer, film, rng):
     layers = target.develop()
     assert np.allclose(layers["dx_var"][:, :-1, 0], (variance["right"][:, :-1] + variance["left"][:, 1:]) / 4)
     assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["down"][:-1] + variance["up"][1:]) / 4)
+
+
+def test_diagnostics_are_images_beside_the_layers(renderer, film, rng):
+    mi = renderer
+    target = film(2, 2)
+    for _ in range(2):
+        samples = rng.random((4, 8, 3)).astype(np.float32)
+        samples[3, :2] = np.nan
+        fill(mi, target, samples)
+        target.put("shift_failures", mi.Float(np.repeat([0, 0.25, 0.5, 1], 8).astype(np.float32)))
+    assert set(target.develop()) == {"primal", "primal_var"}
+    images = target.diagnose()
+    assert images["diagnostics.shiftFailures"].tolist() == [[0, 0.25], [0.5, 1]]
+    # A share of all values: 2 of 8 colours, and none of 8 rates.
+    assert images["diagnostics.discarded"].tolist() == [[0, 0], [0, 0.125]]
+
+
+def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer, film):
+    mi = renderer
+    target = film(1, 1)
+    for _ in range(50):
+        target.put("primal", mi.Color3f(mi.Float(np.full(1000, 0.1, np.float32))))
+    layers = target.develop()
+    assert (layers["primal"] == np.float32(0.1)).all() and not layers["primal_var"].any()
+
+
+def test_blocks_and_strands_lose_no_sample(renderer, film, rng, monkeypatch):
+    import data_gen.film as module
+
+    samples = rng.random((6, 40, 3)).astype(np.float32)
+    results = []
+    for strands in (1, 6 * 3, 6 * 64):
+        monkeypatch.setattr(module, "_STRANDS", strands)
+        target = film(3, 2)
+        for first, last in ((0, 16), (16, 40)):  # a block of 16, then three of 8
+            part = samples[:, first:last]
+            block = 16 if first == 0 else 8
+            lanes = part.reshape(6, -1, block, 3).swapaxes(0, 1).reshape(-1, 3)
+            target.put("primal", renderer.Color3f(*lanes.T))
+            target.end_pass(block)
+        assert target.samples == 40
+        results.append(target.develop())
+    for layers in results:
+        assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-6)
+        assert np.allclose(layers["primal_var"].reshape(6, 3), samples.var(axis=1, ddof=1) / 40, rtol=1e-5)

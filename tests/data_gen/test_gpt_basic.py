@@ -66,25 +66,6 @@ def test_variances_predict_the_spread(renderer):
         assert predicted == pytest.approx(spread, rel=0.25), name
 
 
-def test_same_seed_same_bits_and_passes_do_not_repeat(renderer, monkeypatch):
-    from data_gen import camera
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "diffuse", (16, 12))
-    monkeypatch.setattr(camera, "LANES_PER_PASS", 16 * 12 * 3)
-    calls = []
-    a = render_stack(scene, 10, 7, "gpt-basic", progress=lambda done, total: calls.append((done, total)))
-    b = render_stack(scene, 10, 7, "gpt-basic")
-    c = render_stack(scene, 10, 8, "gpt-basic")
-    assert calls == [(0, 10), (2, 10), (5, 10), (7, 10), (10, 10)]
-    for name in a.names:
-        assert np.array_equal(a[name], b[name]), name
-    assert not np.array_equal(a["primal"], c["primal"])
-    # If passes repeated their random numbers, the variance would not fall with their number.
-    one = render_stack(scene, 3, 7, "gpt-basic")
-    assert not np.array_equal(a["primal"], one["primal"])
-
-
 def test_works_as_a_mitsuba_integrator(renderer):
     scene = load(renderer, "diffuse", (20, 10))
     integrator = renderer.load_dict({"type": "gpt_basic", "nested": {"type": "path", "max_depth": 3}})

@@ -164,7 +164,37 @@ def test_inspection_names_what_matters(scene_file):
         inspect_scene(scene_file(text="<scene"))
 
 
-@pytest.mark.parametrize("size", [(1, 1), (1, 7), (5, 1), (2, 2)])
+def test_media_are_refused_by_name(renderer):
+    from data_gen_scenes import within_fog
+
+    from data_gen.render import choose_sampler, describe, render_stack, set_film_size
+
+    description = within_fog()
+    description["integrator"]["type"] = "path"
+    scene = renderer.load_dict(description)
+    set_film_size(scene, (6, 4))
+    assert describe(scene)[1] == ["air"] and choose_sampler(*describe(scene))[0] == "gpt-basic"
+    with pytest.raises(NgptError, match=r"media \(air\).*gpt-basic, or primal"):
+        render_stack(scene, 1, sampler="gpt")
+    assert render_stack(scene, 1, sampler="primal").attributes["ngpt:sampler"] == "primal"
+
+
+def test_inspection_of_media_lens_maps_and_shutter(scene_file):
+    from data_gen.inspect import inspect_scene
+
+    fog = '<medium type="homogeneous" name="interior" id="mist"/>'
+    text = SCENE.format(integrator="volpath", film="", bsdf="diffuse").replace("</shape>", f"{fog}</shape>")
+    text = text.replace("<film", '<float name="shutter_close" value="0.5"/><film').replace('="constant"', '="point"')
+    report = inspect_scene(scene_file(text=text))
+    assert report["media"] == ["mist"] and report["shutter"] == 0.5 and not report["lens"]
+    assert report["sampler"] == "gpt-basic"
+    plan = "\n".join(report["plan"])
+    assert "`--sampler gpt` refuses" in plan and "nothing moves" in plan and "'direct' layer" not in plan
+    report = inspect_scene("lens")
+    assert report["lens"] and "depth of field" in "\n".join(report["plan"])
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (1, 7), (5, 1), (2, 2)])
 def test_tiny_images(renderer, size):
     from data_gen.render import load_scene, render_stack
 

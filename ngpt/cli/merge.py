@@ -1,0 +1,27 @@
+"""``ngpt merge``: one gradient stack of several, with the samples of all of them."""
+
+import argparse
+
+from ngpt.cli.arguments import add_force, add_json, print_json
+from ngpt.console import Console
+from ngpt.exr import read, write
+from ngpt.files import check_output
+from ngpt.merging import merge
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("stacks", nargs="+", metavar="STACK", help="stacks of one scene, rendered with different seeds")
+    parser.add_argument("-o", "--output", metavar="FILE", required=True, help="stack to write")
+    add_force(parser)
+    add_json(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    target = check_output(args.output, args.force)
+    merged = merge([read(path) for path in args.stacks])
+    write(target, merged, overwrite=args.force)
+    spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]
+    console.say(f"{len(args.stacks)} stacks -> {target}: {merged.width}x{merged.height}, {spp} spp, seeds {seed}")
+    if args.json:
+        print_json({"output": str(target), "inputs": args.stacks, "spp": spp, "seed": seed, "layers": merged.names})
+    return 0

@@ -1,0 +1,146 @@
+"""Merging of independent stacks of one scene: more samples, without rendering them together.
+
+With n_i samples per pixel, means m_i and variances of the mean v_i, the stack of all N = Σ n_i samples has
+
+    mean       m = Σ n_i m_i / N
+    variance   Σ [n_i (n_i - 1) v_i + n_i (m_i - m)²] / (N (N - 1))
+
+[Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.exr import pass_through, with_channels
+from ngpt.stack import GradientStack
+
+# Layers with a variance, and the layers that hold it.
+VARIANCES = {"primal": "primal_var", "dx": "dx_var", "dy": "dy_var"}
+# Channels beside the layers that are means over samples too.
+DIAGNOSTICS = "diagnostics."
+
+
+def merge(stacks: Sequence[GradientStack]) -> GradientStack:
+    """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds.
+
+    Means are weighted by ``ngpt:spp``, and variances of the mean come from the pooled sums, so merged stacks of n1 and
+    n2 samples equal the stack of n1 + n2 up to the rounding of float32. There are two exceptions. Variances of dx and
+    dy are those of two independent directions, which a stack no longer tells apart: their merged value has the same
+    expectation, and differs by about 1 / N of itself. And samples that were not finite are missing in their pixel
+    alone, which then counts with the full weight of its stack; a pixel that lost all of them is NaN and counts nothing.
+
+    A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
+    of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
+
+    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp``, ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all
+    other attributes are those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in
+    size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or ``ngpt:seed``, results of a
+    reconstruction, and channels of unknown meaning.
+    """
+    if len(stacks) < 2:
+        raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
+    counts = [_samples(stack) for stack in stacks]
+    _check(stacks, counts)
+    total = sum(counts)
+    layers = {}
+    for name in stacks[0].names:
+        if name not in VARIANCES.values():
+            layers[name] = _mean([stack[name] for stack in stacks], counts)
+    for name, variance in VARIANCES.items():
+        known = all(variance in stack or n == 1 for stack, n in zip(stacks, counts, strict=True))
+        if name in layers and known:
+            layers[variance] = _variance(stacks, counts, name, variance)
+    attributes = dict(stacks[0].attributes) | {
+        "ngpt:spp": total,
+        "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
+    }
+    for name in ("ngpt:seconds", "ngpt:discarded"):
+        if all(name in stack.attributes for stack in stacks):
+            attributes[name] = sum(stack.attributes[name] for stack in stacks)
+    merged = GradientStack({name: layer.astype(np.float32) for name, layer in layers.items()}, attributes)
+    further = [pass_through(stack) for stack in stacks]
+    if not further[0]:
+        return merged
+    return with_channels(merged, {name: _mean([channels[name] for channels in further], counts) for name in further[0]})
+
+
+def _mean(layers: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+    """Mean weighted by ``counts``, over the values that are not NaN; in double precision."""
+    weights = [n * ~np.isnan(layer) for layer, n in zip(layers, counts, strict=True)]
+    # Products of infinite values and zero weights are left out, not added.
+    total = sum(np.where(w > 0, w * layer.astype(np.float64), 0) for w, layer in zip(weights, layers, strict=True))
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return total / sum(weights)
+
+
+def _variance(stacks: Sequence[GradientStack], counts: Sequence[int], name: str, variance: str) -> np.ndarray:
+    mean = _mean([stack[name] for stack in stacks], counts)
+    squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        for stack, n in zip(stacks, counts, strict=True):
+            values = stack[name].astype(np.float64)
+            there = ~np.isnan(values)
+            within = n * (n - 1) * stack[variance].astype(np.float64) if n > 1 else 0.0
+            squares += np.where(there, within + n * (values - mean) ** 2, 0)
+            total += n * there
+        return np.where(total > 1, squares / (total * (total - 1)), np.nan)
+
+
+def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
+    first = stacks[0]
+    seen: dict[str, str] = {}
+    for stack, n in zip(stacks, counts, strict=True):
+        if (stack.width, stack.height) != (first.width, first.height):
+            raise NgptError(
+                f"{stack.path} is {stack.width}x{stack.height} but {first.path} is {first.width}x{first.height}; only "
+                "stacks of one size can be merged"
+            )
+        for name in _means(stack) ^ _means(first):
+            has, lacks = (stack, first) if name in _means(stack) else (first, stack)
+            raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
+        sampler = stack.attributes.get("ngpt:sampler")
+        if sampler != first.attributes.get("ngpt:sampler"):
+            raise NgptError(
+                f"{stack.path} was made by sampler '{sampler}' and {first.path} by "
+                f"'{first.attributes.get('ngpt:sampler')}'; their variances cannot be merged"
+            )
+        for name in VARIANCES.values():
+            if n > 1 and name not in stack and any(name in other for other in stacks):
+                raise NgptError(f"{stack.path} has no '{name}' though it has {n} samples per pixel; render it again")
+        for seed in _seeds(stack):
+            if seed in seen:
+                raise NgptError(
+                    f"{stack.path} and {seen[seed]} were both rendered with seed {seed}: the same samples twice are no "
+                    "more than once; render one of them with another --seed"
+                )
+            seen[seed] = stack.path
+    for stack in stacks:
+        strange = next((name for name in pass_through(stack) if not name.startswith(DIAGNOSTICS)), None)
+        if strange is not None:
+            raise NgptError(
+                f"{stack.path}: channel '{strange}' is no layer that could be averaged; merge stacks as `ngpt render` "
+                "writes them, before they are reconstructed"
+            )
+
+
+def _means(stack: GradientStack) -> set[str]:
+    """What is averaged over samples: layers and diagnostics."""
+    return {*stack.names, *pass_through(stack)} - set(VARIANCES.values())
+
+
+def _samples(stack: GradientStack) -> int:
+    spp = stack.attributes.get("ngpt:spp")
+    if not isinstance(spp, int | np.integer) or spp < 1:
+        raise NgptError(f"{stack.path}: has no attribute 'ngpt:spp', so its weight is not known; render it with ngpt")
+    return int(spp)
+
+
+def _seeds(stack: GradientStack) -> list[str]:
+    seed = str(stack.attributes.get("ngpt:seed", "")).split()
+    if not seed:
+        raise NgptError(
+            f"{stack.path}: has no attribute 'ngpt:seed', so its samples might be those of another; render it with ngpt"
+        )
+    return seed

@@ -1,0 +1,151 @@
+"""How a render is split into passes: never seen in its bits, bounded in memory and time."""
+
+import time
+
+import numpy as np
+import pytest
+from unbiased import load
+
+from ngpt.errors import NgptError
+
+
+def same(a, b):
+    assert a.names == b.names
+    for name in a.names:
+        assert np.array_equal(a[name], b[name], equal_nan=True), name
+
+
+@pytest.mark.parametrize(
+    ("sampler", "size"), [("gpt", (16, 12)), ("gpt", (7, 5)), ("gpt-basic", (7, 5)), ("primal", (16, 12))]
+)
+def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, sampler, size):
+    from data_gen import camera
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "glossy", size)
+    whole = render_stack(scene, 150, 7, sampler)
+    same(whole, render_stack(scene, 150, 7, sampler))
+    calls = []
+    monkeypatch.setattr(camera, "_FIRST_LANES", size[0] * size[1] * 40)
+    monkeypatch.setattr(camera, "_PASS_SECONDS", 1e-9)
+    parts = render_stack(scene, 150, 7, sampler, lambda done, total: calls.append((done, total)))
+    # 40 samples are two blocks of 16; what is left over at the end is a pass of its own.
+    assert calls == [(n, 150) for n in (0, 32, 48, 64, 80, 96, 112, 128, 144, 150)]
+    same(whole, parts)
+    assert not np.array_equal(whole["primal"], render_stack(scene, 150, 8, sampler)["primal"])
+
+
+def test_large_images_with_small_blocks(renderer, monkeypatch):
+    from data_gen import camera
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "glossy", (33, 21))
+    monkeypatch.setattr(camera, "_BLOCK_LANES", 33 * 21 * 5)
+    whole = render_stack(scene, 14, 7)
+    assert camera.block_of_samples(33 * 21) == 4
+    monkeypatch.setattr(camera, "_PASS_SECONDS", 1e-9)
+    same(whole, render_stack(scene, 14, 7))
+
+
+def test_passes_do_not_move_blocks_within_packets(renderer):
+    from data_gen.camera import blocks_within
+    from data_gen.film import GradientFilm
+
+    assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
+    # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.
+    assert blocks_within(1000, GradientFilm(33, 21), 4) == 1
+
+
+def test_samples_are_independent(renderer):
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "diffuse", (24, 16))
+    stacks = [render_stack(scene, 64, seed, "primal") for seed in range(24)]
+    # If samples, pixels or seeds shared their numbers, means would vary more than the variance of samples says.
+    images = np.stack([stack["primal"] for stack in stacks])
+    predicted = np.mean([stack["primal_var"] for stack in stacks], axis=0)
+    assert images.var(axis=0, ddof=1).mean() == pytest.approx(predicted.mean(), rel=0.1)
+    whole = images.mean(axis=(1, 2, 3))
+    assert whole.var(ddof=1) < 3 * predicted.mean() / images[0].size * 3  # colours go together
+
+
+def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "diffuse", (64, 48))
+    render_stack(scene, 1)
+    calls, start = [], time.perf_counter()
+    stack = render_stack(scene, None, 3, progress=lambda *call: calls.append(call), seconds=1.5)
+    assert 0.5 < time.perf_counter() - start < 4  # on a busy machine too
+    assert calls[0] == (0, 2) and calls[-1] == (2, 2)
+    spp = stack.attributes["ngpt:spp"]
+    assert spp > 1
+    same(stack, render_stack(scene, spp, 3))
+    assert render_stack(scene, 2, seconds=100).attributes["ngpt:spp"] == 2
+    assert render_stack(scene, None, seconds=1e-6).attributes["ngpt:spp"] >= 1  # at least something
+
+
+def test_stopping_keeps_the_samples_done(renderer):
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "diffuse", (256, 256))
+    stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True)
+    assert 1 <= stack.attributes["ngpt:spp"] < 100
+    same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal"))
+
+
+@pytest.mark.parametrize("sampler", ["gpt", "gpt-basic"])
+def test_memory_stays_within_its_budget(renderer, sampler):
+    import drjit as dr
+
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "glossy", (64, 48))
+    whole = render_stack(scene, 100, 1, sampler)
+    dr.flush_malloc_cache()
+    dr.detail.malloc_clear_statistics()
+    before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
+    calls = []
+    stack = render_stack(scene, 100, 1, sampler, lambda *call: calls.append(call), memory=40)
+    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before < 40 * 2**20
+    assert len(calls) > 5
+    same(whole, stack)
+
+
+def test_sizes_that_memory_cannot_hold(renderer):
+    from data_gen.render import render_stack, set_film_size
+
+    scene = load(renderer, "diffuse", (4, 4))
+    set_film_size(scene, (20000, 10000))
+    with pytest.raises(NgptError, match=r"20000x10000 pixels need \d+ MiB .* pass --memory \d+"):
+        render_stack(scene, 1)
+    set_film_size(scene, (40, 30))
+    with pytest.raises(NgptError, match=r"pass --memory (\d+)") as error:
+        render_stack(scene, 1, memory=1)
+    assert render_stack(scene, 1, memory=int(str(error.value).split("--memory ")[1].split(",")[0]))
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"spp": 2**31}, "from 1 to"),
+        ({"spp": None}, "neither a number of samples"),
+        ({"spp": None, "seconds": 0}, "cannot render for 0 s"),
+        ({"spp": None, "seconds": float("nan")}, "cannot render for nan s"),
+        ({"spp": 1, "memory": 0}, "0 MiB"),
+    ],
+)
+def test_bad_options(renderer, options, message):
+    from data_gen.render import render_stack
+
+    with pytest.raises(NgptError, match=message):
+        render_stack(load(renderer, "diffuse", (4, 4)), **options)
+
+
+def test_a_million_samples_of_one_pixel(renderer):
+    from data_gen.render import render_stack
+
+    stack = render_stack(load(renderer, "diffuse", (1, 1)), 1 << 20, sampler="primal")
+    assert stack.attributes["ngpt:spp"] == 1 << 20
+    assert np.allclose(np.linalg.norm(stack["normal"]), 1, atol=1)
+    assert (stack["primal_var"] < 1e-4 * stack["primal"] ** 2).all()

@@ -1,0 +1,160 @@
+"""Merged stacks against statistics of all samples at once."""
+
+import json
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.exr import pass_through, with_channels
+from ngpt.merging import merge
+from ngpt.stack import GradientStack
+
+SHAPE = (5, 4, 3)
+
+
+def stack_of(samples, seed, gradients=True, **attributes):
+    """The stack of samples (spp, H, W, 3), with gradients that are twice the primal."""
+    spp = len(samples)
+    layers = {"primal": samples.mean(axis=0)}
+    if gradients:
+        layers |= {"dx": 2 * layers["primal"], "dy": -2 * layers["primal"]}
+    if spp > 1:
+        variance = samples.var(axis=0, ddof=1) / spp
+        layers |= {f"{name}_var": variance * (1 if name == "primal" else 4) for name in list(layers)}
+    known = {"ngpt:spp": spp, "ngpt:seed": str(seed), "ngpt:sampler": "gpt", "ngpt:seconds": 1.5}
+    return GradientStack.from_arrays(path=f"{seed}.exr", attributes=known | attributes, **layers)
+
+
+@pytest.mark.parametrize("counts", [(4, 4), (1, 7), (1, 1), (3, 1, 12)])
+def test_merged_stacks_are_the_stack_of_all_samples(rng, counts):
+    samples = 5 + rng.normal(size=(sum(counts), *SHAPE))
+    parts = np.split(samples, np.cumsum(counts)[:-1])
+    merged = merge([stack_of(part, seed) for seed, part in enumerate(parts)])
+    whole = stack_of(samples, 0)
+    assert merged.names == whole.names
+    for name in whole.names:
+        assert np.allclose(merged[name], whole[name], rtol=1e-5, atol=1e-7), name
+    assert merged.attributes["ngpt:spp"] == sum(counts)
+    assert merged.attributes["ngpt:seed"] == " ".join(str(i) for i in range(len(counts)))
+    assert merged.attributes["ngpt:seconds"] == 1.5 * len(counts)
+
+
+def test_the_order_of_merging_does_not_matter(rng):
+    a, b, c = (stack_of(rng.random((n, *SHAPE)), seed) for seed, n in enumerate((2, 5, 3)))
+    left, right = merge([merge([a, b]), c]), merge([a, merge([c, b])])
+    for name in left.names:
+        assert np.allclose(left[name], right[name], rtol=1e-5, atol=1e-7), name
+
+
+def test_pixels_without_samples_count_nothing(rng):
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed) for seed in range(2))
+    for name in ("primal", "primal_var"):
+        a.layers[name][1, 2] = np.nan
+    b.layers["primal"][0, 0] = np.inf
+    merged = merge([a, b])
+    assert np.array_equal(merged["primal"][1, 2], b["primal"][1, 2])
+    assert np.allclose(merged["primal_var"][1, 2], b["primal_var"][1, 2], rtol=1e-6)
+    assert np.isposinf(merged["primal"][0, 0]).all()
+    assert np.isfinite(merged["primal"][2:]).all()
+
+
+def test_rendered_stacks(renderer):
+    from data_gen.render import load_scene, render_stack
+
+    scene = load_scene("glossy", (16, 12))
+    parts = [render_stack(scene, spp, seed, diagnostics=True) for seed, spp in enumerate((8, 24))]
+    merged = merge(parts)
+    assert merged.attributes["ngpt:spp"] == 32 and merged.attributes["ngpt:seed"] == "0 1"
+    for name in ("primal", "dx", "albedo", "depth"):
+        expected = (8.0 * parts[0][name] + 24.0 * parts[1][name]) / 32
+        assert np.allclose(merged[name], expected, rtol=1e-5, atol=1e-6), name
+    assert "diagnostics.discarded" in pass_through(merged)
+
+
+def test_films_of_both_parts_and_of_all_samples(renderer, rng):
+    """The primal exactly; gradients, whose two directions a stack does not tell apart, in the mean."""
+    from data_gen.film import GradientFilm
+
+    mi = renderer
+    samples = rng.normal(size=(5, 16 * 16, 96)).astype(np.float32)
+
+    def stack(part, seed):
+        film = GradientFilm(16, 16)
+        for name, values in zip(("primal", "right", "left", "down", "up"), samples[:, :, part], strict=True):
+            film.put(name, mi.Color3f(mi.Float(values.ravel())))
+        attributes = {"ngpt:spp": film.samples, "ngpt:seed": str(seed)}
+        layers = film.develop()
+        return GradientStack(layers, attributes | {"ngpt:spp": film.samples})
+
+    merged, whole = merge([stack(np.s_[:32], 0), stack(np.s_[32:], 1)]), stack(np.s_[:], 2)
+    for name in ("primal", "primal_var", "dx", "dy"):
+        assert np.allclose(merged[name], whole[name], rtol=1e-4, atol=1e-6), name
+    assert np.allclose(merged["dx_var"], whole["dx_var"], rtol=0.15)
+    assert merged["dx_var"].mean() == pytest.approx(whole["dx_var"].mean(), rel=0.01)
+
+
+def error_cases(rng):
+    def stack(seed=1, shape=SHAPE, spp=4, **options):
+        return stack_of(rng.random((spp, *shape)), seed, **options)
+
+    bare = stack(2)
+    del bare.attributes["ngpt:spp"]
+    seedless = stack(2)
+    del seedless.attributes["ngpt:seed"]
+    unknown = stack(2)
+    for name in ("primal_var", "dx_var", "dy_var"):
+        del unknown.layers[name]
+    return [
+        ([stack()], "at least two stacks, and got 1"),
+        ([stack(), stack(2, (5, 6, 3))], "2.exr is 6x5 but 1.exr is 4x5"),
+        ([stack(), stack(2, gradients=False)], "1.exr has 'd[xy]' and 2.exr has not"),
+        ([stack(), stack()], "both rendered with seed 1"),
+        ([stack("0 1"), stack("1")], "both rendered with seed 1"),
+        ([stack(), bare], "2.exr: has no attribute 'ngpt:spp'"),
+        ([stack(), seedless], "2.exr: has no attribute 'ngpt:seed'"),
+        ([stack(), stack(2, **{"ngpt:sampler": "primal"})], "made by sampler 'primal'"),
+        ([stack(), unknown], "2.exr has no 'primal_var' though it has 4 samples"),
+        ([with_channels(stack(i), {"id": np.zeros(SHAPE[:2])}) for i in range(2)], "channel 'id' is no layer"),
+    ]
+
+
+@pytest.mark.parametrize("case", range(10))
+def test_stacks_that_cannot_be_merged(rng, case):
+    stacks, message = error_cases(rng)[case]
+    with pytest.raises(NgptError, match=message):
+        merge(stacks)
+
+
+def test_results_are_not_merged(rng, tmp_path):
+    paths = []
+    for seed in range(2):
+        stack = stack_of(rng.random((4, *SHAPE)), seed)
+        ngpt.write(tmp_path / f"{seed}.exr", ngpt.denoise(stack, "l2"), like=stack)
+        paths.append(tmp_path / f"{seed}.exr")
+    with pytest.raises(NgptError, match="before they are reconstructed"):
+        merge([ngpt.read(path) for path in paths])
+
+
+def test_command(rng, tmp_path, capsys):
+    paths = []
+    for seed in range(3):
+        stack = stack_of(rng.random((4, *SHAPE)), seed)
+        stack = with_channels(stack, {"diagnostics.discarded": np.full(SHAPE[:2], seed / 4)})
+        paths.append(str(ngpt.write(tmp_path / f"{seed}.exr", stack)))
+    out = str(tmp_path / "out.exr")
+    assert main(["merge", *paths, "-o", out, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["spp"] == 12 and report["seed"] == "0 1 2"
+    merged = ngpt.read(out)
+    assert merged.attributes["ngpt:spp"] == 12
+    assert np.allclose(merged["dx"], sum(ngpt.read(path)["dx"] for path in paths) / 3, atol=1e-6)
+    assert np.allclose(pass_through(merged)["diagnostics.discarded"], 0.25)
+    assert main(["info", out]) == 0
+    assert "discarded" in capsys.readouterr().out
+    assert main(["merge", *paths, "-o", out]) == 2
+    assert "--force" in capsys.readouterr().err
+    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 2
+    assert "seed 0" in capsys.readouterr().err
