@@ -199,9 +199,23 @@ def test_tone_mapping_is_that_of_ngpt():
 
 # Backbones and their files
 
-SQUEEZENET = {"features.0.weight": [64, 3, 3, 3], "features.3.squeeze.weight": [16, 64, 1, 1]}
-SQUEEZENET |= {"features.12.expand3x3.weight": [256, 64, 3, 3], "features.9.expand1x1.bias": [192]}
-VGG16 = {"features.0.weight": [64, 3, 3, 3], "features.14.weight": [256, 256, 3, 3], "features.28.bias": [512]}
+# Index of each fire module, its channels in, squeezed and expanded (each of two); of each convolution, in and out.
+_FIRES = {3: (64, 16, 64), 4: (128, 16, 64), 6: (128, 32, 128), 7: (256, 32, 128), 9: (256, 48, 192)}
+_FIRES |= {10: (384, 48, 192), 11: (384, 64, 256), 12: (512, 64, 256)}
+SQUEEZENET = {"features.0.weight": [64, 3, 3, 3], "features.0.bias": [64]}
+for _i, (_in, _squeezed, _out) in _FIRES.items():
+    for _name, _shape in {
+        "squeeze": [_squeezed, _in, 1, 1],
+        "expand1x1": [_out, _squeezed, 1, 1],
+        "expand3x3": [_out, _squeezed, 3, 3],
+    }.items():
+        SQUEEZENET |= {f"features.{_i}.{_name}.weight": _shape, f"features.{_i}.{_name}.bias": _shape[:1]}
+VGG16 = {}
+for _i, _in, _out in [
+    (0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256),
+    (17, 256, 512), (19, 512, 512), (21, 512, 512), (24, 512, 512), (26, 512, 512), (28, 512, 512),
+]:  # fmt: skip
+    VGG16 |= {f"features.{_i}.weight": [_out, _in, 3, 3], f"features.{_i}.bias": [_out]}
 
 
 @pytest.mark.parametrize(
@@ -215,10 +229,19 @@ def test_backbones_are_those_of_torchvision(kind, shapes, parameters, sizes):
     network = kind()
     state = network.state_dict()
     assert sum(t.numel() for t in state.values()) == parameters
-    assert all(list(state[name].shape) == shape for name, shape in shapes.items())
+    assert {name: list(tensor.shape) for name, tensor in state.items()} == shapes
     features = list(network(images(1, 3, 64, 64), lambda x: x))
     assert tuple(f.shape[1] for f in features) == kind.CHANNELS
     assert [f.shape[2] for f in features] == sizes
+
+
+def test_autocast_does_not_reach_the_features():
+    distance = random_elpips(backbones.SqueezeNet)
+    a, b = images(1, 3, 64, 64), images(1, 3, 64, 64, seed=1)
+    near = a + 1e-3 * (b - a)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = distance(a, near)
+    assert inside == distance(a, near)
 
 
 def test_dropout_is_shared_by_both_images():
@@ -248,12 +271,21 @@ def test_elpips_trains_when_its_files_are_there(tmp_path):
 def test_missing_and_damaged_files_are_explained(tmp_path, monkeypatch):
     files = weight_files(tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
+    tensor, numbers, damaged = (str(tmp_path / f"{name}.pth") for name in ("tensor", "numbers", "damaged"))
+    torch.save(torch.zeros(3), tensor)
+    torch.save({"features.0.weight": 3}, numbers)
+    state = backbones.SqueezeNet().state_dict()
+    state["features.0.bias"][5] = torch.nan
+    torch.save(state, damaged)
     cases = [
         ({"backbone": ""}, r"squeezenet1_1-b8a52dc0\.pth: no such file; get .* \"structural\" needs no weights"),
         ({"weights": ""}, "loss.weights is not set"),
         ({"weights": "nowhere"}, "nowhere: no such file"),
         ({"weights": files["backbone"]}, "not a readable safetensors file"),
         ({"backbone": __file__}, "cannot be read as PyTorch weights"),
+        ({"backbone": tensor}, "holds a Tensor, not a dictionary"),
+        ({"backbone": numbers}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"backbone": damaged}, "'features.0.bias' holds values that are not finite"),
         ({"backbone": files["weights"]}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
         ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
     ]
@@ -288,7 +320,8 @@ def test_no_code_is_run_from_weight_files(tmp_path, capsys):
     [
         ({"kind": "perceptive"}, "choose one of"),
         ({"kinds": "l1"}, "unknown key 'kinds'"),
-        ({"l1": -1.0}, "must not be negative"),
+        ({"l1": -1.0}, "not negative"),
+        ({"l1": float("nan")}, "must be finite"),
         ({"l1": "much"}, "must be like 0.01"),
         ({"evaluations": 0}, "at least 1"),
     ],

@@ -1,5 +1,6 @@
 """What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, fields
 from typing import Any
@@ -97,8 +98,8 @@ def make_loss(settings: dict[str, Any]) -> Loss:
         wanted = (int, float) if isinstance(default, float) else type(default)
         if not isinstance(value, wanted) or isinstance(value, bool):
             raise NgptError(f"[loss]: {name} = {value!r}: must be like {default!r}")
-        if isinstance(value, int | float) and value < 0:
-            raise NgptError(f"[loss]: {name} = {value!r}: must not be negative")
+        if isinstance(value, int | float) and not 0 <= value < math.inf:
+            raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")
     result = LossSettings(**settings)
     if result.kind not in KINDS:
         raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join(KINDS)}")

@@ -94,8 +94,8 @@ def _standardised(image: Tensor) -> Tensor:
 def load(kind: type[nn.Module], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    Only tensors are read, never code. Raises NgptError where there is no such file, it is not the one its name promises
-    (eight digits of its SHA-256 are in it), or it has other tensors.
+    Only tensors are read, never code. Raises NgptError where there is no such file, it bears torchvision's name but
+    not the checksum in it, or it has other tensors.
     """
     file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)  # type: ignore[attr-defined]
     if not file.is_file():
@@ -104,17 +104,22 @@ def load(kind: type[nn.Module], path: str = "") -> nn.Module:
             'there, or name it in the configuration as loss.backbone; loss.kind = "structural" needs no weights'
         )
     digits = kind.FILE.rpartition("-")[2].removesuffix(".pth")  # type: ignore[attr-defined]
-    if not path and not hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
+    if file.name == kind.FILE and not hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
         raise NgptError(f"{file}: its checksum is not {digits}...; it is damaged, download it again")
     try:
         tensors = torch.load(file, map_location="cpu", weights_only=True)
     except Exception as error:  # whatever a damaged archive makes of it
         raise NgptError(f"{file}: cannot be read as PyTorch weights: {' '.join(str(error).split())[:200]}") from error
+    if not isinstance(tensors, dict):
+        raise NgptError(f"{file}: holds a {type(tensors).__name__}, not a dictionary of tensors; see docs/losses.md")
     network = kind()
     own = network.state_dict()
     for name, tensor in own.items():
-        if name not in tensors or tensors[name].shape != tensor.shape:
-            found = list(tensors[name].shape) if name in tensors else "missing"
-            raise NgptError(f"{file}: tensor '{name}' should be {list(tensor.shape)}, is {found}")
+        found = tensors.get(name)
+        if not isinstance(found, Tensor) or found.shape != tensor.shape:
+            what = list(found.shape) if isinstance(found, Tensor) else "missing"
+            raise NgptError(f"{file}: tensor '{name}' should be {list(tensor.shape)}, is {what}")
+        if not torch.isfinite(found).all():
+            raise NgptError(f"{file}: tensor '{name}' holds values that are not finite; the file is damaged")
     network.load_state_dict({name: tensors[name] for name in own})
     return network.requires_grad_(False).eval()

@@ -33,6 +33,11 @@ class FeatureDistance(nn.Module):
 
     def forward(self, a: Tensor, b: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """A scalar, the mean over the batch; with ``generator``, inputs of convolutions are dropped at random."""
+        # Differences of features are too small for 16 bits.
+        with torch.autocast(a.device.type, enabled=False):
+            return self._distance(a.float(), b.float(), generator)
+
+    def _distance(self, a: Tensor, b: Tensor, generator: torch.Generator | None) -> Tensor:
         count = len(a)
 
         def dropout(x: Tensor) -> Tensor:
@@ -41,7 +46,7 @@ class FeatureDistance(nn.Module):
             mask = torch.rand(count, *x.shape[1:], generator=generator, device=generator.device).to(x.device) < KEEP
             return x * torch.cat([mask, mask]) / KEEP
 
-        images = 2 * torch.cat([a, b]).float() - 1
+        images = 2 * torch.cat([a, b]) - 1
         total = images.new_zeros(())
         for i, feature in enumerate(self.backbone(images, dropout)):
             # The root's derivative is infinite where all channels are 0, unless something is added inside.
@@ -70,7 +75,7 @@ def read_weights(path: str, channels: tuple[int, ...]) -> list[Tensor]:
         if weight is None or weight.numel() != size:
             found = "missing" if weight is None else f"of {weight.numel()} numbers"
             raise NgptError(f"{path}: vector 'lin{i}' is {found}; it should have {size}")
-        if not (weight >= 0).all():
-            raise NgptError(f"{path}: vector 'lin{i}' holds numbers that are negative or NaN")
+        if not ((weight >= 0) & torch.isfinite(weight)).all():
+            raise NgptError(f"{path}: vector 'lin{i}' holds numbers that are negative or not finite")
         weights.append(weight.flatten())
     return weights
