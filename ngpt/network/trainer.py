@@ -11,6 +11,7 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -51,7 +52,7 @@ class Trainer:
         loss: Loss,
         out: str | Path,
         processes: Processes | None = None,
-        say: Callable[[str], None] = print,
+        say: Callable[[str], None] = partial(print, flush=True),
     ):
         if not len(crops):
             raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
