@@ -11,7 +11,6 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +35,11 @@ Loss = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, dict[str, Tenso
 LIMIT = 20.0
 
 
+def show(text: str) -> None:
+    """Prints a line at once: logs are looked at while they grow."""
+    print(text, flush=True)
+
+
 class Trainer:
     """One run in the folder ``out``, new or continued.
 
@@ -52,7 +56,7 @@ class Trainer:
         loss: Loss,
         out: str | Path,
         processes: Processes | None = None,
-        say: Callable[[str], None] = partial(print, flush=True),
+        say: Callable[[str], None] = show,
     ):
         if not len(crops):
             raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
