@@ -42,7 +42,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def overview() -> dict:
     """What this installation offers."""
-    report = {"version": ngpt.__version__, "methods": {name: method.summary for name, method in METHODS.items()}}
+    report = {
+        "version": ngpt.__version__,
+        "methods": {name: method.missing() or method.summary for name, method in METHODS.items()},
+    }
     try:
         use_renderer()
     except NgptError as error:
@@ -108,7 +111,11 @@ def stack(stack: GradientStack) -> dict:
         },
         "other channels": [name for name in further if name not in rates],
         "missing": [name for name in LAYERS if name not in stack],
-        "methods": [name for name, method in METHODS.items() if all(layer in stack for layer in method.needs)],
+        "methods": [
+            name
+            for name, method in METHODS.items()
+            if not method.missing() and all(layer in stack for layer in method.needs)
+        ],
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
     if not rates:
