@@ -50,6 +50,42 @@ def reconnection_jacobian(base: mi.Point3f, offset: mi.Point3f, target: mi.Point
     return cosines * (near / far)
 
 
+def copy_half_vector(
+    wi: mi.Vector3f, wo: mi.Vector3f, η: mi.Float, wi_offset: mi.Vector3f, same: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """The direction that has, with ``wi_offset``, the half-vector of ``wi`` and ``wo``; dω'/dω; whether it exists.
+
+    Directions are local to the shading frame of either vertex and lead away from it; ``η`` is the relative index of
+    refraction along ``wo``. A refraction is copied only to the ``same`` material from the same side, since the reverse
+    shift must know η; one without bending (thin sheets) is copied as a mirrored reflection. The base vertex must not be
+    left by a Dirac delta. [Kettunen et al. 2015, supplement; Walter et al. 2007, eq. 13-17, 40]
+    """
+    refracts = wi.z * wo.z < 0
+    thin = refracts & (η == 1)
+    bends = refracts & ~thin
+    above = mi.Vector3f(wo.x, wo.y, dr.select(thin, -wo.z, wo.z))
+    scale = dr.select(bends, η, 1)
+    h = wi + scale * above
+    length2 = dr.squared_norm(h)
+    h = h * dr.rsqrt(length2)
+
+    # Reflection about h, of which either sign will do
+    c = dr.dot(wi_offset, h)
+    mirrored = 2 * c * h - wi_offset
+    # Refraction: wi' + η wo' is to be parallel to h.
+    cos2 = 1 - (1 - dr.square(c)) / dr.square(scale)
+    bent = (c * h - wi_offset) / scale - dr.mulsign(dr.safe_sqrt(cos2), c) * h
+    wo_offset = dr.select(bends, bent, mirrored)
+
+    length2_offset = dr.squared_norm(wi_offset + scale * wo_offset)
+    cosines = dr.abs(dr.dot(wo_offset, h) / dr.dot(above, h))
+    J = dr.select(bends, length2 / length2_offset / cosines, cosines)
+    wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
+    exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
+    exists &= (~bends | (cos2 > 0)) & dr.isfinite(J) & (J > 0)
+    return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists
+
+
 def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
     """Power heuristic of two techniques' densities by their ratio: squares of densities would leave float32."""
     return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)

@@ -16,6 +16,25 @@ SMOOTH, DELTA, NULL = 0, 1, 2
 _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.data)?$")
 
 
+class PointerTable:
+    """A yes or no for each of a scene's materials or emitters, looked up in the kernel by their Dr.Jit pointers."""
+
+    def __init__(self, entries: list[tuple], default: bool):
+        """``entries`` are (pointer, value); pointers that are not listed have the ``default`` value."""
+        values = {int(dr.reinterpret_array(mi.UInt32, pointer)[0]): value for pointer, value in entries}
+        # Indexed by Dr.Jit's number of the object.
+        table = np.full(max(values, default=0) + 1, default)
+        table[list(values)] = list(values.values())
+        self.default, self.size = default, len(table)
+        self.table = mi.Bool(table)
+        dr.eval(self.table)
+
+    def __getitem__(self, pointer) -> mi.Bool:
+        number = dr.reinterpret_array(mi.UInt32, pointer)
+        listed = number < self.size
+        return dr.select(listed, dr.gather(mi.Bool, self.table, number, listed), self.default)
+
+
 class Materials:
     """Which materials of a scene scatter so widely that any two directions may be joined at them.
 
@@ -26,27 +45,25 @@ class Materials:
     It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
+
+    ``all_connectable`` is True where every vertex is connectable and no event is other than smooth.
     """
 
     def __init__(self, scene: mi.Scene, threshold: float):
-        smallest = {}
-        for shape in scene.shapes():
-            bsdf = shape.bsdf()
-            if bsdf is not None:
-                smallest[int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])] = smallest_roughness(bsdf)
-        # Indexed by Dr.Jit's number of the material. Materials inside shape groups are not listed and count as rough.
-        table = np.ones(max(smallest, default=0) + 1, bool)
-        for index, roughness in smallest.items():
-            table[index] = roughness > threshold
-        self.size = len(table)
-        self.rough = mi.Bool(table)
-        dr.eval(self.rough)
+        shapes = scene.shapes()
+        bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None]
+        rough = [smallest_roughness(bsdf) > threshold for bsdf in bsdfs]
+        # Materials inside shape groups are not listed: they count as rough, but what else they do is unknown.
+        self.all_connectable = all(rough) and not any(shape.class_name() == "Instance" for shape in shapes)
+        for bsdf in bsdfs:
+            flags = bsdf.flags()
+            sharp = mi.has_flag(flags, mi.BSDFFlags.Delta) or mi.has_flag(flags, mi.BSDFFlags.Null)
+            self.all_connectable &= mi.has_flag(flags, mi.BSDFFlags.Smooth) and not sharp
+        self.rough = PointerTable([(mi.BSDFPtr(b), r) for b, r in zip(bsdfs, rough, strict=True)], default=True)
 
     def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
-        index = dr.reinterpret_array(mi.UInt32, bsdf)
-        rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & self.rough[bsdf]
 
 
 def smallest_roughness(bsdf: mi.BSDF) -> float:

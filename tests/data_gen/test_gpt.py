@@ -73,11 +73,13 @@ def test_agrees_with_the_teaching_sampler(renderer):
 def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     import drjit as dr
 
+    from data_gen import shift
     from data_gen.integrators import gpt
 
+    module = gpt if function == "SHIFTS" else shift
     scene = load(renderer, "diffuse", (32, 32))
     references = render_references(renderer, scene, spp=128)
-    monkeypatch.setattr(gpt, function, partial(mutant, renderer, dr) if callable(mutant) else mutant)
+    monkeypatch.setattr(module, function, partial(mutant, renderer, dr) if callable(mutant) else mutant)
     passed = verdicts(render_ours(scene, "gpt"), references)
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
