@@ -38,6 +38,15 @@ def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool
     return ~reconnects(offset_kind, offset, offset_next, base)
 
 
+def keeps_joined(kind: mi.UInt32) -> mi.Bool:
+    """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does.
+
+    A mirror or a hole, unlike a smooth event, sends light from elsewhere elsewhere. From either side the shift is
+    rejected then: the mirror that one path has sampled, the other cannot have sampled in the same direction.
+    """
+    return kind == SMOOTH
+
+
 def reconnection_jacobian(base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f) -> mi.Float:
     """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``.
 
@@ -79,10 +88,11 @@ def copy_half_vector(
 
     length2_offset = dr.squared_norm(wi_offset + scale * wo_offset)
     cosines = dr.abs(dr.dot(wo_offset, h) / dr.dot(above, h))
-    J = dr.select(bends, length2 / length2_offset / cosines, cosines)
+    J = dr.select(bends, length2_offset / length2 / cosines, cosines)
     wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
     exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
-    exists &= (~bends | (cos2 > 0)) & dr.isfinite(J) & (J > 0)
+    # What is no refraction about h to begin with has no inverse.
+    exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
     return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists
 
 

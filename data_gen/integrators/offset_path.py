@@ -228,8 +228,7 @@ def step_joined(step: Step, path: Offset) -> Offset:
     f, p = evaluate(bsdf, y, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
     r1 = path.r * p / step.p
-    # A mirror or a hole sends light from elsewhere elsewhere.
-    good = (step.kind == SMOOTH) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
+    good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1 = dr.select(good, β1, 0)
     L_bsdf = step.Le * mis_weight(p, step.p_light)
     w2 = shift.gradient_weight(r1, good)
