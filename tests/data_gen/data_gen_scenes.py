@@ -105,26 +105,6 @@ def polished(alpha):
     }
 
 
-def lacquered():
-    """A room of lacquer: paths join at vertices that may mirror."""
-    from data_gen.builtin import _box, _camera, _light, _rgb, _room
-
-    def lacquer(*color):
-        return {"type": "plastic", "diffuse_reflectance": _rgb(*color), "nonlinear": True}
-
-    room = _room(1.5, lacquer(0.5, 0.4, 0.3))
-    for wall in room.values():
-        wall["bsdf"] = lacquer(0.4, 0.4, 0.4)
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 5},
-        "sensor": _camera([0, 1.25, 3.9], [0, 1.15, 0], 50),
-        **room,
-        "lamp": _light([0, 2.2, -0.2], [0, -1, 0], (1.5, 1.5), (4, 4, 4)),
-        "box": _box([-0.4, 0.5, -0.3], [0.7, 1.0, 0.7], 20, lacquer(0.1, 0.3, 0.5)),
-    }
-
-
 def _scale(factor):
     import mitsuba as mi
 

@@ -8,7 +8,7 @@ from functools import partial
 
 import numpy as np
 import pytest
-from data_gen_scenes import fog, furnace, glass, hidden_lamp, lacquered, one_sided, plenty, polished
+from data_gen_scenes import fog, furnace, glass, hidden_lamp, one_sided, plenty, polished
 from unbiased import gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
@@ -65,7 +65,6 @@ def test_agrees_with_the_teaching_sampler(renderer):
         ("reconnection_jacobian", lambda mi, dr, *geometry: mi.Float(1)),
         ("gradient_weight", lambda mi, dr, r, good: dr.select(good, 2 / (1 + r), 1)),
         ("gradient_weight", lambda mi, dr, r, good: mi.Float(1)),
-        ("keeps_joined", lambda mi, dr, kind: mi.Bool(True)),
         ("SHIFTS", {"right": (2, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1)}),
         ("SHIFTS", {"right": (1, 0), "left": (-1, 0), "down": (0, -1), "up": (0, 1)}),
     ],
@@ -85,7 +84,7 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     from data_gen.integrators import gpt
 
     module = gpt if function == "SHIFTS" else shift
-    scene = load(renderer, lacquered if function == "keeps_joined" else "diffuse", (32, 32))
+    scene = load(renderer, "diffuse", (32, 32))
     references = render_references(renderer, scene, spp=128)
     monkeypatch.setattr(module, function, partial(mutant, renderer, dr) if callable(mutant) else mutant)
     passed = verdicts(render_ours(scene, "gpt"), references)
