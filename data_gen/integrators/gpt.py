@@ -66,6 +66,7 @@ class GPT(GradientIntegrator):
         self.rr_depth = props.get("rr_depth", 5)
         self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
         self.shift = props.get("shift", "replay")
+        self.reuse = props.get("reuse", False)
         self.diagnostics = props.get("diagnostics", False)
         if self.shift not in ("replay", "half-vector"):
             raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: replay, half-vector")
@@ -90,7 +91,6 @@ class GPT(GradientIntegrator):
             rr_depth=self.rr_depth,
             shift=self.shift,
             hide_emitters=self.hide_emitters,
-            diagnostics=self.diagnostics,
         )
         return render_passes(
             lambda camera, film: self.sample_pass(scene, plan, camera, film), sensor, seed, spp, **progress
@@ -101,17 +101,15 @@ class GPT(GradientIntegrator):
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         L, Le, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
-        Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
         L, Le = to_rgb(L, ray.wavelengths), to_rgb(Le, ray.wavelengths)
+        Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
+        inside = [inside for _, _, inside in shifted]
+        if self.reuse:
+            L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in offsets], Δ, inside)
         values = {"primal": L + Le, "direct": Le}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
-        inside = [inside for _, _, inside in shifted]
-        if plan.diagnostics:
-            failures, shifts = (
-                sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
-                for flags in ([y.failed for y in offsets], inside)
-            )
-            values["shift_failures"] = failures / dr.fmax(shifts, 1)
+        if self.diagnostics:
+            values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
         dr.eval(values, Δ, inside)
         for name, value in values.items():
             film.put(name, value)
@@ -163,6 +161,29 @@ class GPT(GradientIntegrator):
             si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
             hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
         return hit
+
+
+def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
+    """L of each sample as the mean over the four pairs with neighbours: what either path of a pair says of this pixel.
+
+    A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
+    A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
+    """
+    dr.eval(A, Δ, inside)
+    width, pixels = camera.size.x, camera.size.x * camera.size.y
+    lanes = dr.width(inside[0])
+    spp = lanes // pixels
+    names, lane = list(SHIFTS), dr.arange(mi.Int32, lanes)
+    L = mi.Color3f(0)
+    for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):
+        back = names.index(next(name for name, shift in SHIFTS.items() if shift == (-x, -y)))
+        neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, spp * (x + width * y)))
+        L += (a + dr.gather(mi.Color3f, A[back] + Δ[back], neighbour, active)) / 8
+    return L
+
+
+def count(flags: list[mi.Bool]) -> mi.Float:
+    return sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))

@@ -29,6 +29,8 @@ class Offset:
     a: mi.Spectrum
     Δ: mi.Spectrum
     failed: mi.Bool  # the base path went on to where no offset path corresponds to it
+    w2: mi.Float  # settled: 2 w of all that follows
+    A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ
 
 
 @dataclass
@@ -63,6 +65,9 @@ def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Off
         a=dr.select(ended, -importance * (1 if plan.replays else 2), 0),
         Δ=dr.zeros(mi.Spectrum, dr.width(hit.t)),
         failed=mi.Bool(False) if plan.replays else ended,
+        # Beyond the border there is no path that could have its part of the weight.
+        w2=dr.select(ended, 1 if plan.replays else 2, dr.select(inside, mi.Float(0), 2)),
+        A=dr.zeros(mi.Spectrum, dr.width(hit.t)),
     )
 
 
@@ -108,8 +113,10 @@ def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Of
 
 def settle(step: Step, offsets: list[Offset]) -> None:
     """Adds to settled paths what the base path finds in this step."""
+    C = step.L_light + step.f_p * step.L_bsdf
     for y in offsets:
-        y.Δ = y.Δ + y.a * (step.L_light + step.f_p * step.L_bsdf)
+        y.Δ = y.Δ + y.a * C
+        y.A = y.A + y.w2 * step.β * C
         y.a = y.a * step.f_p
 
 
@@ -123,7 +130,8 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
     f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
     L_light = f * light.weight * light_mis(light.delta, light.p, p)
-    Δ = path.Δ + shift.gradient_weight(path.r, True) * (path.β * L_light - step.β * step.L_light)
+    w2_light = shift.gradient_weight(path.r, True)
+    Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
     parts = step.walks & ~joins
@@ -151,6 +159,8 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
         failed=path.failed | (step.goes_on & (r1 == 0)),
+        w2=dr.select(apart | joined, 0, w2),
+        A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
     )
 
 
@@ -223,7 +233,8 @@ def step_joined(step: Step, path: Offset) -> Offset:
     bsdf = y.bsdf()
     f, p = evaluate(bsdf, y, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
-    Δ = path.Δ + shift.gradient_weight(path.r, True) * (path.β * L_light - step.β * step.L_light)
+    w2_light = shift.gradient_weight(path.r, True)
+    Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     f, p = evaluate(bsdf, y, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
@@ -233,6 +244,7 @@ def step_joined(step: Step, path: Offset) -> Offset:
     L_bsdf = step.Le * mis_weight(p, step.p_light)
     w2 = shift.gradient_weight(r1, good)
     a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
+    A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf
     return Offset(
         ray=path.ray,
         hit=path.hit,
@@ -244,4 +256,6 @@ def step_joined(step: Step, path: Offset) -> Offset:
         a=dr.select(path.joined, a, path.a),
         Δ=dr.select(path.joined, Δ, path.Δ),
         failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
+        w2=dr.select(path.joined, w2, path.w2),
+        A=dr.select(path.joined, A, path.A),
     )

@@ -17,7 +17,6 @@ class Plan:
     ``replays``       offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
     ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
-    ``diagnostics``   failed shifts are counted
     """
 
     materials: Materials
@@ -27,7 +26,6 @@ class Plan:
     replays: bool
     half_vectors: bool
     hide_emitters: bool
-    diagnostics: bool
 
     @property
     def hides(self) -> bool:
@@ -41,11 +39,10 @@ def make_plan(
     rr_depth: int,
     shift: str,
     hide_emitters: bool,
-    diagnostics: bool,
 ) -> Plan:
     """Inspects the scene; the parameters are those of ``gpt``."""
     materials = Materials(scene, roughness_threshold)
     # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
     replays = not materials.all_connectable
     half_vectors = replays and shift == "half-vector"
-    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, diagnostics)
+    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters)

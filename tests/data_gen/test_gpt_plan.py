@@ -13,7 +13,7 @@ def make_plan(scene, **options):
     from data_gen.integrators import plan
 
     defaults = {"roughness_threshold": 0.05, "max_depth": 8, "rr_depth": 5, "shift": "replay"}
-    return plan.make_plan(scene, **defaults | {"hide_emitters": False, "diagnostics": False} | options)
+    return plan.make_plan(scene, **defaults | {"hide_emitters": False} | options)
 
 
 def render(scene, spp=16, size=None, **options):

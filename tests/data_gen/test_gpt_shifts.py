@@ -66,7 +66,7 @@ class Steps:
 
         self.mi, self.dr = mi, dr
         self.scene = mi.load_dict(museum())
-        self.plan = make_plan(self.scene, threshold, -1, 1000, shift, False, True)
+        self.plan = make_plan(self.scene, threshold, -1, 1000, shift, False)
         assert self.plan.replays
         self.random = mi.load_dict({"type": "independent"})
         self.random.seed(7, LANES)
