@@ -72,7 +72,6 @@ def test_agrees_with_the_teaching_sampler(renderer):
         "no Jacobian",
         "failed shifts count half",
         "all weights equal",
-        "joined to mirrors",
         "off by one",
         "down is up",
     ],

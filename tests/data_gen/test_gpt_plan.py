@@ -169,6 +169,29 @@ def mostly(condition):
     return np.array(condition).mean() > 0.99
 
 
+@pytest.mark.parametrize("scene", ["glossy", plenty])
+def test_the_primal_of_base_and_offset_paths_is_unbiased(renderer, scene):
+    from data_gen.render import gpt_integrator
+
+    scene = load(renderer, scene, (32, 32))
+    integrator = gpt_integrator(scene)
+    integrator.reuse = True
+    stacks = [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop() for seed in range(16)]
+    for name, result in gradient_tests(stacks, render_references(renderer, scene, spp=128)):
+        assert result.passed, f"{name}: {result}"
+    base = render(scene, spp=64)
+    assert np.array_equal(base["dx"], stacks[0]["dx"])
+    dark = base["direct"].sum(axis=-1) == 0
+    assert stacks[0]["primal_var"][dark].mean() < 0.6 * base["primal_var"][dark].mean()
+
+
+def test_the_primal_of_base_and_offset_paths_of_a_single_pixel(renderer):
+    """Without neighbours it is that of the base paths."""
+    scene = load(renderer, "diffuse", (1, 1))
+    base, reused = render(scene), render(scene, reuse=True)
+    assert np.allclose(base["primal"], reused["primal"], rtol=1e-5)
+
+
 def test_failed_shifts_are_counted_when_asked(renderer):
     scene = load(renderer, "glossy", (32, 32))
     plain, counted = render(scene), render(scene, diagnostics=True)
