@@ -1,10 +1,11 @@
 """Shift mappings of gradient-domain path tracing, one vertex at a time, as pure functions.
 
 A shift takes a base path through one pixel to an offset path through its neighbour. Vertex by vertex it does one of
-three things (survey, sections 3.1 and 3.3):
+four things (survey, sections 3.1 to 3.3):
 
     reconnect   go straight to the next vertex of the base path, which both paths share from then on
     replay      sample the next direction from the same random numbers
+    copy        take the direction that has the same half-vector, in the shading frame
     reject      give up: no offset path corresponds to this base path
 
 Gradients are unbiased if the shift is an involution, T(T(x)) = x: shifting the offset path back must give the base

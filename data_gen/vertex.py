@@ -16,25 +16,6 @@ SMOOTH, DELTA, NULL = 0, 1, 2
 _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.data)?$")
 
 
-class PointerTable:
-    """A yes or no for each of a scene's materials or emitters, looked up in the kernel by their Dr.Jit pointers."""
-
-    def __init__(self, entries: list[tuple], default: bool):
-        """``entries`` are (pointer, value); pointers that are not listed have the ``default`` value."""
-        values = {int(dr.reinterpret_array(mi.UInt32, pointer)[0]): value for pointer, value in entries}
-        # Indexed by Dr.Jit's number of the object.
-        table = np.full(max(values, default=0) + 1, default)
-        table[list(values)] = list(values.values())
-        self.default, self.size = default, len(table)
-        self.table = mi.Bool(table)
-        dr.eval(self.table)
-
-    def __getitem__(self, pointer) -> mi.Bool:
-        number = dr.reinterpret_array(mi.UInt32, pointer)
-        listed = number < self.size
-        return dr.select(listed, dr.gather(mi.Bool, self.table, number, listed), self.default)
-
-
 class Materials:
     """Which materials of a scene scatter so widely that any two directions may be joined at them.
 
@@ -51,19 +32,31 @@ class Materials:
 
     def __init__(self, scene: mi.Scene, threshold: float):
         shapes = scene.shapes()
-        bsdfs = [bsdf for bsdf in (shape.bsdf() for shape in shapes) if bsdf is not None]
-        rough = [smallest_roughness(bsdf) > threshold for bsdf in bsdfs]
+        # By Dr.Jit's number of each material
+        bsdfs = {dr_number(shape.bsdf()): shape.bsdf() for shape in shapes if shape.bsdf() is not None}
+        table = np.ones(max(bsdfs, default=0) + 1, bool)
+        smooth = True
+        for number, bsdf in bsdfs.items():
+            table[number] = smallest_roughness(bsdf) > threshold
+            sharp = any(mi.has_flag(bsdf.flags(), flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
+            smooth &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and not sharp
         # Materials inside shape groups are not listed: they count as rough, but what else they do is unknown.
-        self.all_connectable = all(rough) and not any(shape.class_name() == "Instance" for shape in shapes)
-        for bsdf in bsdfs:
-            flags = bsdf.flags()
-            sharp = mi.has_flag(flags, mi.BSDFFlags.Delta) or mi.has_flag(flags, mi.BSDFFlags.Null)
-            self.all_connectable &= mi.has_flag(flags, mi.BSDFFlags.Smooth) and not sharp
-        self.rough = PointerTable([(mi.BSDFPtr(b), r) for b, r in zip(bsdfs, rough, strict=True)], default=True)
+        hidden = any(shape.class_name() == "Instance" for shape in shapes)
+        self.all_connectable = bool(table.all()) and smooth and not hidden
+        self.size = len(table)
+        self.rough = mi.Bool(table)
+        dr.eval(self.rough)
 
     def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & self.rough[bsdf]
+        index = dr.reinterpret_array(mi.UInt32, bsdf)
+        rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
+
+
+def dr_number(bsdf: mi.BSDF) -> int:
+    """The number by which Dr.Jit's arrays of pointers know a material."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
 
 
 def smallest_roughness(bsdf: mi.BSDF) -> float:

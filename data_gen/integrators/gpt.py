@@ -17,11 +17,15 @@ four offsets cost about as much as the base path and not four times that.
     Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x), the sum over all lengths of paths and over the two
                       techniques, which are shifted separately: C is the contribution f m of one
     a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
+    A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
 from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
 apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
+
+The base path is in ``base_path``, the offset paths in ``offset_path``, the rules of shifting in ``data_gen.shift``;
+``plan`` decides which of all that a scene needs in its kernel.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -52,9 +56,18 @@ ROUGHNESS_THRESHOLD = 0.05
 class GPT(GradientIntegrator):
     """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces.
 
-    Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``: ``max_depth`` (default: -1, no limit),
-    ``rr_depth`` (5), ``hide_emitters`` (false), and ``roughness_threshold``, the microfacet roughness above which
-    materials are connectable.
+    Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``:
+
+    ``max_depth``            default -1: no limit
+    ``rr_depth``             5
+    ``hide_emitters``        false
+    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
+    ``shift``                "replay" before paths join, or "half-vector": that of smooth events is copied, others are
+                             replayed, which is rarely better
+    ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
+                             Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
+    ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
+                             without a counterpart: rejected, or of zero density, at a step that the base path took
 
     Not handled: media (they are not seen), and polarised variants, for which rendering raises NgptError.
     """
