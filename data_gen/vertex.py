@@ -26,18 +26,23 @@ class Materials:
     It is a property of the material alone, of neither the direction nor the lobe that was sampled: a path and its
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
+
+    ``all_connectable`` is True where every vertex is connectable and no event is other than smooth.
     """
 
     def __init__(self, scene: mi.Scene, threshold: float):
-        smallest = {}
-        for shape in scene.shapes():
-            bsdf = shape.bsdf()
-            if bsdf is not None:
-                smallest[int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])] = smallest_roughness(bsdf)
-        # Indexed by Dr.Jit's number of the material. Materials inside shape groups are not listed and count as rough.
-        table = np.ones(max(smallest, default=0) + 1, bool)
-        for index, roughness in smallest.items():
-            table[index] = roughness > threshold
+        shapes = scene.shapes()
+        # By Dr.Jit's number of each material
+        bsdfs = {dr_number(shape.bsdf()): shape.bsdf() for shape in shapes if shape.bsdf() is not None}
+        table = np.ones(max(bsdfs, default=0) + 1, bool)
+        smooth = True
+        for number, bsdf in bsdfs.items():
+            table[number] = smallest_roughness(bsdf) > threshold
+            sharp = any(mi.has_flag(bsdf.flags(), flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
+            smooth &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and not sharp
+        # Materials inside shape groups are not listed: they count as rough, but what else they do is unknown.
+        hidden = any(shape.class_name() == "Instance" for shape in shapes)
+        self.all_connectable = bool(table.all()) and smooth and not hidden
         self.size = len(table)
         self.rough = mi.Bool(table)
         dr.eval(self.rough)
@@ -47,6 +52,11 @@ class Materials:
         index = dr.reinterpret_array(mi.UInt32, bsdf)
         rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
+
+
+def dr_number(bsdf: mi.BSDF) -> int:
+    """The number by which Dr.Jit's arrays of pointers know a material."""
+    return int(dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(bsdf))[0])
 
 
 def smallest_roughness(bsdf: mi.BSDF) -> float:

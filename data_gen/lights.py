@@ -1,0 +1,98 @@
+"""Emitters seen from the vertices of shifted paths, and what of that they may take over from their base path."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+# Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
+_UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
+
+
+class Lights:
+    """Whether the emitters of a scene answer the same random numbers with the same point, or direction, everywhere.
+
+    Those that do are all that are infinitely far away, and area lights on shapes that are sampled uniformly. To replay
+    their sampling at another vertex changes no more than the solid angle, which saves choosing them anew: they are
+    ``shared``, if there are no others in the scene (a kernel with both kinds of code gained nothing).
+
+    ``near``, ``far``: whether there are emitters of finite and of infinite distance.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
+        far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
+        uniform = [shape.emitter().class_name() == "AreaLight" and is_uniform(shape) for shape in lamps]
+        self.near, self.far = not all(far), any(far)
+        # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
+        self.shared = sum(uniform) + sum(far) == len(scene.emitters())
+
+
+def is_uniform(shape: mi.Shape) -> bool:
+    return shape.is_mesh() or shape.class_name() in _UNIFORM_SHAPES
+
+
+@dataclass
+class LightSample:
+    """An emitter in direction ``d``, found with density ``p`` in solid angle; ``weight`` = Le V / p."""
+
+    d: mi.Vector3f
+    p: mi.Float
+    delta: mi.Bool
+    weight: mi.Spectrum
+
+
+def sample_light(scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> LightSample:
+    """Emitter sampling at a vertex."""
+    light, weight = scene.sample_emitter_direction(si, u, True, active)
+    return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0))
+
+
+def replay_light(scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, lit: mi.Bool) -> LightSample:
+    """``sample_light(scene, y, u, lit)``, by way of what the same numbers gave at another vertex.
+
+    ``base`` is the direction sample there and ``base_weight`` its Le / p, with no regard for occlusion.
+    """
+    if not lights.shared:
+        return sample_light(scene, y, u, lit)
+    far = mi.Bool(lights.far)
+    if lights.far and lights.near:
+        far = mi.has_flag(base.emitter.flags(), mi.EmitterFlags.Infinite)
+    to = mi.Vector3f(base.p - y.p)
+    distance2 = dr.squared_norm(to)
+    d = dr.select(far, base.d, to * dr.rsqrt(distance2))
+    ratio = dr.dot(base.n, d) / dr.dot(base.n, base.d)
+    # dω'/dω from either vertex to the point on the emitter
+    J = dr.select(far, 1, dr.abs(ratio) * dr.square(base.dist) / distance2)
+    # Seen from the other side, an emitter is another one.
+    shared = (base.pdf > 0) & (far | (ratio > 0)) & dr.isfinite(J) & (J > 0)
+    anew, shared = lit & ~shared, lit & shared
+    visible = shared & ~scene.ray_test(y.spawn_ray_to(dr.select(far, y.p + d * base.dist, base.p)), shared)
+    sample = LightSample(
+        d, dr.select(shared, base.pdf / J, 0), base.delta, dr.select(visible, base_weight * J, mi.Spectrum(0))
+    )
+    return dr.if_stmt((sample,), anew, lambda _: sample_light(scene, y, u, anew), lambda sample: sample)
+
+
+def emission(scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled) -> tuple:
+    """Le at ``si`` toward ``ref`` where ``active``, and the density with which emitter sampling finds it where
+    ``sampled``."""
+    light = mi.DirectionSample3f(scene, si, ref)
+    return light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, sampled)
+
+
+def shared_emission(scene, lights: Lights, x1, Le, p, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
+    """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` at the same vertex ``x1``, seen from elsewhere.
+
+    ``y1`` is ``x1`` with another incident direction, of which ``J`` is the ratio d'²/d² of squared distances.
+    """
+    if not lights.shared:
+        return emission(scene, y1, y, True, True)
+    escapes = ~x1.is_valid()
+    ratio = dr.select(escapes, 1, y1.wi.z / x1.wi.z)
+    shared = escapes | ((ratio > 0) & dr.isfinite(ratio))
+    p1 = dr.select(shared, p * dr.select(escapes, 1, J / dr.abs(ratio)), 0)
+    anew = (x1.emitter(scene) != None) & ~shared  # noqa: E711 - a comparison of arrays of pointers
+    return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew), lambda *known: known)

@@ -1,0 +1,237 @@
+"""What the kernel contains is decided by the scene, and changes nothing but its cost."""
+
+import numpy as np
+import pytest
+from data_gen_scenes import glass, plenty, polished
+from test_gpt import verdicts
+from unbiased import gradient_tests, load, render_ours, render_references
+
+from ngpt.testing import z_test
+
+
+def make_plan(scene, **options):
+    from data_gen.integrators import plan
+
+    defaults = {"roughness_threshold": 0.05, "max_depth": 8, "rr_depth": 5, "shift": "replay"}
+    return plan.make_plan(scene, **defaults | {"hide_emitters": False} | options)
+
+
+def render(scene, spp=16, size=None, **options):
+    """Layers of the built-in integrator with these parameters."""
+    from data_gen.render import gpt_integrator
+
+    integrator = gpt_integrator(scene)
+    for name, value in options.items():
+        setattr(integrator, name, value)
+    return integrator.render_film(scene, scene.sensors()[0], 0, spp).develop()
+
+
+def test_plans(renderer):
+    plans = {name: make_plan(load(renderer, name, (4, 4))) for name in ("diffuse", "glossy", "environment", "lens")}
+    assert [name for name, plan in plans.items() if plan.replays] == ["glossy", "environment"]
+    assert [name for name, plan in plans.items() if plan.lights.shared] == ["diffuse", "glossy", "environment"]
+    assert not plans["glossy"].half_vectors and not plans["environment"].hides
+    scene = load(renderer, "environment", (4, 4))
+    assert make_plan(scene, shift="half-vector").half_vectors and make_plan(scene, hide_emitters=True).hides
+    assert not make_plan(load(renderer, "diffuse", (4, 4)), shift="half-vector", hide_emitters=True).half_vectors
+    assert make_plan(load(renderer, lambda: polished(0.01), (4, 4))).replays
+    assert not make_plan(load(renderer, lambda: polished(0.3), (4, 4))).replays
+    # A point light is neither far away nor a surface; without any light there is nothing to share.
+    assert not make_plan(load(renderer, plenty, (4, 4))).lights.shared
+
+
+def test_unknown_shift(renderer):
+    # Mitsuba wraps what a plugin raises.
+    with pytest.raises(RuntimeError, match="unknown shift 'manifold'; choose one of: replay, half-vector"):
+        renderer.load_dict({"type": "gpt", "shift": "manifold"})
+
+
+def test_no_light_at_all(renderer):
+    scene = renderer.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "ball": {"type": "sphere"}})
+    image = renderer.render(scene, integrator=renderer.load_dict({"type": "gpt"}), spp=2)
+    assert not np.array(image)[..., :3].any()
+
+
+@pytest.mark.parametrize(("name", "flag"), [("diffuse", "replays"), ("glossy", "shared"), ("environment", "shared")])
+def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
+    """Code that a scene does not need, put in by force."""
+    from data_gen.integrators import gpt
+
+    scene = load(renderer, name, (32, 32))
+    lean = render(scene)
+
+    def general(*args, **options):
+        plan = make_plan(*args, **options)
+        if flag == "replays":
+            plan.replays = True
+        else:
+            plan.lights.shared = False
+        return plan
+
+    monkeypatch.setattr(gpt, "make_plan", general)
+    full = render(scene)
+    for layer in ("primal", "dx", "dy"):
+        # Paths are the same but for rounding, which now and then decides whether something is hit.
+        off = np.abs(lean[layer] - full[layer]) > 1e-3 * np.abs(full["primal"]).mean()
+        assert off.mean() < 0.01, layer
+
+
+@pytest.mark.parametrize("scene", [plenty, glass, "environment"])
+def test_half_vector_copy_is_unbiased(renderer, scene, monkeypatch):
+    from data_gen import shift
+    from data_gen.render import gpt_integrator
+
+    scene_has_frosted_glass = scene is glass
+    scene = load(renderer, scene, (32, 32))
+    integrator = gpt_integrator(scene)
+    integrator.shift = "half-vector"
+    # Frosted glass and brushed metal are shifted by half-vectors then.
+    integrator.roughness_threshold = 0.35
+
+    def render():
+        return [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop() for seed in range(16)]
+
+    references = render_references(renderer, scene, spp=128)
+    for name, result in gradient_tests(render(), references):
+        assert result.passed, f"{name}: {result}"
+    if scene_has_frosted_glass:
+        copy = shift.copy_half_vector
+        monkeypatch.setattr(
+            shift, "copy_half_vector", lambda *args: (copy(*args)[0], 1 / copy(*args)[1], copy(*args)[2])
+        )
+        assert not all(verdicts(render(), references).values())
+
+
+LAMPS = {
+    "rectangle": {"type": "rectangle", "emitter": {"type": "area"}},
+    "disk": {"type": "disk", "emitter": {"type": "area"}},
+    "cylinder": {"type": "cylinder", "emitter": {"type": "area"}},
+    "cube": {"type": "cube", "emitter": {"type": "area"}},
+    "constant": {"type": "constant"},
+    "sunsky": {"type": "sunsky"},
+    "directional": {"type": "directional"},
+    "envmap": {"type": "envmap"},
+    "two": {"type": "rectangle", "emitter": {"type": "area"}},
+}
+
+
+@pytest.mark.parametrize("name", LAMPS)
+def test_shared_emitters_are_what_sampling_would_find(renderer, name):
+    """Taken over from another vertex, an emitter has the direction, density and weight that it has here."""
+    import drjit as dr
+
+    from data_gen.lights import Lights, emission, replay_light, sample_light, shared_emission
+    from data_gen.vertex import seen_from
+
+    mi, lamp = renderer, dict(LAMPS[name])
+    if name == "envmap":
+        lamp["bitmap"] = mi.Bitmap(np.random.default_rng(1).random((8, 16, 3)).astype(np.float32))
+    block = {"type": "sphere", "center": [0, 0, 2.5], "radius": 0.4}
+    scene = {"type": "scene", "lamp": lamp, "block": block} | ({"sky": {"type": "constant"}} if name == "two" else {})
+    scene = mi.load_dict(scene)
+    lights = Lights(scene)
+    assert lights.shared
+    random = mi.load_dict({"type": "independent"})
+    random.seed(3, 1 << 14)
+
+    def vertex():
+        """Somewhere around the lamp; some of it is hidden by the block."""
+        si = dr.zeros(mi.SurfaceInteraction3f, 1 << 14)
+        p = 8 * mi.Point3f(random.next_1d(), random.next_1d(), random.next_1d()) - 4
+        si.p = dr.select(dr.norm(p) < 2, p + mi.Vector3f(0, 0, 5), p)
+        si.n = mi.Normal3f(0, 0, 1)
+        return si
+
+    x, y, u, yes = vertex(), vertex(), random.next_2d(), mi.Bool(True)
+    base, weight = scene.sample_emitter_direction(x, u, False, yes)
+    shared, own = replay_light(scene, lights, base, weight, u, y, yes), sample_light(scene, y, u, yes)
+    found = dr.max(own.weight) > 0
+    assert dr.count(found)[0] > 500
+    assert mostly((dr.max(shared.weight) > 0) == found)
+    assert mostly(dr.all(dr.abs(shared.weight - own.weight) <= 1e-3 * dr.abs(own.weight)))
+    assert mostly(~found | ((dr.norm(shared.d - own.d) < 1e-3) & (dr.abs(shared.p - own.p) <= 2e-3 * own.p)))
+
+    # The same for emission that is met, along rays from x to where y connects.
+    ray = x.spawn_ray(dr.normalize(mi.Vector3f(2 * random.next_1d() - 1, 2 * random.next_1d() - 1, 0) - x.p))
+    x1 = scene.ray_intersect(ray)
+    Le, p = emission(scene, x1, x, yes, yes)
+    direction = dr.select(x1.is_valid(), dr.normalize(x1.p - y.p), ray.d)
+    y1 = seen_from(x1, direction)
+    shared = shared_emission(scene, lights, x1, Le, p, y, y1, dr.squared_norm(x1.p - y.p) / dr.square(x1.t))
+    own = emission(scene, y1, y, yes, yes)
+    assert dr.any(dr.max(own[0]) > 0) or name == "directional"
+    assert mostly(dr.all(dr.abs(shared[0] - own[0]) <= 1e-3 * dr.abs(own[0])))
+    assert mostly((dr.abs(shared[1] - own[1]) <= 5e-3 * own[1]) | (dr.max(own[0]) == 0))
+
+
+def mostly(condition):
+    """All but a few lanes, where rounding decides: emitters seen edge-on."""
+    return np.array(condition).mean() > 0.99
+
+
+@pytest.mark.parametrize("scene", ["glossy", plenty])
+def test_the_primal_of_base_and_offset_paths_is_unbiased(renderer, scene):
+    from data_gen.render import gpt_integrator
+
+    scene = load(renderer, scene, (32, 32))
+    integrator = gpt_integrator(scene)
+    integrator.reuse = True
+    stacks = [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop() for seed in range(16)]
+    for name, result in gradient_tests(stacks, render_references(renderer, scene, spp=128)):
+        assert result.passed, f"{name}: {result}"
+    base = render(scene, spp=64)
+    assert np.array_equal(base["dx"], stacks[0]["dx"])
+    dark = base["direct"].sum(axis=-1) == 0
+    assert stacks[0]["primal_var"][dark].mean() < 0.6 * base["primal_var"][dark].mean()
+
+
+def test_the_primal_of_base_and_offset_paths_of_a_single_pixel(renderer):
+    """Without neighbours it is that of the base paths."""
+    scene = load(renderer, "diffuse", (1, 1))
+    base, reused = render(scene), render(scene, reuse=True)
+    assert np.allclose(base["primal"], reused["primal"], rtol=1e-5)
+
+
+def test_failed_shifts_are_counted_when_asked(renderer):
+    scene = load(renderer, "glossy", (32, 32))
+    plain, counted = render(scene), render(scene, diagnostics=True)
+    assert "shift_failures" not in plain
+    failures = counted["shift_failures"]
+    assert (
+        failures.shape == (32, 32, 1) and failures.min() >= 0 and 0.01 < failures.mean() < 0.5 and failures.max() <= 1
+    )
+    for name in plain:
+        assert np.array_equal(plain[name], counted[name]), name
+    # Mirrors sampled at joined vertices are what fails most: glossier scenes fail more often than matte ones.
+    assert render(load(renderer, "diffuse", (32, 32)), diagnostics=True)["shift_failures"].mean() < failures.mean()
+
+
+def test_spectral_variant(renderer):
+    from data_gen.backend import use_variant
+
+    use_variant("llvm_ad_spectral")
+    try:
+        import mitsuba as mi
+
+        scene = load(mi, "diffuse", (24, 24))
+        stacks, references = render_ours(scene, "gpt", spp=32), render_references(mi, scene, spp=64)
+        for name, result in gradient_tests(stacks, references):
+            assert result.passed, f"{name}: {result}"
+        assert not verdicts([s | {"dx": 0.9 * s["dx"]} for s in stacks], references)["dx"]
+    finally:
+        use_variant("llvm_ad_rgb")
+
+
+def test_shift_modes_agree(renderer):
+    """Both shifts of one scene have the same mean gradients, with nothing connectable at all."""
+    scene = load(renderer, lambda: polished(0.2), (24, 24))
+
+    def batches(shift):
+        from data_gen.render import gpt_integrator
+
+        integrator = gpt_integrator(scene)
+        integrator.shift, integrator.roughness_threshold = shift, 10.0
+        return [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop()["dx"] for seed in range(16)]
+
+    result = z_test(np.stack(batches("replay")), np.stack(batches("half-vector")))
+    assert result.passed, result
