@@ -91,19 +91,19 @@ def _standardised(image: Tensor) -> Tensor:
     return (image - shift) / scale
 
 
-def load(kind: type[nn.Module], path: str = "") -> nn.Module:
+def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
     Only tensors are read, never code. Raises NgptError where there is no such file, it bears torchvision's name but
     not the checksum in it, or it has other tensors.
     """
-    file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)  # type: ignore[attr-defined]
+    file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)
     if not file.is_file():
         raise NgptError(
-            f"{file}: no such file; get {kind.FILE} from torchvision (download.pytorch.org/models) and put it "  # type: ignore[attr-defined]
+            f"{file}: no such file; get {kind.FILE} from torchvision (download.pytorch.org/models) and put it "
             'there, or name it in the configuration as loss.backbone; loss.kind = "structural" needs no weights'
         )
-    digits = kind.FILE.rpartition("-")[2].removesuffix(".pth")  # type: ignore[attr-defined]
+    digits = kind.FILE.rpartition("-")[2].removesuffix(".pth")
     if file.name == kind.FILE and not hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
         raise NgptError(f"{file}: its checksum is not {digits}...; it is damaged, download it again")
     try:
