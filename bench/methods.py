@@ -3,8 +3,8 @@
     python -m bench.methods --scenes diffuse glossy environment lens SCENE.xml ... --cache /tmp/stacks
 
 Renders a stack for each sample count and a reference for each scene (kept in the cache folder, and taken from there the
-next time), runs every method, and writes bench/results/methods.json, docs/classical-table.md and a picture for each
-method of the place where it does worst compared with the others, docs/images/METHOD-fails.png.
+next time), runs every method, and writes bench/results/methods.json, docs/classical-table.md and, with --pictures
+docs/images, a picture for each method of the place where it does worst compared with the others, METHOD-fails.png.
 """
 
 import argparse
@@ -32,7 +32,8 @@ def main() -> None:
     parser.add_argument("--reference-spp", type=int, default=2048)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder for the rendered stacks and references")
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("--table", type=Path, default=Path("docs/classical-table.md"))
+    parser.add_argument("--pictures", type=Path, help="folder for the places where each method does worst")
     parser.add_argument("-o", "--output", default="bench/results/methods.json")
     args = parser.parse_args()
 
@@ -57,10 +58,10 @@ def main() -> None:
     rows = [{"scene": n, "spp": s, "method": m, "metrics": c} for (n, s, m), c in cells.items()]
     setup = {"size": args.size, "reference spp": args.reference_spp, "reference noise": noise}
     save(args.output, {"benchmark": "methods", **setup, "rows": rows, "metadata": metadata("mitsuba")})
-    write_text(args.docs / "classical-table.md", table(cells, noise) + "\n" + energy_table(cells))
-    for method in METHODS:
-        if method != "primal":
-            write_picture(args.docs / "images" / f"{method}-fails.png", method, cells, images, references)
+    write_text(args.table, table(cells, noise) + "\n" + energy_table(cells))
+    for method in METHODS if args.pictures else ():
+        if any(key[2] == method for key in cells) and method != "primal":
+            write_picture(args.pictures / f"{method}-fails.png", method, cells, images, references)
 
 
 def scene_name(scene: str) -> str:
