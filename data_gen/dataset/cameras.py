@@ -1,0 +1,147 @@
+"""Cameras in the free space of any scene, found by casting rays.
+
+The scene's own camera stands in free space. From there a walk goes along random rays, each time part of the way to what
+they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ngpt.errors import NgptError
+
+VIRTUAL_SIZE = (1280, 720)
+STEPS = 4
+RAYS = 256
+ATTEMPTS = 64
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the window of its virtual image that is rendered: all of it reproducible from these numbers."""
+
+    origin: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+    fov: float  # degrees along x of the virtual image
+    aperture: float
+    focus: float
+    film: tuple[int, int]  # the virtual image, pixels
+    window: tuple[int, int]  # its upper left corner there
+    size: int
+
+    def apply(self, scene: mi.Scene) -> None:
+        """Sets the first sensor of ``scene`` to this view."""
+        params = mi.traverse(scene.sensors()[0])
+        params["to_world"] = mi.ScalarTransform4f().look_at(list(self.origin), list(self.target), list(self.up))
+        params["x_fov"] = self.fov
+        # A new size of the film makes the window the whole film, so the window comes after it.
+        params["film.crop_offset"] = [0, 0]
+        params["film.size"] = list(self.film)
+        params.update()
+        params["film.crop_size"] = [self.size, self.size]
+        params["film.crop_offset"] = list(self.window)
+        if "aperture_radius" in params:
+            params["aperture_radius"] = self.aperture
+            params["focus_distance"] = self.focus
+        params.update()
+
+    def record(self) -> dict:
+        return asdict(self)
+
+
+class Surroundings:
+    """What rays find in a scene, and how large its inhabited part is."""
+
+    def __init__(self, scene: mi.Scene, box: tuple | None = None):
+        self.scene, self.box = scene, box
+        sensor = mi.traverse(scene.sensors()[0])
+        matrix = np.array(sensor["to_world"].matrix, float).reshape(4, 4)
+        self.start, self.up, self.fov = matrix[:3, 3], matrix[:3, 1], float(np.ravel(sensor["x_fov"])[0])
+        bounds = scene.bbox()
+        self.reach = float(np.linalg.norm(np.array(bounds.max) - np.array(bounds.min)))
+        distance = self.cast(np.tile(self.start, (4096, 1)), directions(np.random.default_rng(0), 4096))[0]
+        hits = distance[np.isfinite(distance)]
+        if not len(hits):
+            raise NgptError("the scene's camera sees nothing in any direction; move it among the objects")
+        # Not the bounding box, which a ground plane makes as large as it likes.
+        self.scale = float(np.median(hits))
+
+    def cast(self, origins: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing."""
+        ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(towards.T))
+        si = self.scene.ray_intersect(ray)
+        identity = dr.reinterpret_array(mi.UInt32, si.shape)
+        return np.array(si.t), np.array(si.n).T, np.array(identity)
+
+    def position(self, rng: np.random.Generator) -> np.ndarray:
+        """A point of free space: uniform in the hand-made box where there is one, else at the end of a walk."""
+        if self.box is not None:
+            low, high = self.box
+            return rng.uniform(low, high)
+        point = self.start
+        for towards in directions(rng, STEPS):
+            towards = towards * [1, 1, 1] - 0.5 * (towards @ self.up) * self.up
+            towards /= np.linalg.norm(towards)
+            distance = float(self.cast(point[None], towards[None])[0][0])
+            point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
+        return point
+
+
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
+    """A random view that shows something.
+
+    ``size`` is that of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
+    standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
+    when no view can be found.
+    """
+    for _ in range(ATTEMPTS):
+        origin = around.position(rng)
+        towards = directions(rng, 1)[0]
+        towards = towards - 0.7 * (towards @ around.up) * around.up
+        towards /= np.linalg.norm(towards)
+        distance = float(around.cast(origin[None], towards[None])[0][0])
+        focus = distance if np.isfinite(distance) else around.scale
+        angle = np.radians(rng.uniform(-roll, roll))
+        side = np.cross(towards, around.up)
+        up = np.cos(angle) * around.up + np.sin(angle) * side / max(np.linalg.norm(side), 1e-6)
+        scale = rng.uniform(size / VIRTUAL_SIZE[1], 1)
+        film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
+        window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
+        fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
+        aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
+        vectors = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
+        view = View(*vectors, fov, float(aperture), float(focus), film, window, size)
+        if shows_something(around, view):
+            return view
+    raise NgptError(f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config")
+
+
+def shows_something(around: Surroundings, view: View) -> bool:
+    """Whether a view is worth rendering: not empty, not a wall at the lens, not one flat surface, not inside an object."""
+    view.apply(around.scene)
+    n = 16
+    grid = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5) / n
+    sensor = around.scene.sensors()[0]
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
+    origins, towards = np.array(ray.o).T, np.array(ray.d).T
+    distance, normal, shape = around.cast(np.broadcast_to(origins, towards.shape), towards)
+    hit = np.isfinite(distance)
+    if hit.mean() < 0.35 or np.quantile(distance[hit], 0.1) < 0.06 * around.scale:
+        return False
+    # Edges: neighbours that differ in what they show, or in which way it faces.
+    shape, normal = shape.reshape(n, n), np.where(hit[:, None], normal, 0).reshape(n, n, 3)
+    edges = [
+        np.diff(shape, axis=axis) != 0 for axis in (0, 1)
+    ] + [np.linalg.norm(np.diff(normal, axis=axis), axis=-1) > 0.2 for axis in (0, 1)]
+    return float(np.mean([edge.mean() for edge in edges])) > 0.02
