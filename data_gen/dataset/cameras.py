@@ -15,9 +15,12 @@ import numpy as np
 from ngpt.errors import NgptError
 
 VIRTUAL_SIZE = (1280, 720)
-STEPS = 4
-RAYS = 256
+MAX_ZOOM = 4.0  # the crop is 1 to 1 / 4 of the virtual image's height
+STEPS = 4  # of the walk to a new position
 ATTEMPTS = 64
+CHOICES = 5  # views that one is chosen from
+GRID = 24  # rays across a view that is judged
+FEWEST_EDGES = 0.04
 
 
 @dataclass(frozen=True)
@@ -46,8 +49,9 @@ class View:
         params["film.crop_size"] = [self.size, self.size]
         params["film.crop_offset"] = list(self.window)
         if "aperture_radius" in params:
-            params["aperture_radius"] = self.aperture
-            params["focus_distance"] = self.focus
+            # Opaque: as literals they would be compiled into the kernel, a new one for every view.
+            params["aperture_radius"] = dr.opaque(mi.Float, self.aperture)
+            params["focus_distance"] = dr.opaque(mi.Float, self.focus)
         params.update()
 
     def record(self) -> dict:
@@ -85,7 +89,7 @@ class Surroundings:
             return rng.uniform(low, high)
         point = self.start
         for towards in directions(rng, STEPS):
-            towards = towards * [1, 1, 1] - 0.5 * (towards @ self.up) * self.up
+            towards = towards - 0.5 * (towards @ self.up) * self.up
             towards /= np.linalg.norm(towards)
             distance = float(self.cast(point[None], towards[None])[0][0])
             point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
@@ -99,49 +103,62 @@ def directions(rng: np.random.Generator, count: int) -> np.ndarray:
 
 
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    """A random view that shows something.
+    """A random view that shows something, the more it shows the more likely.
 
     ``size`` is that of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
     standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
     when no view can be found.
     """
+    views, details = [], []
     for _ in range(ATTEMPTS):
-        origin = around.position(rng)
-        towards = directions(rng, 1)[0]
-        towards = towards - 0.7 * (towards @ around.up) * around.up
-        towards /= np.linalg.norm(towards)
-        distance = float(around.cast(origin[None], towards[None])[0][0])
-        focus = distance if np.isfinite(distance) else around.scale
-        angle = np.radians(rng.uniform(-roll, roll))
-        side = np.cross(towards, around.up)
-        up = np.cos(angle) * around.up + np.sin(angle) * side / max(np.linalg.norm(side), 1e-6)
-        scale = rng.uniform(size / VIRTUAL_SIZE[1], 1)
-        film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
-        window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
-        fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
-        aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
-        vectors = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
-        view = View(*vectors, fov, float(aperture), float(focus), film, window, size)
-        if shows_something(around, view):
-            return view
-    raise NgptError(f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config")
+        view = random_view(around, rng, size, roll, lens)
+        detail = what_shows(around, view)
+        if detail > 0:
+            views.append(view)
+            details.append(detail)
+        if len(views) == CHOICES:
+            break
+    if not views:
+        raise NgptError(f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config")
+    weights = np.array(details)
+    return views[int(rng.choice(len(views), p=weights / weights.sum()))]
 
 
-def shows_something(around: Surroundings, view: View) -> bool:
-    """Whether a view is worth rendering: not empty, not a wall at the lens, not one flat surface, not inside an object."""
+def random_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
+    origin = around.position(rng)
+    towards = directions(rng, 1)[0]
+    towards = towards - 0.7 * (towards @ around.up) * around.up
+    towards /= np.linalg.norm(towards)
+    distance = float(around.cast(origin[None], towards[None])[0][0])
+    focus = distance if np.isfinite(distance) else around.scale
+    angle = np.radians(rng.uniform(-roll, roll))
+    side = np.cross(towards, around.up)
+    up = np.cos(angle) * around.up + np.sin(angle) * side / max(np.linalg.norm(side), 1e-6)
+    scale = size / VIRTUAL_SIZE[1] * MAX_ZOOM ** rng.random()
+    film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
+    window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
+    fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
+    aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
+    origin, target, up = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
+    return View(origin, target, up, fov, float(aperture), float(focus), film, window, size)
+
+
+def what_shows(around: Surroundings, view: View) -> float:
+    """The share of edges in a view; 0 if it is not worth rendering.
+
+    That is: mostly empty, a wall at the lens, the inside of a small object, or one flat surface.
+    """
     view.apply(around.scene)
-    n = 16
+    n = GRID
     grid = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5) / n
-    sensor = around.scene.sensors()[0]
-    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
-    origins, towards = np.array(ray.o).T, np.array(ray.d).T
-    distance, normal, shape = around.cast(np.broadcast_to(origins, towards.shape), towards)
+    ray, _ = around.scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
+    towards = np.array(ray.d).T
+    distance, normal, shape = around.cast(np.broadcast_to(np.array(ray.o).T, towards.shape), towards)
     hit = np.isfinite(distance)
     if hit.mean() < 0.35 or np.quantile(distance[hit], 0.1) < 0.06 * around.scale:
-        return False
+        return 0.0
     # Edges: neighbours that differ in what they show, or in which way it faces.
     shape, normal = shape.reshape(n, n), np.where(hit[:, None], normal, 0).reshape(n, n, 3)
-    edges = [
-        np.diff(shape, axis=axis) != 0 for axis in (0, 1)
-    ] + [np.linalg.norm(np.diff(normal, axis=axis), axis=-1) > 0.2 for axis in (0, 1)]
-    return float(np.mean([edge.mean() for edge in edges])) > 0.02
+    other = [(np.diff(shape, axis=a) != 0) | (np.linalg.norm(np.diff(normal, axis=a), axis=-1) > 0.2) for a in (0, 1)]
+    edges = float(np.mean([edge.mean() for edge in other]))
+    return edges if edges > FEWEST_EDGES else 0.0

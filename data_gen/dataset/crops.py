@@ -39,7 +39,9 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
     start = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory() as temporary:
-            scene = load_scene(job.path or str(made_scene(config, job.scene, Path(temporary))), None, job.parameters)
+            path = job.path or str(made_scene(config, job.scene, Path(temporary)))
+            # Loaded in parallel, the parts of a scene come in another order each time, and kernels with them.
+            scene = load_scene(path, None, job.parameters | {"parallel": False})
         around = Surroundings(scene, job.box)
     except (NgptError, RuntimeError) as error:
         record["failures"] = [{"crop": crop, "error": " ".join(str(error).split())} for crop in job.crops]

@@ -2,7 +2,8 @@
 
 Dr.Jit compiles one kernel for each *set* of plugins, in 10 s and more, and keeps it. Every scene has one material of
 each entry of ``SLOTS``, so the kernels of the first scene serve all others. What the plugins take for a constant of the
-kernel (transforms of textures, scales of bump maps and environments) is put into meshes and pictures instead.
+kernel (transforms of textures, scales of bump maps and environments) is put into meshes and pictures instead, and the index of
+glass is fixed.
 """
 
 from __future__ import annotations
@@ -127,7 +128,7 @@ class Palette:
         return inside(plugin("bsdf", "twosided"), plugin("bsdf", "conductor", material=str(self.rng.choice(METALS))))
 
     def _glass(self) -> xml.Element:
-        return plugin("bsdf", "dielectric", int_ior=self.rng.uniform(1.3, 1.7))
+        return plugin("bsdf", "dielectric", int_ior=1.5)
 
     def _frosted(self) -> xml.Element:
         return plugin("bsdf", "roughdielectric", int_ior=1.5, alpha=self._roughness(0.05, 0.4), distribution="ggx")

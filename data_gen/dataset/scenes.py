@@ -80,9 +80,9 @@ def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
         start, end = corners[side], corners[(side + 1) % 4]
         _side(stage, start, end, height, side in with_windows)
     stage.sky = daylight
-    if not daylight or rng.random() < 0.5:
+    if not daylight or rng.random() < 0.7:
         _lamps(stage, width, depth, height)
-    names = rng.choice(list(things.LARGE), rng.integers(3, 9))
+    names = rng.choice(list(things.LARGE), rng.integers(5, 12))
     for name in names:
         stage.stand(things.LARGE[str(name)](rng), (width, depth), float(rng.choice([0, 0.5, 1, 1.5])) * np.pi)
     if rng.random() < 0.5:
@@ -107,11 +107,11 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
             stage.add(things.placed(parts, origin + place * u + [0, 1.5, 0] + 0.01 * inward, angle))
         return
     count = int(rng.integers(1, 1 + max(1, int(length / 1.8))))
-    low, high = rng.uniform(0.02, 0.45), rng.uniform(0.7, 0.95)
-    span = rng.uniform(0.4, 0.9) / count
+    low, high = rng.uniform(0.02, 0.35), rng.uniform(0.75, 0.95)
+    span = rng.uniform(0.5, 0.95) / count
     openings = [((i + 0.5) / count - span / 2, (i + 0.5) / count + span / 2, low, high) for i in range(count)]
     stage.add([("wall", wall(origin, u, [0, height, 0], openings))])
-    blinds, bars = rng.random() < 0.3, int(rng.integers(0, 4))
+    blinds, bars = rng.random() < 0.2, int(rng.integers(0, 4))
     for u0, u1, v0, v1 in openings:
         wide, tall = (u1 - u0) * length, (v1 - v0) * height
         middle = origin + (u0 + u1) / 2 * u + [0, (v0 + v1) / 2 * height, 0]
@@ -134,7 +134,7 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
 def _lamps(stage: Stage, width: float, depth: float, height: float) -> None:
     """Panels, globes, spots under the ceiling, a strip behind a ledge, or lamps with shades."""
     rng = stage.rng
-    kind = str(rng.choice(["panel", "globe", "points", "cove", "shade", "shade"]))
+    kind = str(rng.choice(["panel", "panel", "globe", "points", "cove", "shade"]))
     x, z = rng.uniform(-0.25, 0.25, 2) * [width, depth]
     if kind == "panel":
         size = rng.uniform(0.2, 1.5, 2)
