@@ -21,7 +21,9 @@ def main() -> int:
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="such as configs/data-cpu.toml")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the training set")
     parser.add_argument("--shard", type=part, default=(0, 1), metavar="i/n", help="make only this part, for job arrays")
-    parser.add_argument("--workers", type=int, default=1, help="processes (default: 1, which uses all cores by threads)")
+    parser.add_argument(
+        "--workers", type=int, default=1, help="processes (default: 1, which uses all cores by threads)"
+    )
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     args = parser.parse_args()

@@ -110,7 +110,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     try:
         manifest = json.loads(path.read_text())
     except FileNotFoundError:
-        raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen") from None
+        raise NgptError(
+            f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen"
+        ) from None
     except (OSError, ValueError) as error:
         raise NgptError(f"{path}: cannot be read: {error}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
@@ -140,7 +142,9 @@ def problems(folder: Path) -> list[str]:
             found += _shard_problems(path, entry)
     listed = {entry["file"] for entry in manifest["shards"]}
     on_disk = {path.relative_to(folder).as_posix() for path in (folder / "shards").glob("[!.]*.safetensors")}
-    found += [f"{folder / name}: is not in the manifest; run python -m data_gen again" for name in sorted(on_disk - listed)]
+    found += [
+        f"{folder / name}: is not in the manifest; run python -m data_gen again" for name in sorted(on_disk - listed)
+    ]
     return found
 
 

@@ -119,7 +119,9 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
         if len(views) == CHOICES:
             break
     if not views:
-        raise NgptError(f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config")
+        raise NgptError(
+            f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config"
+        )
     weights = np.array(details)
     return views[int(rng.choice(len(views), p=weights / weights.sum()))]
 

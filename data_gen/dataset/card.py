@@ -64,7 +64,9 @@ def card(data: Dataset, told: dict) -> str:
         "| samples per pixel | inputs |",
         "|---|---|",
     ]
-    lines += [f"| {a} to {b - 1} | {np.sum((counts >= a) & (counts < b))} |" for a, b in zip(edges, edges[1:], strict=False)]
+    lines += [
+        f"| {a} to {b - 1} | {np.sum((counts >= a) & (counts < b))} |" for a, b in zip(edges, edges[1:], strict=False)
+    ]
     lines += ["", "| log-average luminance, stops from middle grey | crops |", "|---|---|"]
     for low in range(-12, 12, 2):
         if within := int(np.sum((exposures >= low) & (exposures < low + 2))):

@@ -77,7 +77,9 @@ def generate(
             done += len(job.crops)
             progress(done, total)
     except BrokenProcessPool as error:
-        raise NgptError(f"{folder}: a worker process died (out of memory?); run the same command to continue") from error
+        raise NgptError(
+            f"{folder}: a worker process died (out of memory?); run the same command to continue"
+        ) from error
     finally:
         update_manifest(folder)
 
@@ -125,7 +127,9 @@ def update_manifest(folder: Path) -> None:
         for path in sorted((folder / "shards").glob("[!.]*.safetensors")):
             name = path.relative_to(folder).as_posix()
             if name not in known:
-                known[name] = {"file": name, "sha256": checksum(path), "bytes": path.stat().st_size} | Shard(path).record
+                known[name] = {"file": name, "sha256": checksum(path), "bytes": path.stat().st_size} | Shard(
+                    path
+                ).record
             entries.append(known[name])
         if entries != manifest["shards"]:
             write_json(folder / MANIFEST, manifest | {"shards": entries})

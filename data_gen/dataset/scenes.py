@@ -120,8 +120,21 @@ def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
         frame += [box([0.03, tall, 0.04], [t * wide, 0, 0]) for t in (np.arange(bars) + 1) / (bars + 1) - 0.5]
         parts: list[things.Part] = [("wood", merge(frame))]
         if rng.random() < 0.35:
-            parts.append(("pane", quads([[[-wide / 2, -tall / 2, 0], [wide / 2, -tall / 2, 0],
-                                          [wide / 2, tall / 2, 0], [-wide / 2, tall / 2, 0]]])))
+            parts.append(
+                (
+                    "pane",
+                    quads(
+                        [
+                            [
+                                [-wide / 2, -tall / 2, 0],
+                                [wide / 2, -tall / 2, 0],
+                                [wide / 2, tall / 2, 0],
+                                [-wide / 2, tall / 2, 0],
+                            ]
+                        ]
+                    ),
+                )
+            )
         if blinds:
             slats = [box([wide, 0.004, 0.04], [0, y, 0.08]) for y in np.arange(-tall / 2, tall / 2, 0.05)]
             parts.append(("wood", merge(slats)))
