@@ -35,8 +35,8 @@ def main() -> int:
     try:
         config = read_config(args.config)
         executor = cluster(args.cluster) if args.cluster else processes(args.workers)
-        with executor, console.progress(str(args.out), "crops") as progress:
-            generate(config, args.out, executor, shard=args.shard, variant=args.variant, progress=progress)
+        with executor as workers, console.progress(str(args.out), "crops") as progress:
+            generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
         write_card(args.out)
     except NgptError as error:
         console.error(error)

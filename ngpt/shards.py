@@ -2,7 +2,7 @@
 
 Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
 
-    indirect, direct            primal - direct and direct: kept apart, since beside a lamp half floats would lose the rest
+    indirect, direct            primal - direct and direct: kept apart, or half floats would lose what a lamp outshines
     dx, dy, albedo, normal, depth
     primal_se, dx_se, dy_se     standard errors: variances of small numbers would underflow in half floats
     reference_indirect, reference_direct    (N, H, W, 3)
@@ -79,6 +79,7 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
     """Writes a shard, and the record of how it came about; it may hold no crop at all, when all have failed.
 
+    A shard that is there already is replaced: it is the same one, made by a worker that was lost before it said so.
     Raises NgptError for numbers that are not finite, naming the tensor, and when the file cannot be written.
     """
     from safetensors.numpy import save
@@ -89,7 +90,7 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
     data = save(tensors, {"ngpt": json.dumps(record)})
-    with atomic_output(path) as temporary:
+    with atomic_output(path, overwrite=True) as temporary:
         temporary.write_bytes(data)
 
 

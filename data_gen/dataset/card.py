@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -64,9 +65,7 @@ def card(data: Dataset, told: dict) -> str:
         "| samples per pixel | inputs |",
         "|---|---|",
     ]
-    lines += [
-        f"| {a} to {b - 1} | {np.sum((counts >= a) & (counts < b))} |" for a, b in zip(edges, edges[1:], strict=False)
-    ]
+    lines += [f"| {a} to {b - 1} | {np.sum((counts >= a) & (counts < b))} |" for a, b in pairwise(edges)]
     lines += ["", "| log-average luminance, stops from middle grey | crops |", "|---|---|"]
     for low in range(-12, 12, 2):
         if within := int(np.sum((exposures >= low) & (exposures < low + 2))):

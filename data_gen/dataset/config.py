@@ -13,7 +13,7 @@ from ngpt.methods import METHODS
 
 @dataclass(frozen=True)
 class Files:
-    """Scene files as a source: all that match ``pattern``; ``boxes``: scene -> ((x, y, z) low, high) for its cameras."""
+    """Scene files as a source: all that match ``pattern``; ``boxes``: scene -> [low, high] corners for cameras."""
 
     pattern: str
     crops: int

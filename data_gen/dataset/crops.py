@@ -27,6 +27,8 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
 
     Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
     """
+    if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
+        return job.file
     use_variant(variant)
     import mitsuba as mi
 

@@ -33,20 +33,23 @@ class Serial(Executor):
 
 
 def processes(count: int) -> Executor:
-    """``count`` processes, or this one alone; new ones are spawned, since LLVM does not survive a fork."""
+    """``count`` processes, or this one alone; spawned, since LLVM does not survive a fork."""
     return Serial() if count == 1 else ProcessPoolExecutor(count, mp_context=get_context("spawn"))
 
 
-def cluster(address: str) -> Executor:
+@contextmanager
+def cluster(address: str) -> Iterator[Executor]:
     """The workers of a Dask cluster; ``address`` is that of its scheduler, such as tcp://host:8786."""
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
         raise NgptError("a Dask cluster needs distributed; `pip install 'ngpt-recon[cluster]'`") from error
     try:
-        return Client(address, timeout="20s").get_executor(retries=3)
+        client = Client(address, timeout="20s")
     except OSError as error:
         raise NgptError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        yield client.get_executor(retries=3)
 
 
 def generate(

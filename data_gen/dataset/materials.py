@@ -1,9 +1,9 @@
 """What things are made of: the same plugins in every scene, with other pictures and numbers.
 
 Dr.Jit compiles one kernel for each *set* of plugins, in 10 s and more, and keeps it. Every scene has one material of
-each entry of ``SLOTS``, so the kernels of the first scene serve all others. What the plugins take for a constant of the
-kernel (transforms of textures, scales of bump maps and environments) is put into meshes and pictures instead, and the index of
-glass is fixed.
+each entry of ``SLOTS``, so the kernels of the first scene serve all others. What plugins take for a constant of the
+kernel (transforms of textures, scales of bump maps and environments) is put into meshes and pictures instead, and the
+refractive index of glass is fixed.
 """
 
 from __future__ import annotations

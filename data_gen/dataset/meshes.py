@@ -59,7 +59,7 @@ def quads(corners) -> Mesh:
     zero = np.zeros_like(width)
     uvs = np.stack([zero, zero, width, zero, width, height, zero, height], axis=1).reshape(-1, 2)
     first = 4 * np.arange(len(corners))[:, None]
-    faces = np.concatenate([first + [0, 1, 2], first + [0, 2, 3]])
+    faces = np.concatenate([first + np.array([0, 1, 2]), first + np.array([0, 2, 3])])
     return Mesh(corners.reshape(-1, 3), normals, uvs, faces)
 
 
