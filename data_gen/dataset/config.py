@@ -52,23 +52,33 @@ class Config:
 
     def plan(self) -> list[Job]:
         """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""
-        sources = [(f"made-{i:05d}", "", self.crops, {}, None) for i in range(self.scenes)]
+        sources: list[tuple] = [(made_name(i), self.crops) for i in range(self.scenes)]
         for source in self.files:
             paths = sorted(glob(source.pattern, recursive=True))
             if not paths:
                 raise NgptError(f"data configuration: no scene file matches '{source.pattern}'")
             for path in paths:
                 name = f"{Path(path).parent.name}-{Path(path).stem}"
-                sources.append((name, path, source.crops, source.parameters, source.boxes.get(name)))
+                sources.append((name, source.crops, path, source.parameters, source.boxes.get(name)))
         names = [source[0] for source in sources]
         if len(set(names)) < len(names):
             raise NgptError("data configuration: two scene files have the same folder and name; rename one")
-        jobs = []
-        for name, path, crops, parameters, box in sources:
-            for batch, first in enumerate(range(0, crops, self.crops_per_shard)):
-                last = min(first + self.crops_per_shard, crops)
-                jobs.append(Job(name, batch, tuple(range(first, last)), path, parameters, box))
-        return jobs
+        return [job for source in sources for job in self.scene_jobs(*source)]
+
+    def scene_jobs(
+        self, name: str, crops: int, path: str = "", parameters: dict[str, str] | None = None, box: list | None = None
+    ) -> list[Job]:
+        """The shards of one scene."""
+        batches = [
+            tuple(range(first, min(first + self.crops_per_shard, crops)))
+            for first in range(0, crops, self.crops_per_shard)
+        ]
+        return [Job(name, i, batch, path, parameters or {}, box) for i, batch in enumerate(batches)]
+
+
+def made_name(number: int) -> str:
+    """The name of a procedural scene, which its seed comes from."""
+    return f"made-{number:05d}"
 
 
 @dataclass(frozen=True)

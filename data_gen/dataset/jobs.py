@@ -64,7 +64,7 @@ def generate(
     """Makes the shards that are missing in ``folder``, of jobs i, i + n, i + 2n ... where ``shard`` is (i, n).
 
     ``executor`` is any of concurrent.futures; whichever it is, and in whatever order it works, the same configuration
-    gives the same bits. ``progress`` gets the number of crops done and of all in this part. Raises NgptError when a file
+    gives the same bits. ``progress`` gets the crops done and all crops of this part. Raises NgptError when a file
     cannot be written or a worker dies; what is finished by then is kept, and the same call continues.
     """
     plan = config.plan()
@@ -117,7 +117,7 @@ def start(config: Config, folder: Path, planned: int) -> None:
     different = [key for key in ours if theirs.get(key) != ours[key]]
     if different:
         raise NgptError(
-            f"{folder}: holds a training set of another configuration ({', '.join(different)} differ); use a new folder"
+            f"{folder}: holds a training set of another configuration ({', '.join(different)} differ); use a new one"
         )
 
 

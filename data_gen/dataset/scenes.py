@@ -6,6 +6,7 @@ stands in free space, as a painter would place it; ``data_gen.dataset.cameras`` 
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
@@ -262,3 +263,17 @@ def _shape(folder: Path, name: str, mesh: Mesh, bsdf: xml.Element) -> xml.Elemen
 def _surface(mesh: Mesh) -> float:
     a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
     return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def main() -> int:
+    if len(sys.argv) != 3 or not sys.argv[1].isdigit():
+        print("usage: python -m data_gen.dataset.scenes SEED FOLDER", file=sys.stderr)
+        return 2
+    folder = Path(sys.argv[2])
+    folder.mkdir(parents=True)
+    print(make_scene(int(sys.argv[1]), folder))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
