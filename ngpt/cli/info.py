@@ -8,6 +8,7 @@ import numpy as np
 import ngpt
 from ngpt.cli.arguments import add_json, add_layers, assignment, print_json
 from ngpt.console import Console
+from ngpt.dataset import summary
 from ngpt.errors import NgptError
 from ngpt.exr import pass_through, read
 from ngpt.layers import LAYERS, format_aliases
@@ -17,7 +18,7 @@ from ngpt.stack import GradientStack
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", nargs="?", metavar="FILE", help="an .exr file, a scene file, or a built-in scene")
+    parser.add_argument("file", nargs="?", metavar="FILE", help="an .exr file, a training set, a scene file or name")
     parser.add_argument(
         "--aliases", action="store_true", help="print the layer names of other renderers that are known"
     )
@@ -33,6 +34,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         print(format_aliases())
     elif args.file is None:
         show(overview(), args.json)
+    elif Path(args.file).is_dir():
+        report = summary(Path(args.file))
+        show(report, args.json)
+        return 1 if report["problems"] else 0
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
         show(scene(args.file, dict(args.define)), args.json)
     else:

@@ -1,0 +1,166 @@
+"""Cameras in the free space of any scene, found by casting rays.
+
+The scene's own camera stands in free space. From there a walk goes along random rays, each time part of the way to what
+they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ngpt.errors import NgptError
+
+VIRTUAL_SIZE = (1280, 720)
+MAX_ZOOM = 4.0  # the crop is 1 to 1 / 4 of the virtual image's height
+STEPS = 4  # of the walk to a new position
+ATTEMPTS = 64
+CHOICES = 5  # views that one is chosen from
+GRID = 24  # rays across a view that is judged
+FEWEST_EDGES = 0.04
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the window of its virtual image that is rendered: all of it reproducible from these numbers."""
+
+    origin: tuple[float, float, float]
+    target: tuple[float, float, float]
+    up: tuple[float, float, float]
+    fov: float  # degrees along x of the virtual image
+    aperture: float
+    focus: float
+    film: tuple[int, int]  # the virtual image, pixels
+    window: tuple[int, int]  # its upper left corner there
+    size: int
+
+    def apply(self, scene: mi.Scene) -> None:
+        """Sets the first sensor of ``scene`` to this view."""
+        params = mi.traverse(scene.sensors()[0])
+        params["to_world"] = mi.ScalarTransform4f().look_at(list(self.origin), list(self.target), list(self.up))
+        params["x_fov"] = self.fov
+        # A new size of the film makes the window the whole film, so the window comes after it.
+        params["film.crop_offset"] = [0, 0]
+        params["film.size"] = list(self.film)
+        params.update()
+        params["film.crop_size"] = [self.size, self.size]
+        params["film.crop_offset"] = list(self.window)
+        if "aperture_radius" in params:
+            # Opaque: as literals they would be compiled into the kernel, a new one for every view.
+            params["aperture_radius"] = dr.opaque(mi.Float, self.aperture)
+            params["focus_distance"] = dr.opaque(mi.Float, self.focus)
+        params.update()
+
+    def record(self) -> dict:
+        return asdict(self)
+
+
+class Surroundings:
+    """What rays find in a scene, and how large its inhabited part is."""
+
+    def __init__(self, scene: mi.Scene, box: tuple | None = None):
+        self.scene, self.box = scene, box
+        sensor = mi.traverse(scene.sensors()[0])
+        matrix = np.array(sensor["to_world"].matrix, float).reshape(4, 4)
+        self.start, self.up, self.fov = matrix[:3, 3], matrix[:3, 1], float(np.ravel(sensor["x_fov"])[0])
+        bounds = scene.bbox()
+        self.reach = float(np.linalg.norm(np.array(bounds.max) - np.array(bounds.min)))
+        distance = self.cast(np.tile(self.start, (4096, 1)), directions(np.random.default_rng(0), 4096))[0]
+        hits = distance[np.isfinite(distance)]
+        if not len(hits):
+            raise NgptError("the scene's camera sees nothing in any direction; move it among the objects")
+        # Not the bounding box, which a ground plane makes as large as it likes.
+        self.scale = float(np.median(hits))
+
+    def cast(self, origins: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing."""
+        ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(towards.T))
+        si = self.scene.ray_intersect(ray)
+        identity = dr.reinterpret_array(mi.UInt32, si.shape)
+        return np.array(si.t), np.array(si.n).T, np.array(identity)
+
+    def position(self, rng: np.random.Generator) -> np.ndarray:
+        """A point of free space: uniform in the hand-made box where there is one, else at the end of a walk."""
+        if self.box is not None:
+            low, high = self.box
+            return rng.uniform(low, high)
+        point = self.start
+        for towards in directions(rng, STEPS):
+            towards = towards - 0.5 * (towards @ self.up) * self.up
+            towards /= np.linalg.norm(towards)
+            distance = float(self.cast(point[None], towards[None])[0][0])
+            point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
+        return point
+
+
+def directions(rng: np.random.Generator, count: int) -> np.ndarray:
+    """(count, 3) unit vectors, uniform on the sphere."""
+    vectors = rng.normal(size=(count, 3))
+    return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
+
+
+def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
+    """A random view that shows something, the more it shows the more likely.
+
+    ``size`` is that of the crop in pixels, ``roll`` the largest angle about the view direction in degrees, ``lens`` the
+    standard deviation of the aperture's radius relative to the distance in focus (0.005 in the paper). Raises NgptError
+    when no view can be found.
+    """
+    views, details = [], []
+    for _ in range(ATTEMPTS):
+        view = random_view(around, rng, size, roll, lens)
+        detail = what_shows(around, view)
+        if detail > 0:
+            views.append(view)
+            details.append(detail)
+        if len(views) == CHOICES:
+            break
+    if not views:
+        raise NgptError(
+            f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config"
+        )
+    weights = np.array(details)
+    return views[int(rng.choice(len(views), p=weights / weights.sum()))]
+
+
+def random_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
+    origin = around.position(rng)
+    towards = directions(rng, 1)[0]
+    towards = towards - 0.7 * (towards @ around.up) * around.up
+    towards /= np.linalg.norm(towards)
+    distance = float(around.cast(origin[None], towards[None])[0][0])
+    focus = distance if np.isfinite(distance) else around.scale
+    angle = np.radians(rng.uniform(-roll, roll))
+    side = np.cross(towards, around.up)
+    up = np.cos(angle) * around.up + np.sin(angle) * side / max(np.linalg.norm(side), 1e-6)
+    scale = size / VIRTUAL_SIZE[1] * MAX_ZOOM ** rng.random()
+    film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
+    window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
+    fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
+    aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
+    origin, target, up = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
+    return View(origin, target, up, fov, float(aperture), float(focus), film, window, size)
+
+
+def what_shows(around: Surroundings, view: View) -> float:
+    """The share of edges in a view; 0 if it is not worth rendering.
+
+    That is: mostly empty, a wall at the lens, the inside of a small object, or one flat surface.
+    """
+    view.apply(around.scene)
+    n = GRID
+    grid = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5) / n
+    ray, _ = around.scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
+    towards = np.array(ray.d).T
+    distance, normal, shape = around.cast(np.broadcast_to(np.array(ray.o).T, towards.shape), towards)
+    hit = np.isfinite(distance)
+    if hit.mean() < 0.35 or np.quantile(distance[hit], 0.1) < 0.06 * around.scale:
+        return 0.0
+    # Edges: neighbours that differ in what they show, or in which way it faces.
+    shape, normal = shape.reshape(n, n), np.where(hit[:, None], normal, 0).reshape(n, n, 3)
+    other = [(np.diff(shape, axis=a) != 0) | (np.linalg.norm(np.diff(normal, axis=a), axis=-1) > 0.2) for a in (0, 1)]
+    edges = float(np.mean([edge.mean() for edge in other]))
+    return edges if edges > FEWEST_EDGES else 0.0

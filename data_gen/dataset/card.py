@@ -1,0 +1,77 @@
+"""What a person looks at first: README.md and a contact sheet, written from the training set itself."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.console import Console
+from ngpt.dataset import Dataset, summary
+from ngpt.display import auto_exposure, to_srgb8
+from ngpt.files import atomic_output
+from ngpt.png import encode_png
+
+CELLS = 24  # crops on the contact sheet, evenly chosen
+COLUMNS = 4  # each shows its noisiest input and its reference
+
+
+def write_card(folder: Path) -> None:
+    """Writes README.md and contact.png into the training set at ``folder``."""
+    data = Dataset(folder)
+    told = summary(folder)
+    if len(data):
+        with atomic_output(folder / "contact.png", overwrite=True) as path:
+            path.write_bytes(encode_png(contact_sheet(data)))
+    with atomic_output(folder / "README.md", overwrite=True) as path:
+        path.write_text(card(data, told))
+    for problem in told["problems"]:
+        Console().say(problem)
+
+
+def contact_sheet(data: Dataset) -> np.ndarray:
+    """(H, W, 3) uint8: pairs of the noisiest input and the reference, at the reference's automatic exposure."""
+    pairs = []
+    for index in np.unique(np.linspace(0, len(data) - 1, min(CELLS, len(data))).astype(int)):
+        crop = data[int(index)]
+        stops = auto_exposure(crop.reference)
+        pair = [to_srgb8(image, stops) for image in (crop.stack(0)["primal"], crop.reference)]
+        pairs.append(np.pad(np.hstack(pair), ((0, 4), (0, 4), (0, 0)), constant_values=32))
+    while len(pairs) % COLUMNS:
+        pairs.append(np.full_like(pairs[0], 32))
+    return np.vstack([np.hstack(pairs[i : i + COLUMNS]) for i in range(0, len(pairs), COLUMNS)])
+
+
+def card(data: Dataset, told: dict) -> str:
+    config = data.manifest["config"]
+    records = [crop for entry in data.manifest["shards"] for crop in entry["crops"]]
+    failures = [(entry["scene"], failure) for entry in data.manifest["shards"] for failure in entry["failures"]]
+    counts = np.array([n for crop in records for n in crop["spp"]])
+    edges = 2 ** np.arange(int(np.log2(config["spp"][0])), int(np.log2(config["spp"][1])) + 2)
+    exposures = np.array([-auto_exposure(crop.reference) for crop in data])
+    lines = [
+        "# Training set",
+        "",
+        f"{told['crops']} crops of {config['size']}x{config['size']} pixels from {told['scenes']} scenes "
+        f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each; "
+        f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
+        "",
+        f"References: gpt at {config['reference_spp']} samples per pixel, reconstructed by "
+        f"{config['reference_method']}. Seed {config['seed']}.",
+        "",
+        "![Pairs of the noisiest input and the reference](contact.png)",
+        "",
+        "| samples per pixel | inputs |",
+        "|---|---|",
+    ]
+    lines += [f"| {a} to {b - 1} | {np.sum((counts >= a) & (counts < b))} |" for a, b in pairwise(edges)]
+    lines += ["", "| log-average luminance, stops from middle grey | crops |", "|---|---|"]
+    for low in range(-12, 12, 2):
+        if within := int(np.sum((exposures >= low) & (exposures < low + 2))):
+            lines.append(f"| {low} to {low + 2} | {within} |")
+    lines += ["", "| seconds | all | per crop |", "|---|---|---|"]
+    lines += [f"| {part} | {value:.0f} | {value / max(len(data), 1):.2f} |" for part, value in told["seconds"].items()]
+    if failures:
+        lines += ["", "Failures:", ""] + [f"- {scene}, crop {one['crop']}: {one['error']}" for scene, one in failures]
+    return "\n".join(lines) + "\n"

@@ -1,0 +1,116 @@
+"""The configuration of a training set: a TOML file, checked before any work starts."""
+
+from __future__ import annotations
+
+import tomllib
+from dataclasses import asdict, dataclass, field
+from glob import glob
+from pathlib import Path
+
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS
+
+
+@dataclass(frozen=True)
+class Files:
+    """Scene files as a source: all that match ``pattern``; ``boxes``: scene -> [low, high] corners for cameras."""
+
+    pattern: str
+    crops: int
+    parameters: dict[str, str] = field(default_factory=dict)
+    boxes: dict[str, list] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Config:
+    """See configs/data-cpu.toml, which explains each entry."""
+
+    seed: int = 0
+    size: int = 128
+    inputs: int = 4
+    spp: tuple[int, int] = (2, 64)
+    roll: float = 20.0
+    lens: float = 0.005
+    crops_per_shard: int = 4
+    reference_spp: int = 256
+    reference_method: str = "wcv"
+    scenes: int = 0
+    crops: int = 4
+    files: tuple[Files, ...] = ()
+
+    def __post_init__(self) -> None:
+        low, high = self.spp
+        for bad, text in (
+            (not 2 <= low <= high, f"spp = [{low}, {high}]: at least 2 (one sample has no variance), low to high"),
+            (self.size < 8, f"size = {self.size}: at least 8 pixels"),
+            (min(self.inputs, self.crops, self.crops_per_shard, self.reference_spp) < 1, "counts must be at least 1"),
+            (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
+            (not self.scenes and not self.files, "no scenes: set scenes = N, or add a [[files]] table"),
+        ):
+            if bad:
+                raise NgptError(f"data configuration: {text}")
+
+    def plan(self) -> list[Job]:
+        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""
+        sources: list[tuple] = [(made_name(i), self.crops) for i in range(self.scenes)]
+        for source in self.files:
+            paths = sorted(glob(source.pattern, recursive=True))
+            if not paths:
+                raise NgptError(f"data configuration: no scene file matches '{source.pattern}'")
+            for path in paths:
+                name = f"{Path(path).parent.name}-{Path(path).stem}"
+                sources.append((name, source.crops, path, source.parameters, source.boxes.get(name)))
+        names = [source[0] for source in sources]
+        if len(set(names)) < len(names):
+            raise NgptError("data configuration: two scene files have the same folder and name; rename one")
+        return [job for source in sources for job in self.scene_jobs(*source)]
+
+    def scene_jobs(
+        self, name: str, crops: int, path: str = "", parameters: dict[str, str] | None = None, box: list | None = None
+    ) -> list[Job]:
+        """The shards of one scene."""
+        batches = [
+            tuple(range(first, min(first + self.crops_per_shard, crops)))
+            for first in range(0, crops, self.crops_per_shard)
+        ]
+        return [Job(name, i, batch, path, parameters or {}, box) for i, batch in enumerate(batches)]
+
+
+def made_name(number: int) -> str:
+    """The name of a procedural scene, which its seed comes from."""
+    return f"made-{number:05d}"
+
+
+@dataclass(frozen=True)
+class Job:
+    """One shard: some crops of one scene. ``path`` is empty for a scene made from its seed."""
+
+    scene: str
+    batch: int
+    crops: tuple[int, ...]
+    path: str
+    parameters: dict[str, str]
+    box: list | None
+
+    @property
+    def file(self) -> str:
+        return f"shards/{self.scene}-{self.batch:03d}.safetensors"
+
+
+def read_config(path: Path) -> Config:
+    """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
+    try:
+        values = tomllib.loads(path.read_text())
+    except (OSError, ValueError) as error:
+        raise NgptError(f"{path}: cannot be read: {error}") from error
+    try:
+        files = tuple(Files(**table) for table in values.pop("files", []))
+        if "spp" in values:
+            values["spp"] = tuple(values["spp"])
+        return Config(**values, files=files)
+    except (TypeError, ValueError) as error:
+        raise NgptError(f"{path}: {error}; the entries are {', '.join(Config.__dataclass_fields__)}") from error
+
+
+def as_json(config: Config) -> dict:
+    return asdict(config) | {"spp": list(config.spp), "files": [asdict(source) for source in config.files]}

@@ -1,0 +1,136 @@
+"""One shard: opens or makes its scene, finds views, renders inputs and references, and writes the file."""
+
+from __future__ import annotations
+
+import tempfile
+import time
+import zlib
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from data_gen.backend import use_variant
+from data_gen.dataset.config import Config, Job
+from ngpt.errors import NgptError
+from ngpt.repair import repair
+from ngpt.shards import CropData, write_shard
+from ngpt.stack import GradientStack
+
+# Views that turn out to be black are replaced this often.
+ATTEMPTS = 6
+LIT = 0.1  # the share of pixels of the first input that must have seen any light
+
+
+def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
+    """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
+
+    Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
+    """
+    if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
+        return job.file
+    use_variant(variant)
+    import mitsuba as mi
+
+    from data_gen.dataset.cameras import Surroundings
+    from data_gen.render import load_scene
+
+    crops: list[CropData] = []
+    record: dict = {"scene": job.scene, "batch": job.batch, "crops": [], "failures": []}
+    record["versions"] = {"ngpt": ngpt.__version__, "mitsuba": mi.__version__, "variant": variant}
+    start = time.perf_counter()
+    try:
+        with tempfile.TemporaryDirectory() as temporary:
+            path = job.path or str(made_scene(config, job.scene, Path(temporary)))
+            # Loaded in parallel, the parts of a scene come in another order each time, and kernels with them.
+            scene = load_scene(path, None, job.parameters | {"parallel": False})
+        around = Surroundings(scene, job.box)
+    except (NgptError, RuntimeError) as error:
+        record["failures"] = [{"crop": crop, "error": " ".join(str(error).split())} for crop in job.crops]
+    else:
+        record["scene_seconds"] = time.perf_counter() - start
+        for crop in job.crops:
+            try:
+                data, told = make_crop(config, around, job.scene, crop)
+            except (NgptError, RuntimeError) as error:
+                record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
+            else:
+                crops.append(data)
+                record["crops"].append(told)
+    write_shard(Path(folder) / job.file, crops, record)
+    return job.file
+
+
+def scene_seed(config: Config, name: str) -> tuple[int, int]:
+    return config.seed, zlib.crc32(name.encode())
+
+
+def made_scene(config: Config, name: str, folder: Path) -> Path:
+    from data_gen.dataset.scenes import make_scene
+
+    return make_scene(scene_seed(config, name), folder)
+
+
+def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
+    """K samples per pixel, log-uniform between the bounds, stratified, smallest first."""
+    low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
+    u = (rng.random() + np.arange(config.inputs)) / config.inputs
+    return [int(n) for n in np.exp(low + u * (high - low))]
+
+
+def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, dict]:
+    """One crop and its record; ``around`` are the ``Surroundings`` of its scene."""
+    from data_gen.dataset.cameras import find_view
+    from data_gen.render import render_stack
+
+    rng = np.random.default_rng((*scene_seed(config, name), crop))
+    counts = sample_counts(rng, config)
+    clock = time.perf_counter()
+    for _ in range(ATTEMPTS):
+        view = find_view(around, rng, config.size, config.roll, config.lens)
+        view.apply(around.scene)
+        seconds = {"camera": time.perf_counter() - clock}
+        seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + 1)]
+        clock = time.perf_counter()
+        stacks = [render_stack(around.scene, counts[0], seeds[0], "gpt")]
+        if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
+            break
+    else:
+        raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
+    stacks += [render_stack(around.scene, *pair, "gpt") for pair in zip(counts[1:], seeds[1:-1], strict=True)]
+    seconds["inputs"] = time.perf_counter() - clock
+    clock = time.perf_counter()
+    converged = render_stack(around.scene, config.reference_spp, seeds[-1], "gpt")
+    reference = ngpt.denoise(converged, method=config.reference_method)
+    seconds["reference"] = time.perf_counter() - clock
+    cleaned = [finite(stack) for stack in stacks]
+    direct = np.nan_to_num(converged["direct"], posinf=0)
+    data = CropData([stack for stack, _ in cleaned], counts, np.maximum(reference, direct), direct)
+    told = {
+        "crop": crop,
+        "spp": counts,
+        "seeds": seeds,
+        "view": view.record(),
+        "repaired": [count for _, count in cleaned],
+        "seconds": {part: round(value, 4) for part, value in seconds.items()},
+    }
+    return data, told
+
+
+def finite(stack: GradientStack) -> tuple[GradientStack, int]:
+    """The stack without values that are not finite, and how many pixels or differences had some.
+
+    Pixels come from their neighbours and gradients become 0; what is not known of a variance is that of an estimate
+    that is all noise: its own square.
+    """
+    whole = repair(stack)
+    layers = {"primal": whole.image + whole.direct, "direct": whole.direct, "dx": whole.dx, "dy": whole.dy}
+    bad = whole.pixels + whole.gradients
+    for name in ("primal", "dx", "dy"):
+        variance = stack[f"{name}_var"]
+        unknown = ~np.isfinite(variance)
+        bad += int(unknown.any(axis=-1).sum())
+        layers[f"{name}_var"] = np.where(unknown, np.square(layers[name]), variance)
+    for name in ("albedo", "normal", "depth"):
+        layers[name] = np.nan_to_num(stack[name], posinf=0, neginf=0)
+    return stack.replace(**layers), bad

@@ -1,0 +1,151 @@
+"""Makes a training set with any executor; a finished shard is a finished job, so being killed loses one at most."""
+
+from __future__ import annotations
+
+import fcntl
+import json
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+
+from data_gen.dataset.config import Config, Job, as_json
+from data_gen.dataset.crops import make_shard
+from ngpt.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
+from ngpt.errors import NgptError
+from ngpt.files import atomic_output
+from ngpt.shards import Shard
+
+
+class Serial(Executor):
+    """Runs each call at once, in this process."""
+
+    def submit(self, fn, /, *args, **kwargs) -> Future:
+        future: Future = Future()
+        try:
+            future.set_result(fn(*args, **kwargs))
+        except Exception as error:
+            future.set_exception(error)
+        return future
+
+
+def processes(count: int) -> Executor:
+    """``count`` processes, or this one alone; spawned, since LLVM does not survive a fork."""
+    return Serial() if count == 1 else ProcessPoolExecutor(count, mp_context=get_context("spawn"))
+
+
+@contextmanager
+def cluster(address: str) -> Iterator[Executor]:
+    """The workers of a Dask cluster; ``address`` is that of its scheduler, such as tcp://host:8786."""
+    try:
+        from distributed import Client
+    except ModuleNotFoundError as error:
+        raise NgptError("a Dask cluster needs distributed; `pip install 'ngpt-recon[cluster]'`") from error
+    try:
+        client = Client(address, timeout="20s")
+    except OSError as error:
+        raise NgptError(f"no Dask scheduler answers at {address}: {error}") from error
+    with client:
+        yield client.get_executor(retries=3)
+
+
+def generate(
+    config: Config,
+    folder: Path,
+    executor: Executor,
+    *,
+    shard: tuple[int, int] = (0, 1),
+    variant: str = "llvm_ad_rgb",
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> None:
+    """Makes the shards that are missing in ``folder``, of jobs i, i + n, i + 2n ... where ``shard`` is (i, n).
+
+    ``executor`` is any of concurrent.futures; whichever it is, and in whatever order it works, the same configuration
+    gives the same bits. ``progress`` gets the crops done and all crops of this part. Raises NgptError when a file
+    cannot be written or a worker dies; what is finished by then is kept, and the same call continues.
+    """
+    plan = config.plan()
+    start(config, folder, sum(len(job.crops) for job in plan))
+    part = plan[shard[0] :: shard[1]]
+    todo = [job for job in part if not (folder / job.file).exists()]
+    total = sum(len(job.crops) for job in part)
+    done = total - sum(len(job.crops) for job in todo)
+    progress(done, total)
+    try:
+        for job in finished(executor, partial(make_shard, config, folder=str(folder.resolve()), variant=variant), todo):
+            update_manifest(folder)
+            done += len(job.crops)
+            progress(done, total)
+    except BrokenProcessPool as error:
+        raise NgptError(
+            f"{folder}: a worker process died (out of memory?); run the same command to continue"
+        ) from error
+    finally:
+        update_manifest(folder)
+
+
+def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ahead: int = 64) -> Iterator[Job]:
+    """Yields jobs as they are finished, with at most ``ahead`` of them handed out; drops the others on an error."""
+    waiting, running = iter(jobs), {}
+    try:
+        while True:
+            limit = 1 if isinstance(executor, Serial) else ahead
+            while len(running) < limit and (job := next(waiting, None)) is not None:
+                running[executor.submit(make, job)] = job
+            if not running:
+                return
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                future.result()
+                yield running.pop(future)
+    finally:
+        for future in running:
+            future.cancel()
+
+
+def start(config: Config, folder: Path, planned: int) -> None:
+    """Makes ``folder`` the home of this configuration's training set; raises NgptError if it is that of another."""
+    (folder / "shards").mkdir(parents=True, exist_ok=True)
+    with locked(folder):
+        if not (folder / MANIFEST).exists():
+            empty = {"format": FORMAT, "version": VERSION, "config": as_json(config), "planned": planned, "shards": []}
+            write_json(folder / MANIFEST, empty)
+        theirs = read_manifest(folder)["config"]
+    ours = json.loads(json.dumps(as_json(config)))
+    different = [key for key in ours if theirs.get(key) != ours[key]]
+    if different:
+        raise NgptError(
+            f"{folder}: holds a training set of another configuration ({', '.join(different)} differ); use a new one"
+        )
+
+
+def update_manifest(folder: Path) -> None:
+    """Lists the shards that are on disk. Jobs on other machines may do the same: the folder is locked meanwhile."""
+    with locked(folder):
+        manifest = read_manifest(folder)
+        known = {entry["file"]: entry for entry in manifest["shards"]}
+        entries = []
+        for path in sorted((folder / "shards").glob("[!.]*.safetensors")):
+            name = path.relative_to(folder).as_posix()
+            if name not in known:
+                known[name] = {"file": name, "sha256": checksum(path), "bytes": path.stat().st_size} | Shard(
+                    path
+                ).record
+            entries.append(known[name])
+        if entries != manifest["shards"]:
+            write_json(folder / MANIFEST, manifest | {"shards": entries})
+
+
+def write_json(path: Path, value: dict) -> None:
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text(json.dumps(value, indent=1) + "\n")
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Only one process at a time is inside, on all machines that share the folder's file system."""
+    with open(folder / ".lock", "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield

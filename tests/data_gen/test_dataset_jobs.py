@@ -1,0 +1,178 @@
+"""Making training sets: the same bits however it is done, nothing lost or doubled when killed, errors recorded.
+
+Most tests replace the rendering of a shard, which takes seconds, by a stand-in that takes none.
+"""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ngpt.dataset import Dataset, problems, read_manifest
+from ngpt.errors import NgptError
+
+pytest.importorskip("safetensors")
+pytest.importorskip("mitsuba")
+
+from data_gen.dataset import crops, jobs
+from data_gen.dataset.config import Config, Files, read_config
+from data_gen.dataset.scenes import make_scene
+from ngpt.shards import write_shard
+
+ROOT = Path(__file__).parents[2]
+TINY = replace(read_config(ROOT / "configs" / "data-tiny.toml"))
+
+
+def stand_in(config, job, folder, variant):
+    """A shard without crops, written after a moment."""
+    time.sleep(0.01)
+    write_shard(Path(folder) / job.file, [], {"scene": job.scene, "crops": [], "failures": []})
+    return job.file
+
+
+def hashes(folder):
+    return {entry["file"]: entry["sha256"] for entry in read_manifest(folder)["shards"]}
+
+
+def test_configurations_can_be_read():
+    for path in (ROOT / "configs").glob("data-*.toml"):
+        assert read_config(path).plan()
+
+
+@pytest.mark.parametrize("text", ["spp = [1, 4]\nscenes = 1", "scenes = 0", "scene = 3", "seed = ", "spp = 3"])
+def test_bad_configurations(tmp_path, text):
+    (tmp_path / "c.toml").write_text(text)
+    with pytest.raises(NgptError):
+        read_config(tmp_path / "c.toml")
+
+
+def test_parts_make_the_whole(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "make_shard", stand_in)
+    config = Config(scenes=5, crops=3, crops_per_shard=2)
+    for i in range(3):
+        jobs.generate(config, tmp_path, jobs.Serial(), shard=(i, 3))
+    assert len(hashes(tmp_path)) == len(config.plan()) == 10
+    assert problems(tmp_path) == []
+
+
+def test_executors_and_orders_agree(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "make_shard", stand_in)
+    config = Config(scenes=6, crops=1)
+    made = []
+    for name, executor in (("serial", jobs.Serial()), ("threads", ThreadPoolExecutor(3))):
+        with executor:
+            jobs.generate(config, tmp_path / name, executor)
+        made.append(hashes(tmp_path / name))
+    assert made[0] == made[1]
+
+
+def test_goes_on_where_it_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "make_shard", stand_in)
+    config = Config(scenes=4, crops=1)
+    jobs.generate(config, tmp_path, jobs.Serial())
+    before = hashes(tmp_path)
+    lost = next((tmp_path / "shards").iterdir())
+    lost.unlink()
+    (tmp_path / "shards" / ".half-written.safetensors").write_bytes(b"x")  # what a killed process leaves behind
+    calls = []
+    jobs.generate(config, tmp_path, jobs.Serial(), progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(3, 4), (4, 4)]
+    assert hashes(tmp_path) == before
+    with pytest.raises(NgptError, match="seed differ"):
+        jobs.generate(replace(config, seed=1), tmp_path, jobs.Serial())
+
+
+def test_disk_full_stops_cleanly(tmp_path, monkeypatch):
+    def full(config, job, folder, variant):
+        if job.scene == "made-00002":
+            raise NgptError(f"{job.file}: cannot be written: No space left on device")
+        return stand_in(config, job, folder, variant)
+
+    monkeypatch.setattr(jobs, "make_shard", full)
+    with pytest.raises(NgptError, match="No space left"):
+        jobs.generate(Config(scenes=4, crops=1), tmp_path, jobs.Serial())
+    assert len(hashes(tmp_path)) == 2
+
+
+def test_scene_files_as_sources(tmp_path):
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a" / "scene.xml").touch()
+    box = [[0, 0, 0], [1, 1, 1]]
+    config = Config(files=(Files(str(tmp_path / "*" / "*.xml"), 3, boxes={"a-scene": box}),))
+    assert [(job.scene, job.crops, job.box) for job in config.plan()] == [("a-scene", (0, 1, 2), box)]
+    with pytest.raises(NgptError, match="no scene file matches"):
+        Config(files=(Files(str(tmp_path / "nothing"), 3),)).plan()
+
+
+def test_a_scene_comes_from_its_seed(tmp_path):
+    for name in ("a", "b", "c"):
+        (tmp_path / name).mkdir()
+        make_scene(8 if name == "c" else 7, tmp_path / name)
+    a, b, c = ({p.name: p.read_bytes() for p in (tmp_path / name).iterdir()} for name in ("a", "b", "c"))
+    assert a == b
+    assert a["scene.xml"] != c["scene.xml"]
+
+
+def test_sample_counts_are_stratified():
+    config = Config(scenes=1, inputs=5, spp=(2, 1023))
+    counts = np.array([crops.sample_counts(np.random.default_rng(i), config) for i in range(400)])
+    assert counts.min() >= 2 and counts.max() <= 1023
+    assert np.all(np.diff(counts, axis=1) >= 0)
+    edges = np.exp(np.linspace(np.log(2), np.log(1024), 6))
+    assert np.all((counts + 1 > edges[:-1]) & (counts <= edges[1:]))
+
+
+@pytest.mark.slow
+def test_tiny(renderer, tmp_path):
+    """The real thing, twice: killed on the way and continued, then by a pool of processes; the same bits."""
+    command = [sys.executable, "-m", "data_gen", "--config", "configs/data-tiny.toml", "--out"]
+    process = subprocess.Popen([*command, str(tmp_path / "a")], cwd=ROOT, start_new_session=True)
+    while process.poll() is None and len(list((tmp_path / "a").glob("shards/[!.]*"))) < 2:
+        time.sleep(0.1)
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    subprocess.run([*command, str(tmp_path / "a")], cwd=ROOT, check=True)
+    subprocess.run([*command, str(tmp_path / "b"), "--workers", "2"], cwd=ROOT, check=True)
+    data = Dataset(tmp_path / "a")
+    assert len(data) == 4 and problems(tmp_path / "a") == problems(tmp_path / "b") == []
+    for one, other in zip(data, Dataset(tmp_path / "b"), strict=True):
+        np.testing.assert_array_equal(one.reference, other.reference)
+        for k in range(one.inputs):
+            for name in one.stack(k).names:
+                np.testing.assert_array_equal(one.stack(k)[name], other.stack(k)[name])
+    assert (tmp_path / "a" / "README.md").exists() and (tmp_path / "a" / "contact.png").exists()
+
+
+@pytest.mark.slow
+def test_dask_cluster_with_a_worker_killed(tmp_path, monkeypatch):
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(jobs, "make_shard", stand_in)
+    config = Config(scenes=60, crops=1)
+    with distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster:
+        pids = [worker.pid for worker in cluster.workers.values()]
+        killed = []
+
+        def progress(done, total):
+            if done >= 5 and not killed:
+                killed.append(os.kill(pids[0], signal.SIGKILL))
+
+        with jobs.cluster(cluster.scheduler_address) as executor:
+            jobs.generate(config, tmp_path, executor, progress=progress)
+    assert killed and len(hashes(tmp_path)) == 60 and problems(tmp_path) == []
+
+
+def test_a_dead_worker_is_an_error_that_says_how_to_go_on(tmp_path, monkeypatch):
+    monkeypatch.setattr(jobs, "make_shard", die)
+    with ProcessPoolExecutor(1) as executor, pytest.raises(NgptError, match="continue"):
+        jobs.generate(Config(scenes=1, crops=1), tmp_path, executor)
+
+
+def die(config, job, folder, variant):
+    os._exit(9)
