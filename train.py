@@ -6,9 +6,11 @@ Run the same command again to continue a run that was stopped. Several GPUs: tor
 import argparse
 import json
 import sys
+from contextlib import ExitStack
 from pathlib import Path
 
 from ngpt.errors import NgptError
+from ngpt.files import exclusive
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -30,7 +32,7 @@ def main(arguments: list[str] | None = None) -> int:
 def run(options: argparse.Namespace) -> int:
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
     from ngpt.network.cost import cost
-    from ngpt.network.data import open_crops, split
+    from ngpt.network.data import Mixture, open_crops, split
     from ngpt.network.distributed import Processes
     from ngpt.network.losses import make_loss
     from ngpt.network.settings import read_settings
@@ -44,18 +46,34 @@ def run(options: argparse.Namespace) -> int:
         raise NgptError("--out is missing: the folder for checkpoint, weights and log")
     out = Path(options.out)
     out.mkdir(parents=True, exist_ok=True)
-    crops = [crop for folder in settings.data.folders for crop in open_crops(folder)]
-    training, held_out = split(crops, settings.data.validation)
+    loss = make_loss(settings.loss)
     processes = Processes()
-    trainer = Trainer(settings, training, held_out, make_loss(settings.loss), out, processes)
-    if trainer.checkpoint.exists():
-        trainer.resume()
-        print(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
-    (out / "settings.json").write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
-    finished = trainer.run()
+    with ExitStack() as stack:
+        if processes.rank == 0:
+            stack.enter_context(exclusive(out))
+        on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+        crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
+        streams = [stack.enter_context(stream(f)) for f in settings.data.folders if f.endswith(".toml")]
+        training = Mixture(crops, *streams)
+        # What is read from a stream is replaced: it must not be kept.
+        trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams)
+        if trainer.checkpoint.exists():
+            trainer.resume()
+            print(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
+        (out / "settings.json").write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+        finished = trainer.run()
     processes.close()
     print(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
     return 0
+
+
+def stream(config: str):
+    """Crops of that dataset configuration, rendered in another process while they are trained on."""
+    from data_gen.dataset.config import read_config
+    from data_gen.dataset.jobs import processes
+    from data_gen.dataset.stream import Stream
+
+    return Stream(read_config(Path(config)), processes(1))
 
 
 if __name__ == "__main__":

@@ -1,5 +1,6 @@
 """Output files: complete under their final name, or not there at all."""
 
+import fcntl
 import os
 import tempfile
 from collections.abc import Iterator
@@ -52,3 +53,19 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         raise NgptError(f"{path}: cannot be written: {error.strerror or error}") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+@contextmanager
+def exclusive(folder: str | os.PathLike) -> Iterator[None]:
+    """Keeps other processes out of ``folder`` for the length of the block; raises NgptError if one is at work there.
+
+    The lock goes with the process, however it ends.
+    """
+    with open(Path(folder) / ".lock", "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise NgptError(
+                f"{folder}: another process is writing there; wait for it, or name another folder"
+            ) from error
+        yield

@@ -5,7 +5,7 @@ import os
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output
+from ngpt.files import atomic_output, exclusive
 
 
 def test_appears_only_when_the_block_succeeds(tmp_path):
@@ -53,4 +53,11 @@ def test_a_file_that_another_writer_finished_meanwhile_is_kept(tmp_path):
 @pytest.mark.parametrize("name", ["missing/a.txt", "."])
 def test_places_that_cannot_be_written(tmp_path, name):
     with pytest.raises(NgptError, match=r"does not exist|is a directory"), atomic_output(tmp_path / name):
+        pass
+
+
+def test_a_folder_belongs_to_one_writer_at_a_time(tmp_path):
+    with exclusive(tmp_path), pytest.raises(NgptError, match="another process is writing there"), exclusive(tmp_path):
+        pass
+    with exclusive(tmp_path):
         pass

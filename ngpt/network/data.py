@@ -1,6 +1,6 @@
 """Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -93,7 +93,7 @@ class StackFolder(Sequence[StackCrop]):
         return tuple(dict.fromkeys(crop.scene for crop in self._crops))
 
 
-def open_crops(folder: str | Path) -> Sequence[Any]:
+def open_crops(folder: str | Path) -> Iterable[Any]:
     """The crops of a dataset (it has a manifest) or of a folder of stacks."""
     path = Path(folder)
     if not path.is_dir():
@@ -126,6 +126,23 @@ def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:
     method = METHODS[config.base]
     with np.errstate(over="ignore", invalid="ignore"):
         return method.run(data, **method.options).astype(np.float32, copy=False)
+
+
+class Mixture(Sequence[Any]):
+    """Several sequences of crops as one; they may grow while they are read, as streams do."""
+
+    def __init__(self, *parts: Any):
+        self.parts = parts
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        for part in self.parts:
+            if index < len(part):
+                return part[index]
+            index -= len(part)
+        raise IndexError(index)
 
 
 class Examples(TorchDataset):

@@ -91,3 +91,17 @@ def test_views_of_ones_own_train_a_network(train, tmp_path):
     assert "at step 2 of 3" in output and "finished at step 3" in output
     image = ngpt.denoise(SyntheticCrop("", 2).stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
     assert image.shape == (32, 32, 3)
+
+
+def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):
+    changes = {
+        "data.folders": ["configs/data-tiny.toml"],
+        "data.crop": 32,
+        "run.steps": 3,
+        "run.batch": 2,
+        "run.log": 1,
+    }
+    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+    status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *arguments)
+    assert status == 0, errors
+    assert "finished at step 3" in output

@@ -185,6 +185,14 @@ def test_the_target_is_where_the_input_is():
         assert torch.allclose(example["primal"][:, 15:-15, 15:-15], example["target"], rtol=1e-3, atol=1e-3)
 
 
+def test_a_mixture_is_its_parts_one_after_the_other():
+    growing = CROPS[:1]
+    mixture = data.Mixture(growing, CROPS[3:5])
+    assert [crop.scene for crop in mixture] == ["scene0", "scene3", "scene4"]
+    growing.append(CROPS[1])
+    assert len(mixture) == 4 and mixture[1].scene == "scene1" and mixture[3].scene == "scene4"
+
+
 def test_scenes_are_held_out_whole():
     training, held_out = data.split(CROPS, ("scene1", "scene5"))
     assert [crop.scene for crop in held_out] == ["scene1", "scene5"] and len(training) == 4
