@@ -92,15 +92,15 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
         seconds = {"camera": time.perf_counter() - clock}
         seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + 1)]
         clock = time.perf_counter()
-        stacks = [render_stack(around.scene, counts[0], seeds[0], "gpt")]
+        stacks = [render_stack(around.scene, counts[0], seeds[0])]
         if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
         raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
-    stacks += [render_stack(around.scene, *pair, "gpt") for pair in zip(counts[1:], seeds[1:-1], strict=True)]
+    stacks += [render_stack(around.scene, *pair) for pair in zip(counts[1:], seeds[1:-1], strict=True)]
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    converged = render_stack(around.scene, config.reference_spp, seeds[-1], "gpt")
+    converged = render_stack(around.scene, config.reference_spp, seeds[-1])
     reference = ngpt.denoise(converged, method=config.reference_method)
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
