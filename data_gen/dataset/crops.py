@@ -46,6 +46,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
             scene = load_scene(path, None, job.parameters | {"parallel": False})
         around = Surroundings(scene, job.box)
     except (NgptError, RuntimeError) as error:
+        stop_if_interrupted(error)
         record["failures"] = [{"crop": crop, "error": " ".join(str(error).split())} for crop in job.crops]
     else:
         record["scene_seconds"] = time.perf_counter() - start
@@ -53,12 +54,22 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
             try:
                 data, told = make_crop(config, around, job.scene, crop)
             except (NgptError, RuntimeError) as error:
+                stop_if_interrupted(error)
                 record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
             else:
                 crops.append(data)
                 record["crops"].append(told)
     write_shard(Path(folder) / job.file, crops, record)
     return job.file
+
+
+def stop_if_interrupted(error: BaseException) -> None:
+    """Raises KeyboardInterrupt if that is what ``error`` comes from: Dr.Jit's loops wrap it in a RuntimeError."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause
+        cause = cause.__cause__ or cause.__context__
 
 
 def scene_seed(config: Config, name: str) -> tuple[int, int]:
