@@ -46,6 +46,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
             scene = load_scene(path, None, job.parameters | {"parallel": False})
         around = Surroundings(scene, job.box)
     except (NgptError, RuntimeError) as error:
+        stop_if_interrupted(error)
         record["failures"] = [{"crop": crop, "error": " ".join(str(error).split())} for crop in job.crops]
     else:
         record["scene_seconds"] = time.perf_counter() - start
@@ -53,12 +54,22 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
             try:
                 data, told = make_crop(config, around, job.scene, crop)
             except (NgptError, RuntimeError) as error:
+                stop_if_interrupted(error)
                 record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
             else:
                 crops.append(data)
                 record["crops"].append(told)
     write_shard(Path(folder) / job.file, crops, record)
     return job.file
+
+
+def stop_if_interrupted(error: BaseException) -> None:
+    """Raises KeyboardInterrupt if that is what ``error`` comes from: Dr.Jit's loops wrap it in a RuntimeError."""
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt):
+            raise cause
+        cause = cause.__cause__ or cause.__context__
 
 
 def scene_seed(config: Config, name: str) -> tuple[int, int]:
@@ -92,15 +103,15 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
         seconds = {"camera": time.perf_counter() - clock}
         seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + 1)]
         clock = time.perf_counter()
-        stacks = [render_stack(around.scene, counts[0], seeds[0], "gpt")]
+        stacks = [render_stack(around.scene, counts[0], seeds[0])]
         if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
         raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
-    stacks += [render_stack(around.scene, *pair, "gpt") for pair in zip(counts[1:], seeds[1:-1], strict=True)]
+    stacks += [render_stack(around.scene, *pair) for pair in zip(counts[1:], seeds[1:-1], strict=True)]
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    converged = render_stack(around.scene, config.reference_spp, seeds[-1], "gpt")
+    converged = render_stack(around.scene, config.reference_spp, seeds[-1])
     reference = ngpt.denoise(converged, method=config.reference_method)
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
