@@ -96,13 +96,17 @@ class Palette:
         # The height is in the picture: the plugin's own scale would be compiled into the kernel.
         bump = plugin("bsdf", "bumpmap", scale=0.3)
         bump.append(self.picture("arbitrary", self.rng.uniform(0.15, 1) * relief, raw=True))
-        return inside(plugin("bsdf", "twosided"), inside(bump, self._coat()))
+        # Not a coat: Mitsuba's roughplastic is NaN where the tilted frame leaves a direction below the horizon.
+        return inside(plugin("bsdf", "twosided"), inside(bump, self._disney()))
 
     def _plastic(self) -> xml.Element:
         plastic = inside(plugin("bsdf", "plastic", nonlinear=True), self.picture("diffuse_reflectance"))
         return inside(plugin("bsdf", "twosided"), plastic)
 
     def _principled(self) -> xml.Element:
+        return inside(plugin("bsdf", "twosided"), self._disney())
+
+    def _disney(self) -> xml.Element:
         # Not 0, which would leave the lobe out of the kernel.
         metallic = 1.0 if self.rng.random() < 0.4 else 0.01
         principled = plugin(
@@ -116,7 +120,7 @@ class Palette:
         gloss = low + (high - low) * random_picture(self.rng, low=0, high=1).mean(axis=-1)
         principled.append(self.picture("base_color"))
         principled.append(self.picture("roughness", gloss, raw=True))
-        return inside(plugin("bsdf", "twosided"), principled)
+        return principled
 
     def _metal(self) -> xml.Element:
         metal = plugin(
