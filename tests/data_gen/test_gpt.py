@@ -94,14 +94,14 @@ def one_direction(film, forward, backward, axis):
     """Differences sampled from one of the two pixels only."""
     gradient, variance = type(film).true_gradient(film, forward, backward, axis)
     ahead = np.s_[:, :-1] if axis == 1 else np.s_[:-1]
-    gradient[ahead] = film._image(film.moments[forward].mean_or_nan())[ahead]
+    gradient[ahead] = film._image(film._statistics(forward)[1])[ahead]
     return gradient, variance
 
 
 def wrapped(film, forward, backward, axis):
     """The last column's difference taken to the first."""
     gradient, variance = type(film).true_gradient(film, forward, backward, axis)
-    image = film._image(film.moments["primal"].mean_or_nan())
+    image = film._image(film._statistics("primal")[1])
     return np.where(gradient == 0, np.roll(image, -1, axis=axis) - image, gradient), variance
 
 
