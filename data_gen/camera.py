@@ -45,7 +45,8 @@ class CameraSamples:
         pixels = int(dr.prod(self.size))
         lane = dr.arange(mi.UInt32, pixels * spp)
         # Opaque, here and below: a literal would be compiled into the kernel, a new one for every value.
-        in_pixel, in_block = (dr.opaque(mi.UInt32, n * (block or spp)) for n in (1, pixels))
+        self.block = block or spp
+        in_pixel, in_block = (dr.opaque(mi.UInt32, n * self.block) for n in (1, pixels))
         pixel = lane % in_block // in_pixel
         sample = lane // in_block * in_pixel + lane % in_pixel + dr.opaque(mi.UInt32, first)
         self.random = sample_streams(seed, pixel, sample)

@@ -183,14 +183,12 @@ def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f
     A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
     """
     dr.eval(A, Δ, inside)
-    width, pixels = camera.size.x, camera.size.x * camera.size.y
-    lanes = dr.width(inside[0])
-    spp = lanes // pixels
-    names, lane = list(SHIFTS), dr.arange(mi.Int32, lanes)
+    names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
     L = mi.Color3f(0)
     for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):
         back = names.index(next(name for name, shift in SHIFTS.items() if shift == (-x, -y)))
-        neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, spp * (x + width * y)))
+        # The same sample of another pixel, in the same block.
+        neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, camera.block * (x + camera.size.x * y)))
         L += (a + dr.gather(mi.Color3f, A[back] + Δ[back], neighbour, active)) / 8
     return L
 

@@ -105,11 +105,11 @@ def test_inside_glass(renderer):
         description["ball"]["bsdf"] = {"type": "dielectric"}
         return description
 
-    stack = render(renderer, scene, spp=128)
+    stack = render(renderer, scene, spp=1024)
     # Radiance is higher by the square of the index of refraction where the lamp is seen through the surface.
     check_sane(stack, most=1.505**2 * 1.5)
     assert stack["primal"].mean() == pytest.approx(
-        np.array(renderer.render(load(renderer, scene, (24, 24)), spp=512)).mean(), rel=0.1
+        np.array(renderer.render(load(renderer, scene, (24, 24)), spp=4096)).mean(), rel=0.1
     )
 
 
