@@ -118,7 +118,7 @@ def layers_of(data: Repaired, config: ModelConfig) -> Layers:
         arrays |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
     if config.base:
         arrays["base"] = base_image(data, config)
-    return {name: torch.from_numpy(np.ascontiguousarray(arrays[name].transpose(2, 0, 1))) for name in config.inputs}
+    return {name: torch.from_numpy(np.array(arrays[name].transpose(2, 0, 1), order="C")) for name in config.inputs}
 
 
 def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:

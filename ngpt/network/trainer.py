@@ -166,7 +166,7 @@ class Trainer:
             "parameters": parameters(self.model),
             "version": ngpt.__version__,
             "torch": torch.__version__,
-            "settings": self.settings.to_dict(),
+            "settings": published(self.settings),
         }
         weights.save_weights(self.out / "weights.safetensors", self.average, provenance, overwrite=True)
 
@@ -265,6 +265,15 @@ class Trainer:
             for name, value in values.items():
                 if name != "step":
                     self._writer.add_scalar(name, value, self.step)
+
+
+def published(settings: Settings) -> dict[str, Any]:
+    """The settings as they go into files that are given away: names of folders and files, not where they lie."""
+    values = settings.to_dict()
+    values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
+    values["initial"] = Path(settings.initial).name
+    values["loss"] = {k: Path(v).name if k in ("backbone", "weights") else v for k, v in settings.loss.items()}
+    return values
 
 
 def _keep_lines(path: Path, step: int) -> None:

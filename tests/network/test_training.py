@@ -21,7 +21,7 @@ from ngpt.network import data, weights  # noqa: E402
 from ngpt.network.augment import Augmentation  # noqa: E402
 from ngpt.network.schedule import learning_rate  # noqa: E402
 from ngpt.network.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
-from ngpt.network.trainer import Trainer  # noqa: E402
+from ngpt.network.trainer import Trainer, published  # noqa: E402
 
 CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
 SETTINGS = {
@@ -277,6 +277,13 @@ def test_fine_tuning_starts_from_weights(tmp_path):
     values["model"]["units"] = [2, 2]
     with pytest.raises(NgptError, match=r"another \[model\]"):
         Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b")
+
+
+def test_weights_do_not_tell_where_things_lie(tmp_path):
+    values = SETTINGS | {"initial": "/home/me/a.safetensors", "loss": {"kind": "l1", "backbone": "/home/me/b.pth"}}
+    values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
+    told = published(from_dict(values, "test"))
+    assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
 
 
 def test_damaged_weights_are_explained(tmp_path):

@@ -1,0 +1,102 @@
+"""The weights that come with the package."""
+
+import numpy as np
+import pytest
+import torch
+
+import ngpt
+from ngpt.gradients import forward_differences
+from ngpt.methods import METHODS, WEIGHTS
+from ngpt.metrics import relmse_trimmed
+from ngpt.network.weights import load_weights
+
+SHIPPED = [name for name in ("ngpt-fast", "ngpt") if (WEIGHTS / f"{name}.safetensors").is_file()]
+
+
+@pytest.fixture(scope="module")
+def views(renderer):
+    """A stack of 8 samples and a reference of each built-in scene."""
+    from data_gen.render import load_scene, render_stack
+
+    result = {}
+    for name in ("diffuse", "lens"):
+        scene = load_scene(name, (96, 64))
+        result[name] = render_stack(scene, 8, seed=3), render_stack(scene, 1024, seed=4, sampler="primal")["primal"]
+    return result
+
+
+def test_ngpt_fast_is_shipped():
+    assert "ngpt-fast" in SHIPPED
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_method_needs_what_its_weights_read_and_says_how_they_were_made(name):
+    model, header = load_weights(WEIGHTS / f"{name}.safetensors")
+    assert set(METHODS[name].needs) == set(model.config.needs)
+    assert {"step", "hours", "settings", "torch", "version"} <= header["training"].keys()
+    assert "/" not in str(header["training"]["settings"]["data"]["folders"]), "paths of the machine it was trained on"
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_it_is_better_than_l1_on_scenes_of_its_own_kind(views, name):
+    for stack, reference in views.values():
+        ours, l1 = (relmse_trimmed(ngpt.denoise(stack, method), reference) for method in (name, "l1"))
+        assert ours < l1
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("stops", [-10, 10])
+def test_it_does_not_depend_on_exposure(views, name, stops):
+    stack, _ = views["diffuse"]
+    k = 2.0**stops
+    powers = {"primal": 1, "direct": 1, "dx": 1, "dy": 1, "primal_var": 2, "dx_var": 2, "dy_var": 2}
+    scaled = stack.replace(**{layer: stack[layer] * np.float32(k**power) for layer, power in powers.items()})
+    expected = k * ngpt.denoise(stack, name)
+    error = np.abs(ngpt.denoise(scaled, name) - expected)
+    assert (error <= 0.01 * expected + 1e-6 * k).mean() > 0.999
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_a_firefly_stays_where_it_is(views, name):
+    stack, _ = views["diffuse"]
+    primal = stack["primal"].copy()
+    primal[20, 10] += 1e6
+    before, after = ngpt.denoise(stack, name), ngpt.denoise(stack.replace(primal=primal), name)
+    model, _ = load_weights(WEIGHTS / f"{name}.safetensors")
+    # 50 sweeps of its base, and what the network sees.
+    far = np.s_[:, 10 + model.network.radius + 1 :]
+    assert np.isfinite(after).all()
+    assert (np.abs(after - before)[far] <= 0.01 * before[far] + 1e-3).mean() > 0.99
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 16)])
+@pytest.mark.parametrize("value", [0.0, 1.0, 65504.0, 1e12])
+def test_sizes_and_extremes(name, size, value):
+    rng = np.random.default_rng(0)
+    image = (value * rng.random((*size, 3))).astype(np.float32)
+    dx, dy = forward_differences(image)
+    layers = {"primal": image, "dx": dx, "dy": dy, "albedo": rng.random((*size, 3)), "depth": rng.random((*size, 1))}
+    layers["normal"] = np.broadcast_to(np.float32([0, 0, 1]), image.shape)
+    layers |= {f"{layer}_var": np.square(image * 0.1) for layer in ("primal", "dx", "dy")}
+    result = ngpt.denoise(ngpt.GradientStack.from_arrays(**layers), name)
+    assert result.shape == image.shape and np.isfinite(result).all()
+    assert result.min() >= 0 and result.max() <= image.max() * 1.001
+
+
+@pytest.mark.parametrize("name", SHIPPED)
+def test_sixteen_bits_cost_little(views, name):
+    """Of the body; the error of the image, where it matters most to a user."""
+    from ngpt.network.data import layers_of
+    from ngpt.repair import repair
+
+    stack, reference = views["lens"]
+    model, _ = load_weights(WEIGHTS / f"{name}.safetensors")
+    layers = {layer: tensor[None] for layer, tensor in layers_of(repair(stack), model.config).items()}
+    errors = {}
+    for precision in (torch.float32, torch.bfloat16, torch.float16):
+        with torch.inference_mode(), torch.autocast("cpu", precision, enabled=precision != torch.float32):
+            image = model(layers)[0].permute(1, 2, 0).numpy()
+        errors[precision] = relmse_trimmed(image + stack["direct"], reference)
+    assert errors[torch.float16] < 1.02 * errors[torch.float32]
+    assert errors[torch.bfloat16] < 1.15 * errors[torch.float32]
