@@ -24,13 +24,14 @@ def signed_log(x: Tensor) -> Tensor:
 
     Grows by 0.69 per stop: 1e12 becomes 27.6.
     """
-    return torch.sign(x) * torch.log1p(torch.abs(x))
+    # Two halves rather than sgn(x), which would hide the slope of 1 at 0 from automatic differentiation.
+    return torch.log1p(torch.clamp(x, min=0)) - torch.log1p(torch.relu(-x))
 
 
 def signed_exp(y: Tensor) -> Tensor:
     """sgn(y) (exp|y| - 1), the inverse of ``signed_log``. In float32, whatever comes in; overflows beyond 88.7."""
     y = y.float()
-    return torch.sign(y) * torch.expm1(torch.abs(y))
+    return torch.expm1(torch.clamp(y, min=0)) - torch.expm1(torch.relu(-y))
 
 
 def srgb(x: Tensor) -> Tensor:
@@ -38,7 +39,7 @@ def srgb(x: Tensor) -> Tensor:
     a = torch.abs(x)
     # The power has an infinite slope at 0, which would reach the other branch's gradient as 0 * inf.
     curve = 1.055 * torch.clamp(a, min=0.0031308) ** (1 / 2.4) - 0.055
-    return torch.sign(x) * torch.where(a <= 0.0031308, 12.92 * a, curve)
+    return torch.where(a <= 0.0031308, 12.92 * x, torch.sign(x) * curve)
 
 
 def inverse_srgb(y: Tensor) -> Tensor:

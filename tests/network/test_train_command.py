@@ -3,6 +3,7 @@
 import runpy
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import ngpt
@@ -91,6 +92,24 @@ def test_views_of_ones_own_train_a_network(train, tmp_path):
     assert "at step 2 of 3" in output and "finished at step 3" in output
     image = ngpt.denoise(SyntheticCrop("", 2).stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
     assert image.shape == (32, 32, 3)
+
+
+def test_the_shipped_network_is_fine_tuned_in_one_command(train, tmp_path):
+    from crops import SyntheticCrop
+
+    crop = SyntheticCrop("", 0)
+    (tmp_path / "views" / "mine").mkdir(parents=True)
+    ngpt.write(tmp_path / "views" / "mine" / "reference.exr", crop.reference)
+    ngpt.write(tmp_path / "views" / "mine" / "few.exr", crop.stack(0))
+    changes = {"data.folders": [str(tmp_path / "views")], "data.crop": 32, "run.steps": 1, "run.batch": 1}
+    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+    out = tmp_path / "run"
+    status, _, errors = train("--config", "configs/fine-tune.toml", "--out", str(out), *arguments)
+    assert status == 0, errors
+    ours = ngpt.denoise(crop.stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
+    # One step at a low rate: close to what it started from, and not the same.
+    change = np.abs(ours - ngpt.denoise(crop.stack(0), "ngpt-fast"))
+    assert 0 < change.mean() < 0.05
 
 
 def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):

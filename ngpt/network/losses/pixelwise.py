@@ -1,7 +1,8 @@
 """Losses that compare pixel by pixel, in tone-mapped or relative radiance."""
 
-import torch
 from torch import Tensor
+
+from ngpt.network.transfer import signed_log
 
 
 def tone_mapped(image: Tensor) -> Tensor:
@@ -36,5 +37,4 @@ def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tenso
 
 def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |ln(1 + |p|) sgn p - ln(1 + |t|) sgn t|."""
-    p, t = (torch.sign(x) * torch.log1p(x.abs()) for x in (prediction, target))
-    return (p - t).abs().mean()
+    return (signed_log(prediction) - signed_log(target)).abs().mean()
