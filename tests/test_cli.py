@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -293,6 +294,8 @@ def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path
         # Any thread may get a signal, at its leisure, and two that are pending count as one.
         "    for _ in range(presses): os.kill(os.getpid(), signal.SIGINT); time.sleep(0.5)\n"
         "old, c.GradientFilm.end_pass = c.GradientFilm.end_pass, end_pass\n"
+        # Whoever started the tests in the background had Ctrl-C ignored by everything in them.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         "from ngpt.cli import main; sys.exit(main(sys.argv[2:]))"
     )
     code = f"from data_gen.backend import use_variant; use_variant()\n{code}"
@@ -306,6 +309,18 @@ def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path
         assert spp > 1 and f"holds the {spp} samples per pixel done by then" in run.stderr
     else:
         assert os.listdir(tmp_path) == [] and "error: interrupted" in run.stderr
+
+
+def test_ctrl_c_is_ignored_where_whoever_started_it_said_so():
+    from ngpt.cli.render import stop_on_ctrl_c
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_on_ctrl_c() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_rendering_without_llvm_says_what_to_install(tmp_path):

@@ -101,6 +101,9 @@ def stop_on_ctrl_c() -> Iterator[Callable[[], bool]]:
         Console().say("interrupted: ending with this pass; press Ctrl-C again to discard it all")
 
     before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:  # in the background of a script, whose Ctrl-C is not for us
+        yield lambda: False
+        return
     try:
         signal.signal(signal.SIGINT, note)
     except ValueError:  # not in the main thread, where alone signals arrive
