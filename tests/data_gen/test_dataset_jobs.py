@@ -144,6 +144,36 @@ def test_an_interrupt_inside_a_loop_of_drjit_is_no_failure_of_a_crop(renderer):
 
 
 @pytest.mark.slow
+def test_views_of_a_scene_share_their_kernels(renderer):
+    """Where two factors of the projection were equal to the last bit, everything was compiled once more."""
+    import drjit as dr
+    import mitsuba as mi
+
+    from data_gen.dataset.cameras import Surroundings, View, random_view
+
+    ball = {"type": "sphere", "center": [0, 0, 5], "to_world": mi.ScalarTransform4f().scale(0.5)}
+    scene = mi.load_dict({"type": "scene", "camera": {"type": "thinlens", "aperture_radius": 0.1}, "ball": ball})
+    around = Surroundings(scene)
+    point = dr.opaque(mi.Point2f, 0.3, 64)
+
+    def kernels(views: list[View]) -> int:
+        found = set()
+        for view in views:
+            view.apply(scene)
+            with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+                dr.kernel_history_clear()
+                dr.eval(scene.sensors()[0].sample_ray_differential(0.0, 0.5, point, point))
+                found |= {kernel["hash"] for kernel in dr.kernel_history([dr.KernelType.JIT])}
+        return len(found)
+
+    rng = np.random.default_rng(1)
+    assert kernels([random_view(around, rng, 64, 20, 0.005) for _ in range(24)]) == 1
+    # That they would not by themselves: the first pair of factors differs, the second does not.
+    view = random_view(around, rng, 64, 20, 0.005)
+    sizes = ((351, 198), (187, 123)), ((114, 64), (0, 0))
+    assert kernels([replace(view, film=film, window=window, fov=42.0) for film, window in sizes]) == 2
+
+
 def test_tiny(renderer, tmp_path):
     """The real thing, twice: killed on the way and continued, then by a pool of processes; the same bits."""
     command = [sys.executable, "-m", "data_gen", "--config", "configs/data-tiny.toml", "--out"]

@@ -28,11 +28,11 @@ def render_references(mi, scene, batches=24, spp=256):
     return np.stack([np.array(mi.render(scene, spp=spp, seed=1000 + i)) for i in range(batches)])
 
 
-def gradient_tests(stacks, references):
-    """(name, z-test) of the primal and of the gradients, those of the direct emission included."""
-    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references)
+def gradient_tests(stacks, references, level=0.01):
+    """(name, z-test) of the primal and of the gradients, those of the direct emission included; each at ``level``."""
+    yield "primal", z_test(np.stack([stack["primal"] for stack in stacks]), references, level=level)
     slopes = [forward_differences(reference) for reference in references]
     for axis, name in enumerate(("dx", "dy")):
         # The contract keeps direct emission out of dx and dy; its own differences put it back.
         ours = np.stack([stack[name] + forward_differences(stack["direct"])[axis] for stack in stacks])
-        yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]))
+        yield name, z_test(ours, np.stack([slope[axis] for slope in slopes]), level=level)
