@@ -6,7 +6,7 @@ they hit, so it never enters an object and stays where one can get to. Views tha
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -123,7 +123,7 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
             f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config"
         )
     weights = np.array(details)
-    return views[int(rng.choice(len(views), p=weights / weights.sum()))]
+    return with_one_kernel(around, views[int(rng.choice(len(views), p=weights / weights.sum()))])
 
 
 def random_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
@@ -140,32 +140,31 @@ def random_view(around: Surroundings, rng: np.random.Generator, size: int, roll:
     film = tuple(max(size, round(scale * n)) for n in VIRTUAL_SIZE)
     window = tuple(int(rng.integers(0, n - size + 1)) for n in film)
     fov = float(np.clip(around.fov * rng.uniform(0.7, 1.2), 15, 100))
-    fov, film = with_one_kernel(around, fov, film, window, size)
     aperture = max(abs(rng.normal(0, lens)), 1e-5) * focus
     origin, target, up = (tuple(float(x) for x in v) for v in (origin, origin + focus * towards, up))
     return View(origin, target, up, fov, float(aperture), float(focus), film, window, size)
 
 
-def with_one_kernel(around: Surroundings, fov: float, film: tuple, window: tuple, size: int) -> tuple[float, tuple]:
-    """``fov`` and ``film``, or some that hardly differ, for which all views of a scene share their kernels.
+def with_one_kernel(around: Surroundings, view: View) -> View:
+    """The view, or one that hardly differs, for which all views of a scene share their kernels.
 
     Pixels are square, so two factors of the camera's projection are equal but for rounding. Where they are equal to the
     last bit, Dr.Jit takes them for one variable, and compiles all kernels, for many seconds, once more.
     """
     params = mi.traverse(around.scene.sensors()[0])
-    crop, corner = mi.ScalarVector2i(size, size), mi.ScalarVector2i(*window)
+    crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
     # Some sizes have equal factors whatever the field of view: all those that are as high as the crop.
     for larger in range(16):
-        whole = tuple(n + larger for n in film)
+        film = view.film[0] + larger, view.film[1] + larger
         for steps in range(8):
-            angle = np.float32(fov) * np.float32(1 + steps * 1e-6)
+            fov = np.float32(view.fov) * np.float32(1 + steps * 1e-6)
             projection = mi.perspective_projection(
-                mi.ScalarVector2i(*whole), crop, corner, mi.Float(angle), params["near_clip"], params["far_clip"]
+                mi.ScalarVector2i(*film), crop, corner, mi.Float(fov), params["near_clip"], params["far_clip"]
             )
-            factors = np.array(projection.inverse().matrix, np.float32).reshape(4, 4)
+            factors = projection.inverse().matrix
             if factors[0, 0] != factors[1, 1]:
-                return float(angle), whole
-    return fov, film
+                return replace(view, fov=float(fov), film=film)
+    return view
 
 
 def what_shows(around: Surroundings, view: View) -> float:
