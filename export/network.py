@@ -15,8 +15,8 @@ from export import stages
 from export.text import IR_VERSION, OPSET, finish, parse
 from ngpt.controlvariates import SWEEPS
 from ngpt.errors import NgptError
-from ngpt.network import features, padding
-from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network import features
+from ngpt.network.model import Reconstructor
 from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 
@@ -59,6 +59,7 @@ def metadata(model: Reconstructor, name: str) -> dict[str, str]:
         "alignment": str(model.alignment),
         "overlap": str(overlap(model)),
         "overlap with base": str(overlap(model, given_base=True)),
+        "bytes per pixel": str(bytes_per_pixel(model)),
         "statistics": ", ".join(stages.STATISTICS),
         "precision": "float32",
         "base": model.config.base,
@@ -70,10 +71,20 @@ def overlap(model: Reconstructor, given_base: bool = False) -> int:
 
     What the network sees, and before it what the control variates and the smoothing of their weights do.
     """
-    reach = model.network.radius + padding.MARGIN
+    reach = model.network.radius
     if model.config.base and not given_base:
         reach += SWEEPS + 2
     return -(-reach // model.alignment) * model.alignment
+
+
+def bytes_per_pixel(model: Reconstructor) -> int:
+    """What a run takes at most for each pixel, beside the image's layers; measured in tests/test_runtime.py.
+
+    The head reads the longest list of tensors there is; it exists as the list, as one tensor, and about once more in
+    units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor. A quarter more.
+    """
+    listed = next(model.network.head.parameters()).shape[1]
+    return 5 * (3 * listed + 6 * features.channels(model.config.inputs))
 
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:

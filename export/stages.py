@@ -421,7 +421,9 @@ def before(config: ModelConfig) -> str:
     lines += [_encode(name) for name in config.inputs]
     lines += [_PADS, *(_pad(name) for name in config.inputs)]
     padded = ", ".join(f"{name}_padded" for name in config.inputs)
-    outputs = "float[tiles,channel_count,rows,columns] channels, float exposure, float low, float high, int64 height_now, "
+    outputs = (
+        "float[tiles,channel_count,rows,columns] channels, float exposure, float low, float high, int64 height_now, "
+    )
     outputs += "int64 width_now"
     outputs += ", float[tiles,3,height,width] log_base" if config.base else ""
     count = sum(CHANNELS[name] for name in config.inputs)
@@ -477,7 +479,8 @@ _BASE = """
     is_absent = Equal (base_size, nothing)
     base_scaled = If (is_absent) <
         then_branch: graph = make () => (float[tiles,3,height,width] made) {
-            made = ngpt.ControlVariates (primal_scaled, dx_scaled, dy_scaled, known_x, known_y, primal_var, dx_var, dy_var, mean_variance)
+            made = ngpt.ControlVariates
+                (primal_scaled, dx_scaled, dy_scaled, known_x, known_y, primal_var, dx_var, dy_var, mean_variance)
         },
         else_branch: graph = take () => (float[tiles,3,height,width] taken) { taken = Div (base, exposure) }
     >

@@ -15,7 +15,7 @@ SIZE = 29, 23  # width and height: odd, and no multiple of any alignment
 
 
 def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) -> None:
-    """Writes ``NAME.f32``, the inputs, ``image.f32``, what the model makes of them, and ``vector.json`` into ``folder``.
+    """Writes ``NAME.f32``, the inputs, ``image.f32``, what the model makes of them, and ``vector.json`` into a folder.
 
     The former are float32, little-endian, (1, C, height, width) in C order; the latter lists their shapes and SHA-256
     sums. Raises NgptError where a file exists and may not be overwritten.
