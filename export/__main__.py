@@ -16,6 +16,7 @@ def main(arguments: list[str] | None = None) -> int:
     what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as train.py makes them")
     what.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
     parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
+    parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
     parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
     parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.onnx")
@@ -50,7 +51,7 @@ def write(args: argparse.Namespace) -> list[Path]:
         from export.network import network_model, statistics_model
 
         name = args.weights.stem
-        models = {args.output: network_model(args.weights, name)}
+        models = {args.output: network_model(args.weights, name, args.precision)}
         if args.statistics:
             models[args.statistics] = statistics_model(args.weights, name)
     for path, model in models.items():

@@ -21,8 +21,14 @@ from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 
 
-def network_model(weights: str | Path, name: str) -> onnx.ModelProto:
+PRECISIONS = ("float32", "float16")
+
+
+def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
     """The graph of the weights in that file; ``name`` is what its metadata call it.
+
+    ``precision`` is that of the convolutions but the last; what surrounds them is float32 always. float16 is for GPUs:
+    ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
 
     Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
     """
@@ -31,12 +37,12 @@ def network_model(weights: str | Path, name: str) -> onnx.ModelProto:
     text = stages.before(config).replace("$ALIGNMENT", str(model.alignment))
     before = parse(text, stages.FUNCTIONS + stages.CONTROL_VARIATES)
     passed_on = [output.name for output in before.graph.output if output.name != "channels"]
-    body = onnx.compose.add_prefix(network_body(model), "network/")
+    body = onnx.compose.add_prefix(network_body(model, precision), "network/")
     after = onnx.compose.add_prefix(parse(stages.after(config), stages.FUNCTIONS), "after/", rename_outputs=False)
     model_proto = onnx.compose.merge_models(before, body, [("channels", "network/channels")])
     links = [("network/prediction", "after/prediction"), *((name, f"after/{name}") for name in passed_on)]
     model_proto = onnx.compose.merge_models(model_proto, after, links, name="reconstruction")
-    return finish(model_proto, metadata(model, name) | {"training": json.dumps(header.get("training", {}))})
+    return finish(model_proto, metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))})
 
 
 def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
@@ -46,7 +52,7 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
     return finish(graph, {"version": ngpt.__version__, "method": name, "statistics": ", ".join(stages.STATISTICS)})
 
 
-def metadata(model: Reconstructor, name: str) -> dict[str, str]:
+def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
     inputs = stages.layers(model.config)
     return {
@@ -61,7 +67,7 @@ def metadata(model: Reconstructor, name: str) -> dict[str, str]:
         "overlap with base": str(overlap(model, given_base=True)),
         "bytes per pixel": str(bytes_per_pixel(model)),
         "statistics": ", ".join(stages.STATISTICS),
-        "precision": "float32",
+        "precision": precision,
         "base": model.config.base,
     }
 
@@ -96,12 +102,27 @@ def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
     return model, header
 
 
-def network_body(model: Reconstructor) -> onnx.ModelProto:
+class _Half(torch.nn.Module):
+    """The network in float16, but for its head, which predicts logarithms."""
+
+    def __init__(self, network: torch.nn.Module):
+        super().__init__()
+        self.network = network.half()
+        self.network.head.float()
+
+    def forward(self, channels: torch.Tensor) -> torch.Tensor:
+        return self.network(channels.half())
+
+
+def network_body(model: Reconstructor, precision: str = "float32") -> onnx.ModelProto:
     """The network proper, ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
     for module in model.network.modules():
         if isinstance(module, Convolution):
             # Normalised once and for all, rather than in each run of the graph.
-            module.weight = partial(_same, module.weight().detach())  # type: ignore[method-assign]
+            weight = module.weight().detach()
+            if precision == "float16" and module is not model.network.head.convolution:
+                weight = weight.half()
+            module.weight = partial(_same, weight)  # type: ignore[method-assign]
     a = model.alignment
     # Sizes that are not special: the exporter takes 0 and 1 for constants.
     example = torch.zeros(2, features.channels(model.config.inputs), 5 * a, 7 * a)
@@ -111,7 +132,7 @@ def network_body(model: Reconstructor) -> onnx.ModelProto:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            model.network,
+            model.network if precision == "float32" else _Half(model.network),
             (example,),
             dynamo=True,
             opset_version=OPSET,

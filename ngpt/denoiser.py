@@ -77,7 +77,7 @@ class Denoiser:
             matrix = _to_numpy(getattr(to_sensor, "matrix", to_sensor)).reshape(-1)
             rotation = matrix.reshape(4, 4)[:3, :3] if matrix.size == 16 else matrix.reshape(3, 3)
             layers["normal"] = np.ascontiguousarray(layers["normal"] @ rotation.T.astype(np.float32))
-        result = reconstruct(GradientStack.from_arrays(**layers), self.method, **self.options).image
+        result = reconstruct(GradientStack(layers), self.method, **self.options).image
         return _like(np.concatenate([result, image[..., 3:]], axis=-1), noisy)
 
     def _layer(self, name: str, value: Any, channels: tuple[int, ...]) -> np.ndarray:

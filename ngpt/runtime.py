@@ -133,7 +133,7 @@ class Network:
 
     def _cuts(self, length: int) -> list[tuple[list[tuple[slice, int]], int]]:
         """Ways to cut a side, coarsest first: what each piece is for and where it begins, and how long all are."""
-        cuts = []
+        cuts: list[tuple[list[tuple[slice, int]], int]] = []
         for count in range(1, max(1, length // self.alignment) + 1):
             step = -(-length // (count * self.alignment)) * self.alignment
             # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment.
