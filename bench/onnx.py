@@ -184,8 +184,8 @@ def table(result: dict) -> str:
         f"Medians (quartiles) of {result['repeats']}. `ngpt denoise` of 64x64 pixels, from the command to the end: "
         f"{result['start-up']['median']:.2f} s. Memory of ngpt-fast beside the stack: {memory}. Files: "
         f"{result['bytes']['float32']} bytes, float16 {result['bytes']['float16']}. {versions}; {where['threads']} "
-        f"threads of {where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.onnx`, which explains "
-        "the rows."
+        f"threads of {where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.onnx`, which "
+        "explains the rows."
     )
     return "\n".join(lines) + f"\n\n{note}\n"
 

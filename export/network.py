@@ -20,7 +20,6 @@ from ngpt.network.model import Reconstructor
 from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 
-
 PRECISIONS = ("float32", "float16")
 
 
