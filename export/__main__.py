@@ -1,4 +1,4 @@
-"""``python -m export --method l2 -o l2.onnx``: writes a reconstruction as an ONNX file."""
+"""``python -m export --weights W.safetensors -o model.onnx``: writes a reconstruction as an ONNX file."""
 
 import argparse
 import sys
@@ -6,30 +6,62 @@ from pathlib import Path
 
 from ngpt.console import Console
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output
+from ngpt.files import atomic_output, check_output
 from ngpt.poisson import DEFAULT_ALPHA
 
 
 def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m export", description="Write a reconstruction as an ONNX file.")
-    parser.add_argument("--method", choices=["l2"], default="l2", help="l2: least-squares screened Poisson")
-    parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"default: {DEFAULT_ALPHA}")
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as train.py makes them")
+    what.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
+    parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
+    parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
+    parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
+    parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.onnx")
-    parser.add_argument("--force", action="store_true", help="overwrite a file that exists")
+    parser.add_argument("--force", action="store_true", help="overwrite files that exist")
     args = parser.parse_args(arguments)
     console = Console()
     try:
+        for path in (args.output, args.statistics):
+            if path is not None:
+                check_output(path, args.force)
+        if not args.weights and (args.statistics or args.vector):
+            raise NgptError("--statistics and --vector belong to networks; leave them out for a classical method")
         try:
-            from export.poisson import l2_model
+            written = write(args)
         except ModuleNotFoundError as error:
             raise NgptError(f"export needs the package '{error.name}'; `pip install 'ngpt-recon[export]'`") from error
-        with atomic_output(args.output, args.force) as temporary:
-            temporary.write_bytes(l2_model(args.alpha).SerializeToString())
     except NgptError as error:
         console.error(error)
         return 2
-    console.say(f"{args.output}: {args.method}, alpha {args.alpha}, {args.output.stat().st_size} bytes")
+    for path in written:
+        console.say(f"{path}: {path.stat().st_size} bytes")
     return 0
+
+
+def write(args: argparse.Namespace) -> list[Path]:
+    """Writes what the arguments ask for; returns the files."""
+    if not args.weights:
+        from export.poisson import l2_model
+
+        models = {args.output: l2_model(args.alpha)}
+    else:
+        from export.network import network_model, statistics_model
+
+        name = args.weights.stem
+        models = {args.output: network_model(args.weights, name, args.precision)}
+        if args.statistics:
+            models[args.statistics] = statistics_model(args.weights, name)
+    for path, model in models.items():
+        with atomic_output(path, args.force) as temporary:
+            temporary.write_bytes(model.SerializeToString())
+    if args.vector:
+        from export.vector import write_vector
+
+        write_vector(models[args.output], args.vector, args.force)
+    return list(models)
 
 
 if __name__ == "__main__":

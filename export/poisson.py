@@ -8,17 +8,15 @@ so near the peak of a machine that up to 1920x1080 the two are equally fast on t
 from string import Template
 
 import onnx
-import onnx.inliner
-import onnx.parser
 
 import ngpt
+from export.text import finish, parse
 from ngpt.errors import NgptError
 from ngpt.poisson import DEFAULT_ALPHA
 
 # Steps and names as in ngpt/poisson.py: the correction u = I - P solves (α² + ∂ᵀ∂) u = ∂ᵀ(G - ∂P). `Basis` is the
 # orthonormal DCT-II of n points, (n, n), and `eigenvalues` those of the one-dimensional ∂ᵀ∂ under Neumann boundaries.
 _GRAPH = Template("""
-<ir_version: 9, opset_import: ["": 18, "ngpt": 1]>
 l2 (float[1,3,height,width] primal, float[1,3,height,width] dx, float[1,3,height,width] dy)
     => (float[1,3,height,width] image)
 {
@@ -126,12 +124,5 @@ def l2_model(alpha: float = DEFAULT_ALPHA) -> onnx.ModelProto:
     """
     if not 0 < alpha < float("inf"):
         raise NgptError(f"alpha {alpha}: must be a positive number; the default is {DEFAULT_ALPHA}")
-    lines = [line for line in _GRAPH.substitute(alpha_squared=f"{alpha**2:.9e}").splitlines() if "#" not in line]
-    model = onnx.parser.parse_model("\n".join(lines))
-    # Plain operators only: not every runtime knows functions in a model.
-    model = onnx.inliner.inline_local_functions(model)
-    onnx.checker.check_model(model, full_check=True)
-    model.producer_name, model.producer_version = "ngpt", ngpt.__version__
-    metadata = {"version": ngpt.__version__, "method": "l2", "alpha": str(alpha), "gradient": "forward"}
-    onnx.helper.set_model_props(model, {f"ngpt.{key}": value for key, value in metadata.items()})
-    return model
+    model = parse(_GRAPH.substitute(alpha_squared=f"{alpha**2:.9e}"))
+    return finish(model, {"version": ngpt.__version__, "method": "l2", "alpha": str(alpha), "gradient": "forward"})

@@ -7,6 +7,7 @@ ngpt.write("out.exr", image, like=stack)
 
 __version__ = "0.1.0"
 
+from ngpt.denoiser import Denoiser
 from ngpt.errors import NgptError
 from ngpt.exr import read, read_image, write
 from ngpt.merging import merge
@@ -15,6 +16,7 @@ from ngpt.stack import GradientStack
 
 __all__ = [
     "METHODS",
+    "Denoiser",
     "GradientStack",
     "NgptError",
     "Result",

@@ -46,8 +46,11 @@ def repair(stack: GradientStack) -> Repaired:
     good = np.isfinite(primal).all(axis=-1) & np.isfinite(direct).all(axis=-1)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
-    image = primal - direct if good.all() else _from_neighbours(primal, direct, good)
-    direct = np.where(good[..., None], direct, 0)
+    # Copies only of what changes: layers of large images are large.
+    if good.all():
+        image = primal - direct if direct.any() else primal
+    else:
+        image, direct = _from_neighbours(primal, direct, good), np.where(good[..., None], direct, 0)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
     if "dx" not in stack or "dy" not in stack:
         return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features)
@@ -59,8 +62,11 @@ def repair(stack: GradientStack) -> Repaired:
         both &= np.isfinite(stack[name]).all(axis=-1)
         border = np.s_[:, -1] if axis == 1 else np.s_[-1]
         both[border] = True  # no difference there, so nothing to mistrust
-        gradients.append(np.where(both[..., None], stack[name], 0))
-        gradients[-1][border] = 0
+        layer = stack[name]
+        if not both.all() or layer[border].any():
+            layer = np.where(both[..., None], layer, 0)
+            layer[border] = 0
+        gradients.append(layer)
         trusted.append(both)
     lost = int(sum(np.sum(~t) for t in trusted))
     flags = (trusted[0], trusted[1]) if lost else None
@@ -83,7 +89,10 @@ def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray
     if not all(name in stack for name in names):
         return None
     pairs = zip(names, (known, *trusted), strict=True)
-    primal, dx, dy = (np.where(flags[..., None], stack[name], np.float32(np.nan)) for name, flags in pairs)
+    primal, dx, dy = (
+        stack[name] if flags.all() else np.where(flags[..., None], stack[name], np.float32(np.nan))
+        for name, flags in pairs
+    )
     return primal, dx, dy
 
 

@@ -12,6 +12,7 @@ from ngpt.exr import read, read_image, write
 from ngpt.files import check_output
 from ngpt.methods import METHODS, reconstruct
 from ngpt.metrics import compare
+from ngpt.runtime import MEMORY
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,7 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("-m", "--method", default="auto", choices=["auto", *METHODS], help=f"default: auto. {methods}")
     parser.add_argument("--alpha", type=alpha, help="weight of the primal image in l2 and l1: a number, or auto")
-    parser.add_argument("--weights", metavar="FILE", help="weights for ngpt and ngpt-fast instead of those shipped")
+    parser.add_argument("--weights", metavar="FILE", help="a network (.onnx, .safetensors) instead of the one shipped")
+    parser.add_argument(
+        "--device", help="where networks run: cpu (default), cuda, tensorrt, openvino, directml, coreml"
+    )
+    parser.add_argument(
+        "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
+    )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_layers(parser)
     add_force(parser)
@@ -37,7 +44,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for _, target in pairs:
         check_output(target, args.force)
     reference = read_image(args.ref) if args.ref else None
-    options = {name: value for name in ("alpha", "weights") if (value := getattr(args, name)) is not None}
+    options = {
+        name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
+    }
     reports = []
     for i, (source, target) in enumerate(pairs, 1):
         try:

@@ -1,0 +1,194 @@
+"""Speed of the networks in their runtimes, and of OIDN beside them: the table of docs/onnx-table.md.
+
+    python -m bench.onnx
+
+Per size, on synthetic stacks with features and variances, all in this process and in turn, warm:
+
+    ngpt-fast       as ngpt.reconstruct() runs it: repair, base (NumPy), network (ONNX Runtime)
+    repair, base    the first two alone
+    network         the network alone, its base given, in ONNX Runtime
+    float16         the same with half precision, which this provider computes in float32
+    graph alone     the network with its base made inside the graph, as a host without ngpt has it
+    torch, torch bf16   the network by PyTorch, in float32 and under autocast
+    oidn high, oidn fast   Open Image Denoise with albedo and normal, for what people use today
+
+Beside them, each in a process of its own: the largest memory, and the seconds from the command to the end of `ngpt
+denoise` for a stack of 64x64 pixels. Rows whose package is not installed are left out, and the results say so.
+"""
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from bench.common import measure, metadata, save, summary
+from bench.reconstruction import synthetic
+from ngpt.methods import METHODS, WEIGHTS, reconstruct
+from ngpt.repair import repair
+from ngpt.runtime import Network, planes
+from ngpt.stack import GradientStack
+
+SIZES = ("1280x720", "1920x1080")
+FAST = WEIGHTS / "ngpt-fast.onnx"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--sizes", nargs="*", default=SIZES)
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/onnx.json"))
+    args = parser.parse_args()
+    packages = ("onnxruntime", "torch", "mitsuba-oidn")
+    result = {"benchmark": "onnx", "repeats": args.repeats, "sizes": {}, "metadata": metadata(*packages)}
+    with tempfile.TemporaryDirectory() as folder:
+        half = half_precision(Path(folder))
+        for size in args.sizes:
+            width, height = map(int, size.split("x"))
+            result["sizes"][size] = bench_size(stack_of(width, height), half, args.repeats)
+            print(size, {name: round(row["median"], 3) for name, row in result["sizes"][size].items()}, flush=True)
+        result["start-up"] = start_up(Path(folder), args.repeats)
+        result["peak MiB"] = {size: peak(size) for size in args.sizes}
+        result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size if half else None}
+    save(args.output, result)
+    (args.docs / "onnx-table.md").write_text(table(result))
+    print(table(result))
+
+
+def stack_of(width: int, height: int) -> GradientStack:
+    (primal, dx, dy), (primal_var, dx_var, dy_var) = synthetic(width, height)
+    random = np.random.default_rng(1)
+    albedo = np.clip(primal, 0, 1)
+    normal = random.normal(size=primal.shape).astype(np.float32)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    variances = {"primal_var": primal_var, "dx_var": dx_var, "dy_var": dy_var}
+    return GradientStack.from_arrays(
+        primal=primal, dx=dx, dy=dy, albedo=albedo, normal=normal, depth=primal[..., :1], **variances
+    )
+
+
+def half_precision(folder: Path) -> Path | None:
+    try:
+        from export.network import network_model
+    except ModuleNotFoundError:
+        return None
+    path = folder / "half.onnx"
+    path.write_bytes(network_model(WEIGHTS / "ngpt-fast.safetensors", "ngpt-fast", "float16").SerializeToString())
+    return path
+
+
+def bench_size(stack: GradientStack, half: Path | None, repeats: int) -> dict:
+    data, network = repair(stack), Network(FAST)
+    layers = {"primal": data.image, "dx": data.dx, "dy": data.dy, **data.features}
+    layers |= dict(zip(("primal_var", "dx_var", "dy_var"), data.variances, strict=True))
+    base = METHODS["wcv"].run(data)
+    feed = {name: planes(layer)[None] for name, layer in layers.items()}
+    calls = {
+        "ngpt-fast": lambda: reconstruct(stack, "ngpt-fast"),
+        "repair": lambda: repair(stack),
+        "base": lambda: METHODS["wcv"].run(data),
+        "network": lambda: network.reconstruct(layers, base),
+        "graph alone": lambda: network.session.run(None, feed),
+    }
+    if half:
+        in_half = Network(half)
+        calls["float16"] = lambda: in_half.reconstruct(layers, base)
+    calls |= torch_calls(data) | oidn_calls(data)
+    return measure(calls, repeats)
+
+
+def torch_calls(data) -> dict:
+    try:
+        import torch
+    except ModuleNotFoundError:
+        return {}
+    from ngpt.network.data import layers_of
+    from ngpt.network.weights import load_weights
+
+    model, _ = load_weights(WEIGHTS / "ngpt-fast.safetensors")
+    layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
+
+    def run(half: bool) -> None:
+        with torch.inference_mode(), torch.autocast("cpu", torch.bfloat16, enabled=half):
+            model(layers)
+
+    return {"torch": lambda: run(False), "torch bf16": lambda: run(True)}
+
+
+def oidn_calls(data) -> dict:
+    try:
+        import mitsuba_oidn
+    except ModuleNotFoundError:
+        return {}
+    features = {name: np.ascontiguousarray(data.features[name]) for name in ("albedo", "normal")}
+
+    def run(quality) -> None:
+        np.array(mitsuba_oidn.denoise(data.image, **features, hdr=True, quality=quality))
+
+    return {
+        "oidn high": lambda: run(mitsuba_oidn.Quality.High),
+        "oidn fast": lambda: run(mitsuba_oidn.Quality.Fast),
+    }
+
+
+def start_up(folder: Path, repeats: int) -> dict:
+    """Seconds of wall clock of the whole command on a small stack."""
+    ngpt.write(folder / "small.exr", stack_of(64, 64))
+    command = [sys.executable, "-m", "ngpt", "denoise", str(folder / "small.exr"), "-m", "ngpt-fast", "--force"]
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        subprocess.run([*command, "-o", str(folder / "clean.exr")], check=True, capture_output=True)
+        seconds.append(time.perf_counter() - start)
+    return summary(seconds)
+
+
+def peak(size: str) -> float:
+    """MiB that ngpt-fast takes at most beside the stack, in a process of its own."""
+    code = f"""
+from bench.onnx import stack_of
+from ngpt.methods import reconstruct
+def mebibytes(field):
+    return int(dict(line.split(":") for line in open("/proc/self/status"))[field].split()[0]) / 1024
+stack = stack_of({size.replace("x", ", ")})
+reconstruct(stack_of(32, 32), "ngpt-fast")
+before = mebibytes("VmRSS")
+open("/proc/self/clear_refs", "w").write("5")
+reconstruct(stack, "ngpt-fast")
+print(mebibytes("VmHWM") - before)
+"""
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
+    return float(done.stdout)
+
+
+def table(result: dict) -> str:
+    sizes = result["sizes"]
+    lines = [f"| milliseconds | {' | '.join(sizes)} | per megapixel |", "|---|" + "--:|" * (len(sizes) + 1)]
+    width, height = map(int, list(sizes)[-1].split("x"))
+    for name in next(iter(sizes.values())):
+        cells = [
+            f"{1e3 * row[name]['median']:.0f} ({1e3 * row[name]['low']:.0f} .. {1e3 * row[name]['high']:.0f})"
+            for row in sizes.values()
+        ]
+        per = 1e9 * list(sizes.values())[-1][name]["median"] / (width * height)
+        lines.append(f"| {name} | {' | '.join(cells)} | {per:.0f} |")
+    memory = ", ".join(f"{value:.0f} MiB at {size}" for size, value in result["peak MiB"].items())
+    where = result["metadata"]
+    versions = ", ".join(f"{name} {number or 'absent'}" for name, number in where["versions"].items())
+    note = (
+        f"Medians (quartiles) of {result['repeats']}. `ngpt denoise` of 64x64 pixels, from the command to the end: "
+        f"{result['start-up']['median']:.2f} s. Memory of ngpt-fast beside the stack: {memory}. Files: "
+        f"{result['bytes']['float32']} bytes, float16 {result['bytes']['float16']}. {versions}; {where['threads']} "
+        f"threads of {where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.onnx`, which "
+        "explains the rows."
+    )
+    return "\n".join(lines) + f"\n\n{note}\n"
+
+
+if __name__ == "__main__":
+    main()

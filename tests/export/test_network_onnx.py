@@ -1,0 +1,251 @@
+"""Networks as ONNX: the same as in PyTorch, whole and in tiles, whatever goes in."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxscript")
+torch = pytest.importorskip("torch")
+
+# ruff: noqa: E402
+import onnx
+import onnxruntime
+from full_stack import full_layers
+
+from export.__main__ import main
+from export.network import network_model, overlap, statistics_model
+from export.vector import example_layers, quiet
+from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.weights import load_weights, save_weights
+from ngpt.stack import GradientStack
+
+FAST = WEIGHTS / "ngpt-fast.safetensors"
+ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
+CONFIGS = {
+    "with a base": ModelConfig("dense", (4, 6), (1, 1), (*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
+    "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
+    "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
+    "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),
+    "primal alone": ModelConfig("plain", (4, 4, 4, 4, 4), (), ("primal",)),
+}
+
+
+def session(model):
+    return onnxruntime.InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])
+
+
+@pytest.fixture(scope="module")
+def fast():
+    return session(onnx.load(WEIGHTS / "ngpt-fast.onnx"))
+
+
+@pytest.fixture(scope="module")
+def weights(tmp_path_factory):
+    """Files of untrained weights, none of which is zero."""
+    folder = tmp_path_factory.mktemp("weights")
+    torch.manual_seed(0)
+    for name, config in CONFIGS.items():
+        model = Reconstructor(config)
+        with torch.no_grad():
+            for parameter in model.parameters():
+                parameter += 0.1 * torch.randn_like(parameter)
+        save_weights(folder / f"{name}.safetensors", model, {})
+    return folder
+
+
+def noisy(height, width, scale=1.0, seed=0):
+    """All layers of a stack, (1, C, H, W)."""
+    layers = full_layers(height, width, scale, seed)
+    return {name: np.ascontiguousarray(layer.transpose(2, 0, 1)[None]) for name, layer in layers.items()}
+
+
+def in_torch(layers, path):
+    stack = GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+    return reconstruct(stack, "ngpt", weights=str(path)).image.transpose(2, 0, 1)[None]
+
+
+def run(session, layers, **more):
+    names = [i.name for i in session.get_inputs()]
+    return session.run(None, {name: layers[name] for name in names if name in layers} | more)[0]
+
+
+def assert_close(ours, theirs, tolerance=1e-4):
+    assert np.isfinite(ours).all()
+    # Relative to each value, and for the darkest to a hundredth of the largest.
+    assert (np.abs(ours - theirs) <= tolerance * (np.abs(theirs) + 1e-2 * np.abs(theirs).max())).all()
+
+
+@pytest.fixture(scope="module", params=list(CONFIGS))
+def pair(request, weights):
+    """A file of weights and its ONNX session."""
+    path = weights / f"{request.param}.safetensors"
+    return path, session(network_model(path, request.param))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (17, 16), (37, 53)])
+def test_the_same_as_in_torch(pair, size):
+    path, onnx_session = pair
+    layers = noisy(*size)
+    assert_close(run(onnx_session, layers), in_torch(layers, path))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
+def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
+    layers = noisy(*size)
+    assert_close(run(fast, layers), in_torch(layers, FAST))
+
+
+@pytest.mark.slow
+def test_the_same_on_a_large_odd_size(fast):
+    layers = noisy(727, 1283)
+    assert_close(run(fast, layers), in_torch(layers, FAST))
+
+
+def test_the_same_with_a_scene_that_has_unknown_variances_and_extreme_pixels(fast):
+    layers = noisy(40, 33)
+    layers["primal"][0, :, 10, 12] = 1e6
+    layers["primal_var"][0, :, 20:24, 8:12] = np.nan
+    layers["dx_var"][0, 1, 5, 5] = -1
+    layers["dy_var"][0, 2, 30, 9] = np.inf
+    assert_close(run(fast, layers), in_torch(layers, FAST), 1e-3)
+
+
+def test_a_base_may_be_given(fast):
+    layers = noisy(32, 41)
+    theirs = in_torch(layers, FAST)
+    stack = GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+    base = reconstruct(stack, "wcv").image.transpose(2, 0, 1)[None]
+    assert_close(run(fast, layers, base=np.ascontiguousarray(base)), theirs)
+    assert np.abs(run(fast, layers, base=2 * base) - theirs).max() > 0.1 * theirs.mean(), "the base is not used"
+
+
+@pytest.mark.parametrize("value", [0.0, 1e-12, 65504.0, 1e12])
+def test_extremes(fast, value):
+    ours = run(fast, noisy(19, 24, value))
+    assert np.isfinite(ours).all()
+    # In proportion to what goes in: exactly, since powers of two are.
+    layers = noisy(19, 24, 1.0)
+    for k in (2.0**-30, 2.0**30):
+        scaled = noisy(19, 24, k)
+        assert_close(run(fast, scaled) / np.float32(k), run(fast, layers), 1e-3)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("name", ["primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"])
+def test_values_that_are_not_finite_stay_where_they_are(fast, name, bad):
+    layers = noisy(160, 24)
+    whole = run(fast, layers)
+    layers[name][0, 0, 3, 4] = bad
+    harmed = run(fast, layers)
+    assert np.isfinite(harmed).all()
+    far = np.abs(harmed - whole)[0, :, 130:]
+    assert far.max() <= 0.02 * whole.mean()
+
+
+def test_the_same_input_gives_the_same_bits(fast):
+    layers = noisy(45, 70)
+    assert np.array_equal(run(fast, layers), run(fast, layers))
+
+
+@pytest.mark.parametrize("name", ["with a base", "as published"])
+def test_tiles_of_a_host_make_the_whole(weights, name):
+    """What CONTRACT.md tells a host to do, literally."""
+    path = weights / f"{name}.safetensors"
+    model = network_model(path, name)
+    tell = {item.key: item.value for item in model.metadata_props}
+    alignment, margin = int(tell["ngpt.alignment"]), int(tell["ngpt.overlap"])
+    onnx_session, layers = session(model), noisy(50, 290)
+    statistics = run(session(statistics_model(path, name)), layers)
+    whole, tiled = run(onnx_session, layers), np.zeros((1, 3, 50, 290), np.float32)
+    step = 20 * alignment
+    for x in range(0, 290, step):
+        begin = max(x - margin, 0)
+        part = {key: layer[..., begin : x + step + margin].copy() for key, layer in layers.items()}
+        image = run(onnx_session, part, statistics=statistics)
+        tiled[..., x : x + step] = image[..., x - begin : x - begin + step]
+    assert_close(tiled, whole, 2e-5)
+    wrong = run(onnx_session, {key: layer[..., :100].copy() for key, layer in layers.items()})
+    assert np.abs(wrong[..., :40] - whole[..., :40]).max() > 1e-4 * whole.mean(), "statistics would not matter"
+
+
+def test_half_precision_is_within_percents(fast):
+    half = network_model(FAST, "half", "float16")
+    assert {item.key: item.value for item in half.metadata_props}["ngpt.precision"] == "float16"
+    layers = noisy(40, 56)
+    full_image, half_image = run(fast, layers), run(session(half), layers)
+    error = np.sqrt(np.mean((half_image - full_image) ** 2) / np.mean(full_image**2))
+    assert 0 < error < 0.01
+    assert half.ByteSize() < 0.6 * (WEIGHTS / "ngpt-fast.onnx").stat().st_size
+
+
+def test_several_tiles_in_one_run(fast):
+    a, b = noisy(30, 20, seed=1), noisy(30, 20, seed=2)
+    statistics = np.array([0.1, 5, 0, 8, 0.05], np.float32)
+    both = {name: np.concatenate([a[name], b[name]]) for name in a}
+    together = run(fast, both, statistics=statistics)
+    assert_close(together[:1], run(fast, a, statistics=statistics), 1e-5)
+
+
+def test_the_overlap_is_what_the_network_sees(weights):
+    """Measured: what lies beyond it does not matter, and half of it would be too little."""
+    path = weights / "as published.safetensors"
+    model = network_model(path, "m")
+    onnx_session, layers = session(model), noisy(9, 160)
+    statistics = np.array([0.1, 5, 0, 8, 0.05], np.float32)
+    before = run(onnx_session, layers, statistics=statistics)
+    layers["albedo"][..., 80:] += 1
+    changed = np.abs(run(onnx_session, layers, statistics=statistics) - before).max(axis=(0, 1, 2)) > 0
+    reach = 80 - int(np.argmax(changed))
+    margin = int({item.key: item.value for item in model.metadata_props}["ngpt.overlap"])
+    assert margin // 2 < reach <= margin
+
+
+def test_overlap_includes_the_sweeps_of_the_base(weights):
+    model, _ = load_weights(FAST)
+    assert overlap(model) >= overlap(model, given_base=True) + 50
+    assert overlap(model) % model.alignment == 0
+
+
+def test_metadata_tell_all_and_nothing_of_this_machine():
+    file = WEIGHTS / "ngpt-fast.onnx"
+    model = onnx.load(file)
+    tell = {item.key: item.value for item in model.metadata_props}
+    assert tell["ngpt.inputs"].split(", ")[:3] == ["primal", "dx", "dy"]
+    assert json.loads(tell["ngpt.training"])["step"] > 0
+    assert str(Path.cwd()).encode() not in file.read_bytes() and b"site-packages" not in file.read_bytes()
+    assert not any(initializer.external_data for initializer in model.graph.initializer)
+
+
+def test_the_vector_is_that_of_the_shipped_network(fast):
+    folder = Path(__file__).parents[2] / "export/vector"
+    listing = json.loads((folder / "vector.json").read_text())
+    arrays = {}
+    for name, entry in listing.items():
+        data = (folder / f"{name}.f32").read_bytes()
+        assert hashlib.sha256(data).hexdigest() == entry["sha256"]
+        arrays[name] = np.frombuffer(data, "<f4").reshape(entry["shape"])
+    assert all(np.allclose(arrays[name], layer) for name, layer in example_layers().items())
+    assert_close(run(fast, arrays), arrays["image"])
+
+
+def test_command(tmp_path, weights, capsys):
+    output, path = tmp_path / "m.onnx", weights / "as published.safetensors"
+    command = ["--weights", str(path), "-o", str(output), "--statistics", str(tmp_path / "s.onnx")]
+    assert main([*command, "--vector", str(tmp_path / "vector")]) == 0
+    listing = json.loads((tmp_path / "vector/vector.json").read_text())
+    assert set(listing) == {*ALL, "image"}
+    assert main(command) == 2 and "m.onnx" in capsys.readouterr().err
+    assert main(["--weights", str(tmp_path / "none.safetensors"), "-o", str(tmp_path / "n.onnx")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "n.onnx").exists()
+
+
+def test_a_base_without_a_graph_is_refused(tmp_path, capsys):
+    config = ModelConfig("plain", (4, 4), (), ("primal", "dx", "dy", "base"), "l2")
+    save_weights(tmp_path / "w.safetensors", Reconstructor(config), {})
+    assert main(["--weights", str(tmp_path / "w.safetensors"), "-o", str(tmp_path / "m.onnx")]) == 2
+    assert "'l2'" in capsys.readouterr().err

@@ -1,0 +1,149 @@
+"""Networks in ONNX Runtime: tiles, memory, devices, and what is wrong with files."""
+
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from full_stack import full_layers, full_stack
+
+from ngpt.errors import NgptError
+from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.runtime import Cancelled, Network
+from ngpt.stack import GradientStack
+
+FAST = WEIGHTS / "ngpt-fast.onnx"
+
+
+@pytest.fixture(scope="module")
+def network():
+    return Network(FAST)
+
+
+@pytest.fixture(scope="module")
+def image():
+    """Layers, with the base, of an image that takes many tiles, and the whole of it."""
+    layers = full_layers(197, 303)
+    layers["base"] = layers["primal"] * 0.9
+    return layers, Network(FAST).reconstruct(layers)
+
+
+@pytest.mark.parametrize(("memory", "batch"), [(50, 1), (30, 1), (22, 1), (60, 2), (90, 3)])
+def test_tiles_do_not_show(network, image, memory, batch):
+    layers, whole = image
+    tiles, size = network.plan(197, 303, memory, batch)
+    assert len(tiles) > 1 and size[0] * size[1] * network.bytes * batch <= memory * 2**20
+    tiled = network.reconstruct(layers, memory=memory, batch=batch)
+    assert np.abs(tiled - whole).max() <= 1e-5 * whole.max()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 900), (1080, 1920), (333, 1001), (4320, 8192)])
+@pytest.mark.parametrize("memory", [25, 300, 2048])
+def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
+    tiles, (rows, columns) = network.plan(*size, memory)
+    count = np.zeros(size, np.uint8)
+    for y, x, top, left in tiles:
+        count[y, x] += 1
+        for inner, begin, extent, length in ((y, top, rows, size[0]), (x, left, columns, size[1])):
+            assert begin % network.alignment == 0 and begin >= 0 and begin + extent <= length
+            assert begin == 0 or inner.start - begin >= network.overlap
+            assert begin + extent == length or begin + extent - inner.stop >= network.overlap
+    assert (count == 1).all()
+
+
+def test_a_file_that_is_on_disk_twice_is_loaded_twice_and_once_otherwise(tmp_path):
+    assert Network(FAST).session is Network(FAST).session
+    shutil.copy(FAST, tmp_path / "n.onnx")
+    assert Network(tmp_path / "n.onnx").session is not Network(FAST).session
+
+
+def test_progress_and_stop(network, image):
+    layers, _ = image
+    calls = []
+    network.reconstruct(layers, memory=30, progress=lambda *call: calls.append(call))
+    total = calls[0][1]
+    assert total > 3 and calls == [(i, total) for i in range(total + 1)]
+    seen = []
+    with pytest.raises(Cancelled, match=f"2 of {total}"):
+        network.reconstruct(layers, memory=30, progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2)
+
+
+def test_memory_that_does_not_hold_a_tile_is_refused_with_what_would(network, image):
+    with pytest.raises(NgptError, match=r"smallest tile takes (\d+) MiB, and 3 MiB are allowed") as caught:
+        network.plan(197, 303, 3)
+    needed = int(str(caught.value).split("takes ")[1].split()[0])
+    assert network.plan(197, 303, needed)[0]
+
+
+@pytest.mark.parametrize("bound", [100, 400])
+def test_memory_stays_within_the_bound(bound):
+    """In a process of its own, by the largest size it ever had."""
+    code = f"""
+import sys
+sys.path.insert(0, "tests")
+from full_stack import full_layers
+from ngpt.runtime import Network
+layers = full_layers(700, 900)
+layers["base"] = layers["primal"]
+network = Network({str(FAST)!r})
+network.reconstruct({{name: layer[:8, :8] for name, layer in layers.items()}})
+def megabytes(field):
+    return int(dict(line.split(":") for line in open("/proc/self/status"))[field].split()[0]) / 1024
+before = megabytes("VmRSS")
+open("/proc/self/clear_refs", "w").write("5")  # forgets the peak so far
+network.reconstruct(layers, memory={bound})
+print(megabytes("VmHWM") - before)
+"""
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+    result_image = 700 * 900 * 3 * 4 / 2**20
+    assert float(result.stdout) <= bound + result_image
+
+
+@pytest.mark.parametrize(
+    ("device", "message"),
+    [("tensorrt", "device 'tensorrt': this build of ONNX Runtime has only: cpu"), ("abacus", "device 'abacus' is unk")],
+)
+def test_devices_that_are_not_there_are_named_not_replaced(device, message):
+    with pytest.raises(NgptError, match=message):
+        Network(FAST, device)
+
+
+def test_bad_files(tmp_path, image):
+    with pytest.raises(NgptError, match="no such file"):
+        Network(tmp_path / "none.onnx")
+    damaged = tmp_path / "damaged.onnx"
+    damaged.write_bytes(FAST.read_bytes()[:5000])
+    with pytest.raises(NgptError, match=r"damaged\.onnx: ONNX Runtime cannot load it"):
+        Network(damaged)
+    with pytest.raises(NgptError, match=r"statistics\.onnx: lacks the metadata"):
+        Network(WEIGHTS / "ngpt-fast.statistics.onnx")
+    shutil.copy(FAST, tmp_path / "alone.onnx")
+    with pytest.raises(NgptError, match=r"alone\.statistics\.onnx: no such file"):
+        Network(tmp_path / "alone.onnx").reconstruct(image[0], memory=30)
+
+
+def test_missing_layers_are_named(network):
+    layers = full_layers(9, 9)
+    del layers["albedo"], layers["dx_var"]
+    with pytest.raises(NgptError, match="needs layers albedo, dx_var, base"):
+        network.reconstruct(layers)
+
+
+def test_the_method_takes_files_of_both_kinds():
+    pytest.importorskip("torch")
+    stack = full_stack(20, 30)
+    images = [
+        reconstruct(stack, "ngpt-fast", weights=str(WEIGHTS / f"ngpt-fast.{kind}")).image
+        for kind in ("onnx", "safetensors")
+    ]
+    assert np.allclose(*images, rtol=1e-4, atol=1e-5)
+
+
+def test_auto_takes_the_network_where_it_was_trained():
+    stack = full_stack(20, 30)
+    assert reconstruct(stack).method == "ngpt-fast"
+    for spp, method in ((64, "ngpt-fast"), (65, "wcv"), (2048, "wcv")):
+        rendered = GradientStack(stack.layers, attributes={"ngpt:spp": spp})
+        assert reconstruct(rendered, memory=100).method == method
