@@ -270,7 +270,10 @@ def main() -> int:
         print("usage: python -m data_gen.dataset.scenes SEED FOLDER", file=sys.stderr)
         return 2
     folder = Path(sys.argv[2])
-    folder.mkdir(parents=True)
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        print(f"{folder}: exists and is not an empty folder; give a new one", file=sys.stderr)
+        return 2
+    folder.mkdir(parents=True, exist_ok=True)
     print(make_scene(int(sys.argv[1]), folder))
     return 0
 

@@ -120,6 +120,14 @@ def test_a_scene_comes_from_its_seed(tmp_path):
     assert a["scene.xml"] != c["scene.xml"]
 
 
+def test_a_scene_can_be_saved_by_its_seed(tmp_path, monkeypatch, capsys):
+    from data_gen.dataset import scenes
+
+    monkeypatch.setattr(sys, "argv", ["scenes", "5", str(tmp_path / "new")])
+    assert scenes.main() == 0 and (tmp_path / "new/scene.xml").is_file()
+    assert scenes.main() == 2 and "exists and is not an empty folder" in capsys.readouterr().err
+
+
 def test_sample_counts_are_stratified():
     config = Config(scenes=1, inputs=5, spp=(2, 1023))
     counts = np.array([crops.sample_counts(np.random.default_rng(i), config) for i in range(400)])
