@@ -1,7 +1,9 @@
 """Cameras in the free space of any scene, found by casting rays.
 
 The scene's own camera stands in free space. From there a walk goes along random rays, each time part of the way to what
-they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected.
+they hit, so it never enters an object and stays where one can get to. Views that see nothing are rejected. Where hardly
+any view sees something, as of an object in the middle of nowhere, cameras stand between the scene's own and what that
+sees, and look at something else it sees.
 """
 
 from __future__ import annotations
@@ -74,6 +76,14 @@ class Surroundings:
             raise NgptError("the scene's camera sees nothing in any direction; move it among the objects")
         # Not the bounding box, which a ground plane makes as large as it likes.
         self.scale = float(np.median(hits))
+        self.seen = self.points(scene.sensors()[0])
+
+    def points(self, sensor: mi.Sensor) -> np.ndarray:
+        """(n, 3) what the sensor sees, through a grid of its film; where that is nothing, n is 0."""
+        origins, towards = grid_rays(sensor)
+        distance = self.cast(origins, towards)[0]
+        hit = np.isfinite(distance)
+        return origins[hit] + distance[hit, None] * towards[hit]
 
     def cast(self, origins: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing."""
@@ -102,6 +112,15 @@ def directions(rng: np.random.Generator, count: int) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=1, keepdims=True)
 
 
+def grid_rays(sensor: mi.Sensor) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and directions (GRID², 3) of rays through the film, row by row."""
+    n = GRID
+    grid = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5) / n
+    ray, _ = sensor.sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
+    towards = np.array(ray.d).T
+    return np.broadcast_to(np.array(ray.o).T, towards.shape), towards
+
+
 def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
     """A random view that shows something, the more it shows the more likely.
 
@@ -110,8 +129,10 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
     when no view can be found.
     """
     views, details = [], []
-    for _ in range(ATTEMPTS):
-        view = random_view(around, rng, size, roll, lens)
+    for attempt in range(2 * ATTEMPTS):
+        if attempt == ATTEMPTS and views:
+            break
+        view = random_view(around, rng, size, roll, lens, aimed=attempt >= ATTEMPTS and len(around.seen) > 0)
         detail = what_shows(around, view)
         if detail > 0:
             views.append(view)
@@ -120,16 +141,24 @@ def find_view(around: Surroundings, rng: np.random.Generator, size: int, roll: f
             break
     if not views:
         raise NgptError(
-            f"no view that shows anything in {ATTEMPTS} attempts; give the scene a camera box in the config"
+            f"no view that shows anything in {2 * ATTEMPTS} attempts; give the scene a camera box in the config"
         )
     weights = np.array(details)
     return with_one_kernel(around, views[int(rng.choice(len(views), p=weights / weights.sum()))])
 
 
-def random_view(around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float) -> View:
-    origin = around.position(rng)
-    towards = directions(rng, 1)[0]
-    towards = towards - 0.7 * (towards @ around.up) * around.up
+def random_view(
+    around: Surroundings, rng: np.random.Generator, size: int, roll: float, lens: float, aimed: bool = False
+) -> View:
+    """Any view, or one ``aimed`` at what the scene's own camera sees."""
+    if aimed:
+        before, target = around.seen[rng.integers(len(around.seen), size=2)]
+        origin = around.start + rng.uniform(0, 0.6) * (before - around.start)
+        towards = target - origin
+    else:
+        origin = around.position(rng)
+        towards = directions(rng, 1)[0]
+        towards = towards - 0.7 * (towards @ around.up) * around.up
     towards /= np.linalg.norm(towards)
     distance = float(around.cast(origin[None], towards[None])[0][0])
     focus = distance if np.isfinite(distance) else around.scale
@@ -174,10 +203,7 @@ def what_shows(around: Surroundings, view: View) -> float:
     """
     view.apply(around.scene)
     n = GRID
-    grid = (np.stack(np.meshgrid(np.arange(n), np.arange(n)), axis=-1).reshape(-1, 2) + 0.5) / n
-    ray, _ = around.scene.sensors()[0].sample_ray(0.0, 0.5, mi.Point2f(grid.T), mi.Point2f(0.5))
-    towards = np.array(ray.d).T
-    distance, normal, shape = around.cast(np.broadcast_to(np.array(ray.o).T, towards.shape), towards)
+    distance, normal, shape = around.cast(*grid_rays(around.scene.sensors()[0]))
     hit = np.isfinite(distance)
     if hit.mean() < 0.35 or np.quantile(distance[hit], 0.1) < 0.06 * around.scale:
         return 0.0

@@ -152,6 +152,20 @@ def test_an_interrupt_inside_a_loop_of_drjit_is_no_failure_of_a_crop(renderer):
 
 
 @pytest.mark.slow
+def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
+    import mitsuba as mi
+
+    from data_gen.dataset.cameras import Surroundings, find_view, random_view, what_shows
+
+    pose = mi.ScalarTransform4f().look_at([0, 0, -20], [0, 0, 0], [0, 1, 0])
+    cube = {"type": "cube", "to_world": mi.ScalarTransform4f().rotate([1, 1, 0], 40).scale(0.7)}
+    scene = mi.load_dict({"type": "scene", "camera": {"type": "perspective", "fov": 10, "to_world": pose}, "c": cube})
+    around, rng = Surroundings(scene), np.random.default_rng(4)
+    blind = [what_shows(around, random_view(around, rng, 64, 20, 0.005)) for _ in range(40)]
+    assert np.mean(blind) < 0.02, "the walk finds it by itself"
+    assert what_shows(around, find_view(around, rng, 64, 20, 0.005)) > 0
+
+
 def test_views_of_a_scene_share_their_kernels(renderer):
     """Where two factors of the projection were equal to the last bit, everything was compiled once more."""
     import drjit as dr
