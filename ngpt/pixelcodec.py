@@ -1,9 +1,9 @@
 """Pictures of a report: scene-linear numbers in few bytes, each off by no more than a stated share.
 
 A value v, exposed so that middle grey is near 0.18, becomes the whole number nearest
-sgn(v) · steps · log2(1 + |v| / TOE): half a step at most is lost, see
-:func:`worst_error`. What follows loses nothing: the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each row is predicted from its
-neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
+sgn(v) · steps · log2(1 + |v| / TOE): half a step at most is lost, see :func:`worst_error`. What
+follows loses nothing: the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each
+row is predicted from its neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
 arithmetic is modulo 2^16. ``report.html`` holds the decoder.
 """
 
@@ -42,7 +42,8 @@ def values(code: np.ndarray, steps: int) -> np.ndarray:
 
 def encode(image: np.ndarray, steps: int) -> bytes:
     """(H, W, 3) exposed floats -> deflated bytes: the predictor of each row of Y, Cg, Co (H each; 0 median, 1 mean),
-    then the low bytes of all residuals in zigzag order (0, -1, 1, -2, ...), then the high bytes."""
+    then all residuals in zigzag order (0, -1, 1, -2, ...), two in a byte, the first one high, where 15 says that the
+    number follows; then the low bytes of those numbers, then their high bytes."""
     red, green, blue = np.moveaxis(codes(image, steps), 2, 0)
     orange = red - blue  # int16 wraps
     middle = blue + (orange >> 1)
@@ -54,9 +55,12 @@ def encode(image: np.ndarray, steps: int) -> bytes:
         residuals.append(np.take_along_axis(candidates, rule[None, :, None], axis=0)[0])
         rules.append(rule.astype(np.uint8))
     folded = np.stack(residuals)
-    folded = ((folded << 1) ^ (folded >> 15)).view(np.uint16)
+    folded = ((folded << 1) ^ (folded >> 15)).view(np.uint16).ravel()
+    nibbles = np.minimum(np.pad(folded, (0, folded.size % 2)), 15).astype(np.uint8)
+    large = folded[folded >= 15]
     packer = zlib.compressobj(6, zlib.DEFLATED, 15, 9, zlib.Z_FILTERED)
-    body = b"".join(part.astype(np.uint8).tobytes() for part in (np.stack(rules), folded & 255, folded >> 8))
+    parts = (np.stack(rules), nibbles[0::2] << 4 | nibbles[1::2], large & 255, large >> 8)
+    body = b"".join(part.astype(np.uint8).tobytes() for part in parts)
     return packer.compress(body) + packer.flush()
 
 

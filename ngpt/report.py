@@ -60,7 +60,7 @@ class Scene:
 
 @dataclass
 class Overview:
-    """What comes before the scenes, all optional."""
+    """What comes after the scenes, all optional."""
 
     tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the first is the head
     plots: dict[str, str] = field(default_factory=dict)  # title -> SVG document
@@ -93,8 +93,8 @@ def write_report(
         for scene in scenes
     ]
     sections = [_section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
-    before = _overview(overview or Overview())
-    taken = len(before) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
+    after = _overview(overview or Overview())
+    taken = len(after) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
     pixels, steps = _pixels(scenes, exposures, 0.95 * 0.75 * (PAGE_LIMIT - taken))  # base64 adds a third
     facts = [_facts(*each) for each in zip(scenes, exposures, steps, strict=True)]
     table = base64.b64encode(display.heat_table().tobytes()).decode()
@@ -110,7 +110,7 @@ def write_report(
     text = _filled(
         TITLE=escape(title),
         COMMAND=escape(command),
-        OVERVIEW=before,
+        OVERVIEW=after,
         SCENES="\n".join(sections),
         FOOTER=notes,
         # '<' as an escape: a name that contains '</script>' must stay a name.
@@ -225,7 +225,7 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 def _section(number: int, scene: Scene, stops: float) -> str:
     first = next(iter(scene.entries[0].metrics), "")
     notes = {
-        entry.name: _note(first, _middle(entry.metrics[first])) if first in entry.metrics else ""
+        entry.name: _note(first, median(entry.metrics[first])) if first in entry.metrics else ""
         for entry in scene.entries
     }
     pictures = [
@@ -276,7 +276,7 @@ def _table(scene: Scene) -> str:
         cells = []
         for metric in metrics:
             values = entry.metrics.get(metric, math.nan)
-            value, primal = _middle(values), _middle(baseline.get(metric, math.nan))
+            value, primal = median(values), median(baseline.get(metric, math.nan))
             compared = "" if entry.name == BASELINE else _compared(metric, value, primal)
             mark = ' class="best"' if best[metric] == row else ""
             cells.append(f"<td{mark}><span>{_number(value)}</span>{_spread(values)}<small>{compared}</small></td>")
@@ -291,7 +291,7 @@ def _table(scene: Scene) -> str:
     )
 
 
-def _middle(values: float | Sequence[float]) -> float:
+def median(values: float | Sequence[float]) -> float:
     """The median over seeds; NaN if one of them is not finite, since that seed failed."""
     values = [values] if isinstance(values, int | float | np.number) else list(values)
     return statistics.median(values) if values and all(map(math.isfinite, values)) else math.nan
@@ -333,7 +333,7 @@ def _rising(metric: str) -> bool:
 
 def _best(scene: Scene, metric: str) -> int | None:
     """The index of the entry with the best finite value, or None."""
-    values = [(_middle(entry.metrics.get(metric, math.nan)), row) for row, entry in enumerate(scene.entries)]
+    values = [(median(entry.metrics.get(metric, math.nan)), row) for row, entry in enumerate(scene.entries)]
     values = [(-value if _rising(metric) else value, row) for value, row in values if math.isfinite(value)]
     return min(values)[1] if values else None
 

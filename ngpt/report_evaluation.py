@@ -3,6 +3,7 @@
 import json
 import math
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 from ngpt.errors import NgptError
@@ -60,7 +61,7 @@ def _results(folder: Path) -> dict:
 
 def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
     """The sample counts whose pictures fit into ROOM, at least one; high counts are left out first: they look alike."""
-    taken, shown = 0, []
+    taken, shown = 0, list[int]()
     for spp in counts:
         drawn = {(cell["scene"], cell["method"]) for cell in cells if cell["spp"] == spp}
         names = [name for name, _ in drawn] + list({name for name, _ in drawn})  # a reference each
@@ -82,7 +83,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
             absent.append(f"{method} ({why})")
             continue
         seconds = _row(results, name, spp, method)["seconds"]["total"]
-        metrics = {}
+        metrics: dict[str, float | Sequence[float]] = {}
         for metric in results["metrics"]:
             values = [_value(cell["metrics"].get(metric)) for cell in mine if not cell["absent"]]
             metrics[metric] = values[0] if len(values) == 1 else values
@@ -95,7 +96,7 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     facts = [
         f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of gradients; times are render and method"
     ]
-    facts += [f"reference {reference['spp']} spp"] if image is not None else ["no reference"]
+    facts += [f"reference {reference['spp']:g} spp"] if image is not None else ["no reference"]
     facts += ["without " + ", ".join(absent)] if absent else []
     return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries)
 
