@@ -1,9 +1,9 @@
 """Pictures of a report: scene-linear numbers in few bytes, each off by no more than a stated share.
 
 A value v, exposed so that middle grey is near 0.18, becomes the whole number nearest
-sgn(v) · steps · log2(1 + |v| / TOE): half a step at most is lost, see :func:`worst_error`. What
-follows loses nothing: the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each
-row is predicted from its neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
+sgn(v) · steps · log2(1 + |v| / TOE): half a step at most is lost, see :func:`worst_error`. What follows loses nothing:
+the three numbers of a pixel are decorrelated by lifting (YCoCg-R, Malvar and Sullivan 2003), each row is predicted from
+its neighbours (the median of LOCO-I, or the mean of four where noise prevails), and the residuals are deflated. All
 arithmetic is modulo 2^16. ``report.html`` holds the decoder.
 """
 

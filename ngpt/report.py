@@ -95,7 +95,7 @@ def write_report(
     sections = [_section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
     after = _overview(overview or Overview())
     taken = len(after) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
-    pixels, steps = _pixels(scenes, exposures, 0.95 * 0.75 * (PAGE_LIMIT - taken))  # base64 adds a third
+    pixels, steps = _pixels(scenes, exposures, 0.99 * 0.75 * (PAGE_LIMIT - taken))  # base64 adds a third
     facts = [_facts(*each) for each in zip(scenes, exposures, steps, strict=True)]
     table = base64.b64encode(display.heat_table().tobytes()).decode()
     page = {
