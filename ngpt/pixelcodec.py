@@ -77,11 +77,11 @@ def _guesses(plane: np.ndarray) -> list[np.ndarray]:
     return [median.astype(np.int16), mean.astype(np.int16)]
 
 
-def fitting_steps(images: list[np.ndarray], weights: list[float], room: float) -> list[int]:
+def fitting_steps(images: list[np.ndarray], room: float) -> list[int]:
     """Steps per stop for each of the exposed ``images`` such that all of them, encoded, take about ``room`` bytes.
 
-    Whatever takes most room for its weight is made coarser first: that is noise, which hides the loss best. Sizes are
-    estimated from an eighth of the rows. Beyond the coarsest steps nothing gives way, and the room is exceeded.
+    Whatever takes most room is made coarser first: that is noise, which hides the loss best. Sizes are estimated from
+    an eighth of the rows. Beyond the coarsest steps nothing gives way, and the room is exceeded.
     """
     places = [0] * len(images)
     sizes = [_estimate(image, LADDER[0]) for image in images]
@@ -89,7 +89,7 @@ def fitting_steps(images: list[np.ndarray], weights: list[float], room: float) -
         open_ones = [i for i, place in enumerate(places) if place + 1 < len(LADDER)]
         if not open_ones:
             break
-        worst = max(open_ones, key=lambda i: sizes[i] / weights[i])
+        worst = max(open_ones, key=lambda i: sizes[i])
         places[worst] += 1
         sizes[worst] = _estimate(images[worst], LADDER[places[worst]])
     return [LADDER[place] for place in places]

@@ -183,9 +183,7 @@ def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[l
         [image.astype(np.float64) * 2.0 ** round(stops) for _, image in _pictures(scene)]
         for scene, stops in zip(scenes, exposures, strict=True)
     ]
-    # Every map of a scene is made from its reference, so that gets twice the room.
-    weights = [2.0 if name == REFERENCE else 1.0 for scene in scenes for name, _ in _pictures(scene)]
-    chosen = iter(pixelcodec.fitting_steps([image for images in exposed for image in images], weights, room))
+    chosen = iter(pixelcodec.fitting_steps([image for images in exposed for image in images], room))
     steps = [[next(chosen) for _ in images] for images in exposed]
     elements = []
     for number, images in enumerate(exposed):

@@ -54,9 +54,7 @@ def test_noise_gives_way_before_what_is_smooth():
     rng = np.random.default_rng(0)
     images = [np.ones((64, 64, 3)), rng.gamma(1.0, 1.0, (64, 64, 3))]
     full = sum(len(pixelcodec.encode(image, pixelcodec.LADDER[0])) for image in images)
-    assert pixelcodec.fitting_steps(images, [1.0, 1.0], full) == [256, 256]
-    smooth, noisy = pixelcodec.fitting_steps(images, [1.0, 1.0], 0.6 * full)
+    assert pixelcodec.fitting_steps(images, full) == [256, 256]
+    smooth, noisy = pixelcodec.fitting_steps(images, 0.6 * full)
     assert smooth == 256 and noisy < 64
-    first, second = pixelcodec.fitting_steps([images[1]] * 2, [1.0, 2.0], 1.2 * full)
-    assert first < second
-    assert pixelcodec.fitting_steps(images, [1.0, 1.0], 0.0) == [pixelcodec.LADDER[-1]] * 2
+    assert pixelcodec.fitting_steps(images, 0.0) == [pixelcodec.LADDER[-1]] * 2
