@@ -90,12 +90,17 @@ def signed_map(gradient: np.ndarray) -> np.ndarray:
     scale = np.percentile(magnitude, 99.0) if magnitude.size else 0.0
     if scale == 0.0:  # a layer that is zero nearly everywhere still has its peak
         scale = magnitude.max(initial=0.0) or 1.0
-    return coloured(0.5 + 0.5 * value / scale, colour_table(_DIVERGING, 255))  # odd: zero has an entry of its own
+    return coloured(0.5 + 0.5 * value / scale, sign_table())
 
 
 def heat_table() -> np.ndarray:
     """(256, 3) uint8 sRGB from black over red to pale yellow."""
     return colour_table(_INFERNO, 256)
+
+
+def sign_table() -> np.ndarray:
+    """(255, 3) uint8 sRGB from blue over grey to orange; odd, so that zero has an entry of its own."""
+    return colour_table(_DIVERGING, 255)
 
 
 def colour_table(anchors: tuple[str, ...], size: int) -> np.ndarray:

@@ -1,7 +1,8 @@
 """One HTML file that shows every method on every scene: for judging images, sending to others, keeping.
 
-The page needs no network and no other file. Pictures travel as half floats, so the reader can change the exposure and
-see the error of what was measured, not of a screenshot. ``report.html`` holds the markup, the style and the script;
+The page needs no network and no other file. Pictures travel as scene-linear numbers (:mod:`ngpt.pixelcodec`), so the
+reader can change the exposure and see the error of what was measured, not of a screenshot; what their storage costs is
+stated beside them. ``report.html`` holds the markup, the style and the script;
 this file fills it. Without JavaScript the tables and the thumbnails remain.
 """
 
@@ -11,7 +12,8 @@ import json
 import math
 import os
 import re
-import zlib
+import statistics
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files as package_files
@@ -19,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt import display
+from ngpt import display, pixelcodec
 from ngpt.errors import NgptError
 from ngpt.files import atomic_output
 from ngpt.png import encode_png
@@ -27,9 +29,9 @@ from ngpt.png import encode_png
 REFERENCE = "reference"  # the name of Scene.reference among the pictures
 BASELINE = "primal"  # the method the table compares the others to
 HIGHER_IS_BETTER = {"psnr", "ssim", "ms-ssim"}  # compared in lower case; every other metric is an error
-THUMBNAIL_WIDTH = 320
+THUMBNAIL_WIDTH = 240
 NOTHING = "&ndash;"
-HALF_MAX = 65504.0
+PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
 
 
 @dataclass
@@ -39,7 +41,8 @@ class Entry:
     name: str  #                  'primal', 'l2', ...: unique in its scene
     image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
     seconds: float | None = None  # reconstruction time
-    metrics: dict[str, float] = field(default_factory=dict)  # e.g. {'relMSE': 0.012}
+    # e.g. {'relMSE': 0.012}, or one value per seed, of which the table shows the median and the range
+    metrics: dict[str, float | Sequence[float]] = field(default_factory=dict)
 
 
 @dataclass
@@ -55,6 +58,15 @@ class Scene:
     layers: dict[str, np.ndarray] = field(default_factory=dict)
 
 
+@dataclass
+class Overview:
+    """What comes after the scenes, all optional."""
+
+    tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the first is the head
+    plots: dict[str, str] = field(default_factory=dict)  # title -> SVG document
+    formulas: dict[str, str] = field(default_factory=dict)  # metric -> its formula in plain text
+
+
 def write_report(
     path: str | os.PathLike,
     title: str,
@@ -62,31 +74,43 @@ def write_report(
     *,
     command: str,
     footer: dict[str, str],
+    overview: Overview | None = None,
     overwrite: bool = False,
 ) -> Path:
     """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
 
     ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
-    Values beyond 18 stops over the average of the scene are stored as that limit, and the page says so ('≥').
+    Pictures are stored to 0.14 % of their value, or as much coarser as a page of PAGE_LIMIT bytes demands, those of
+    most noise first; the page states the worst error of each.
     """
     path = Path(path)
     if not scenes:
         raise NgptError(f"{path}: a report needs at least one scene")
     for scene in scenes:
         _check(path, scene)
-    sections, pixels, facts = [], [], []
-    for number, scene in enumerate(scenes):
-        stops = display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
-        sections.append(_section(number, scene, stops))
-        for place, (_, image) in enumerate(_pictures(scene)):
-            pixels.append(f'<script type="text/plain" id="pixels-{number}-{place}">{_packed(image, stops)}</script>')
-        facts.append(_facts(scene, stops))
+    exposures = [
+        display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
+        for scene in scenes
+    ]
+    sections = [_section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
+    after = _overview(overview or Overview())
+    taken = len(after) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
+    pixels, steps = _pixels(scenes, exposures, 0.99 * 0.75 * (PAGE_LIMIT - taken))  # base64 adds a third
+    facts = [_facts(*each) for each in zip(scenes, exposures, steps, strict=True)]
     table = base64.b64encode(display.heat_table().tobytes()).decode()
-    page = {"scenes": facts, "heat": table, "epsilon": display.ERROR_EPSILON, "range": display.ERROR_RANGE}
+    page = {
+        "scenes": facts,
+        "heat": table,
+        "signs": base64.b64encode(display.sign_table().tobytes()).decode(),
+        "epsilon": display.ERROR_EPSILON,
+        "range": display.ERROR_RANGE,
+        "toe": pixelcodec.TOE,
+    }
     notes = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in footer.items())
     text = _filled(
         TITLE=escape(title),
         COMMAND=escape(command),
+        OVERVIEW=after,
         SCENES="\n".join(sections),
         FOOTER=notes,
         # '<' as an escape: a name that contains '</script>' must stay a name.
@@ -132,7 +156,7 @@ def _pictures(scene: Scene) -> list[tuple[str, np.ndarray]]:
     return pictures if scene.reference is None else [*pictures, (REFERENCE, np.asarray(scene.reference))]
 
 
-def _facts(scene: Scene, stops: float) -> dict:
+def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
     """What the script has to know of a scene, besides the pixels."""
     best = _best(scene, next(iter(scene.entries[0].metrics), ""))
     names = [entry.name for entry in scene.entries]
@@ -141,6 +165,7 @@ def _facts(scene: Scene, stops: float) -> dict:
         "width": scene.entries[0].image.shape[1],
         "height": scene.entries[0].image.shape[0],
         "stops": stops,
+        "steps": steps,
         "pictures": [name for name, _ in _pictures(scene)],
         "layers": list(scene.layers),
         "reference": scene.reference is not None,
@@ -152,19 +177,20 @@ def _facts(scene: Scene, stops: float) -> dict:
 # --- pixels ----------------------------------------------------------------------------------------------------------
 
 
-def _packed(image: np.ndarray, stops: float) -> str:
-    """(H, W, 3) -> base64 of deflated half floats, exposed by round(stops) stops so that half's range fits the scene.
-
-    Planes of R, G, B; each row as differences of neighbouring bit patterns, modulo 2^16; all high bytes, then all low
-    bytes. Neighbours have like exponents, so the high bytes nearly vanish: a smooth image takes a third of the room.
-    """
-    exposed = image.astype(np.float64) * 2.0 ** round(stops)
-    # Only what is infinite may read as infinite.
-    exposed = np.where(np.isfinite(exposed), np.clip(exposed, -HALF_MAX, HALF_MAX), exposed)
-    bits = exposed.astype(np.float16).view(np.uint16).transpose(2, 0, 1)
-    delta = np.diff(bits, axis=2, prepend=np.uint16(0))
-    planes = np.stack([delta >> 8, delta & 255]).astype(np.uint8)
-    return base64.b64encode(zlib.compress(planes.tobytes(), 6)).decode()
+def _pixels(scenes: list[Scene], exposures: list[float], room: float) -> tuple[list[str], list[list[int]]]:
+    """The script elements of all pictures, in about ``room`` bytes, and the steps per stop of each scene's."""
+    exposed = [
+        [image.astype(np.float64) * 2.0 ** round(stops) for _, image in _pictures(scene)]
+        for scene, stops in zip(scenes, exposures, strict=True)
+    ]
+    chosen = iter(pixelcodec.fitting_steps([image for images in exposed for image in images], room))
+    steps = [[next(chosen) for _ in images] for images in exposed]
+    elements = []
+    for number, images in enumerate(exposed):
+        for place, image in enumerate(images):
+            packed = base64.b64encode(pixelcodec.encode(image, steps[number][place])).decode()
+            elements.append(f'<script type="text/plain" id="pixels-{number}-{place}">{packed}</script>')
+    return elements, steps
 
 
 def _layer_view(name: str, layer: np.ndarray) -> np.ndarray:
@@ -198,7 +224,10 @@ def _thumbnail(image: np.ndarray) -> np.ndarray:
 
 def _section(number: int, scene: Scene, stops: float) -> str:
     first = next(iter(scene.entries[0].metrics), "")
-    notes = {entry.name: _note(first, entry.metrics.get(first)) for entry in scene.entries}
+    notes = {
+        entry.name: _note(first, median(entry.metrics[first])) if first in entry.metrics else ""
+        for entry in scene.entries
+    }
     pictures = [
         _figure(name, _thumbnail(display.to_srgb8(image, stops)), notes.get(name, ""))
         for name, image in _pictures(scene)
@@ -229,8 +258,8 @@ def _figure(name: str, picture: np.ndarray, note: str) -> str:
     )
 
 
-def _note(metric: str, value: float | None) -> str:
-    return "" if value is None else f"<small>{escape(metric)} {_number(value)}</small>"
+def _note(metric: str, value: float) -> str:
+    return f"<small>{escape(metric)} {_number(value)}</small>"
 
 
 def _table(scene: Scene) -> str:
@@ -246,10 +275,11 @@ def _table(scene: Scene) -> str:
     for row, entry in enumerate(scene.entries):
         cells = []
         for metric in metrics:
-            value = entry.metrics.get(metric, math.nan)
-            compared = "" if entry.name == BASELINE else _compared(metric, value, baseline.get(metric, math.nan))
+            values = entry.metrics.get(metric, math.nan)
+            value, primal = median(values), median(baseline.get(metric, math.nan))
+            compared = "" if entry.name == BASELINE else _compared(metric, value, primal)
             mark = ' class="best"' if best[metric] == row else ""
-            cells.append(f"<td{mark}><span>{_number(value)}</span><small>{compared}</small></td>")
+            cells.append(f"<td{mark}><span>{_number(value)}</span>{_spread(values)}<small>{compared}</small></td>")
         seconds = NOTHING if entry.seconds is None else f"{entry.seconds:.3g} s"
         cells.append(f"<td><span>{seconds}</span></td>")
         rows.append(f'<tr><th scope="row">{escape(entry.name)}</th>{"".join(cells)}</tr>')
@@ -261,13 +291,49 @@ def _table(scene: Scene) -> str:
     )
 
 
+def median(values: float | Sequence[float]) -> float:
+    """The median over seeds; NaN if one of them is not finite, since that seed failed."""
+    values = [values] if isinstance(values, int | float | np.number) else list(values)
+    return statistics.median(values) if values and all(map(math.isfinite, values)) else math.nan
+
+
+def _spread(values: float | Sequence[float]) -> str:
+    """The lowest and the highest of several seeds."""
+    if isinstance(values, int | float | np.number) or len(values) < 2:
+        return ""
+    return f'<small class="spread">{_number(min(values))} &hellip; {_number(max(values))}</small>'
+
+
+def _overview(overview: Overview) -> str:
+    """Plots, tables and formulas, each under its title."""
+    parts = []
+    for title, svg in overview.plots.items():
+        # As a picture of its own, so that no script or link in it does anything.
+        data = base64.b64encode(svg.encode()).decode()
+        image = f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{data}">'
+        parts.append(f'<figure class="plot">{image}<figcaption><b>{escape(title)}</b></figcaption></figure>')
+    plots = '<h3>Plots</h3><div class="plots">' + "".join(parts) + "</div>" if parts else ""
+    tables = "".join(f"<h3>{escape(title)}</h3>{_plain_table(rows)}" for title, rows in overview.tables.items())
+    formulas = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in overview.formulas.items())
+    formulas = f'<h3>Metrics</h3><dl class="formulas">{formulas}</dl>' if formulas else ""
+    body = tables + plots + formulas
+    return f'<details id="overview" open><summary>Overview</summary>{body}</details>' if body else ""
+
+
+def _plain_table(rows: list[list[str]]) -> str:
+    head, *body = [[escape(cell) for cell in row] for row in rows]
+    lines = [f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{c}</td>" for c in row[1:]) + "</tr>" for row in body]
+    heads = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
 def _rising(metric: str) -> bool:
     return metric.lower() in HIGHER_IS_BETTER
 
 
 def _best(scene: Scene, metric: str) -> int | None:
     """The index of the entry with the best finite value, or None."""
-    values = [(entry.metrics.get(metric, math.nan), row) for row, entry in enumerate(scene.entries)]
+    values = [(median(entry.metrics.get(metric, math.nan)), row) for row, entry in enumerate(scene.entries)]
     values = [(-value if _rising(metric) else value, row) for value, row in values if math.isfinite(value)]
     return min(values)[1] if values else None
 

@@ -16,7 +16,7 @@ from ngpt.exr import write
 from ngpt.files import check_output
 from ngpt.methods import METHODS, reconstruct
 from ngpt.metrics import compare
-from ngpt.report import Entry, Scene, write_report
+from ngpt.report import Entry, Scene, median, write_report
 from ngpt.stack import GradientStack
 
 TABLE_METRICS = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR")
@@ -113,5 +113,6 @@ def print_table(scenes: list[Scene]) -> None:
     print(f"{'scene':14}{'method':10}{'relMSE':>12}{'of primal':>12}{'seconds':>10}")
     for scene in scenes:
         for entry in scene.entries:
-            share = entry.metrics["relMSE"] / max(scene.entries[0].metrics["relMSE"], 1e-30)
-            print(f"{scene.name:14}{entry.name:10}{entry.metrics['relMSE']:12.5f}{share:12.1%}{entry.seconds:10.2f}")
+            error = median(entry.metrics["relMSE"])
+            share = error / max(median(scene.entries[0].metrics["relMSE"]), 1e-30)
+            print(f"{scene.name:14}{entry.name:10}{error:12.5f}{share:12.1%}{entry.seconds:10.2f}")
