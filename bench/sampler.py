@@ -30,7 +30,9 @@ import numpy as np
 import ngpt
 from bench.common import metadata, save, summary
 from bench.gradientmap import variances_of_differences, write_map
-from bench.methods import reference_noise, scene_name, write_text
+from evaluation.config import scene_name
+from evaluation.results import write_text
+from evaluation.stacks import reference_noise
 from ngpt.methods import reconstruct
 from ngpt.metrics import compare
 from ngpt.stack import GradientStack

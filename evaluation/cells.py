@@ -38,7 +38,6 @@ class Scorer:
     def cell(
         self,
         column: Column,
-        spp: int,
         stack: Callable[[], GradientStack],
         reference: np.ndarray,
         key: list,

@@ -24,10 +24,7 @@ def write_results(results: dict[str, Any], out: Path) -> None:
     results["plots"] = {"frontier": {}}
     (out / "plots").mkdir(exist_ok=True)
     for scene in [*results["scenes"], None]:
-        rows = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"] is not None]
-        points = [
-            Point(row["method"], row["spp"], row["seconds"]["total"], row["error"]) for row in rows if row["error"]
-        ]
+        points = _points([row for row in results["summary"] if row["scene"] == scene and _is_drawn(row)])
         if points:
             name = scene or "mean"
             title = scene or f"geometric mean over {len(shared_scenes(results))} scenes"
@@ -88,11 +85,19 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
                     times[key] = _mean(known, geometric=True) if len(known) == len(parts) else None
                 rows.append(_row(results, None, spp, method, scores, times, min(row["seeds"] for row in parts)))
     for scene in {row["scene"] for row in rows}:
-        timed = [row for row in rows if row["scene"] == scene and row["error"] and row["seconds"]["total"] is not None]
-        best = pareto([Point(row["method"], row["spp"], row["seconds"]["total"], row["error"]) for row in timed])
-        for row, is_best in zip(timed, best, strict=True):
+        timed = [row for row in rows if row["scene"] == scene and _is_drawn(row)]
+        for row, is_best in zip(timed, pareto(_points(timed)), strict=True):
             row["pareto"] = is_best
     return rows
+
+
+def _is_drawn(row: dict[str, Any]) -> bool:
+    """Whether there are a time and an error; logarithmic axes know no zero."""
+    return bool(row["error"]) and bool(row["seconds"]["total"])
+
+
+def _points(rows: list[dict[str, Any]]) -> list[Point]:
+    return [Point(row["method"], row["spp"], row["seconds"]["total"], row["error"]) for row in rows]
 
 
 def _row(

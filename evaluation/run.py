@@ -79,9 +79,8 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
                 progress(done + n, total)
 
             try:
-                _scene(
-                    SceneStacks(name, source, config, cache, console.say), columns, lacks, scorer, results, out, advance
-                )
+                stacks = SceneStacks(name, source, config, cache, console.say)
+                _scene(stacks, columns, lacks, scorer, results, out, advance)
             except NgptError as error:
                 console.error(f"{name}: {error}")
                 results["scenes"].setdefault(name, {"file": source})["absent"] = str(error)
@@ -147,7 +146,7 @@ def _scene(
 
                 image = out / "images" / name / f"{spp}-{column.name}.exr" if config.images and seed == 0 else None
                 key = [stacks.stack_key(column.stack, used, seed), _reference_key(file)]
-                cell = scorer.cell(column, spp, load, pixels, key, image)
+                cell = scorer.cell(column, load, pixels, key, image)
                 if cell["absent"]:
                     cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
                     continue

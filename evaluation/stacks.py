@@ -1,8 +1,8 @@
 """Stacks, references and costs of one scene: rendered once, then taken from the cache.
 
-The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's files,
-the size, and the versions that render. In it are KIND-SPP-SEED.exr, where SPP is the number of samples that were rendered,
-reference-*.exr and cost-*.json. A folder of stacks of one's own looks the same, without the costs.
+The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
+files, the size, and the versions that render. In it are KIND-SPP-SEED.exr, where SPP is the number of samples that were
+rendered, reference-*.exr and cost-*.json. A folder of stacks of one's own looks the same, without the costs.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def reference_noise(reference: GradientStack) -> float:
 
 
 def content_hash(scene: str) -> str:
-    """SHA-256 over a scene's file and the files it names, those included in turn; of a built-in scene, over its name."""
+    """SHA-256 over a scene's file and the files it names, those included in turn; over a built-in scene's name."""
     digest = hashlib.sha256()
     if not Path(scene).is_file():
         digest.update(scene.encode())

@@ -13,12 +13,12 @@ def tables(results: dict[str, Any]) -> str:
     width, height = settings["size"]
     lines = [f"# {results['title']}", ""]
     lines += [
-        f"Errors are {primary}: {results['metrics'][primary]['formula']}. {settings['seeds']} seeds a cell: the median, and "
-        f"half the distance of the quartiles as ± per cent where it is over 5 %. {width}x{height} pixels. Methods with a † "
-        "see no gradients and are given path-traced samples in their place, as many as the gradient stack's rendering time "
-        "buys (measured for each scene; with albedo, normal and depth where they want them). **Bold** is best in its "
-        "row; *italic* is a method with gradients that loses to one without; ~ is within three times of the reference's "
-        "own noise, where an order means little.",
+        f"Errors are {primary}: {results['metrics'][primary]['formula']}. {settings['seeds']} seeds a cell: the "
+        "median, and half the distance of the quartiles as ± per cent where it is over 5 %. "
+        f"{width}x{height} pixels. Methods with a † see no gradients and are given path-traced samples in their place, "
+        "as many as the gradient stack's rendering time buys (measured for each scene; with albedo, normal and depth "
+        "where they want them). **Bold** is best in its row; *italic* is a method with gradients that loses to one "
+        "without; ~ is within three times of the reference's own noise, where an order means little.",
         "",
         *_errors(results),
         "",

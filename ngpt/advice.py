@@ -5,8 +5,8 @@ count. Over these scenes each method m has a law
 
     log error_m = log noise - log n + a_m + b_m log n + c_m log noise + d_m log gain
 
-for n samples, fitted by ridge regression: ``noise`` is the relative variance of a sample, ``gain`` how much less variance
-gradients have than independent differences. How well it does is judged by scenes left out of the fit.
+for n samples, fitted by ridge regression: ``noise`` is the relative variance of a sample, ``gain`` how much less
+variance gradients have than independent differences. How well it does is judged by scenes left out of the fit.
 """
 
 from __future__ import annotations
@@ -223,7 +223,7 @@ def _sure(chosen: tuple, found: list[tuple], spread: dict[str, np.ndarray], by_e
 
 
 def residuals(table: dict[str, Any], left_out: str = "") -> dict[str, np.ndarray]:
-    """For each method log measured - log expected error of each scene, by laws fitted without it, mean over its counts."""
+    """For each method log measured - log expected error of each scene by laws fitted without it, mean over counts."""
     scenes = [scene for scene in table["scenes"] if scene["scene"] != left_out]
     subset = {**table, "scenes": scenes}
     result: dict[str, list[float]] = {method: [] for method in table["methods"]}
@@ -267,7 +267,7 @@ def hindsight(table: dict[str, Any], pixels: int = 320 * 180, budgets: int = 5) 
 
 
 def _measured(law: dict[str, list[float]], spp: float) -> float:
-    """A method's error at ``spp`` samples between those measured, by straight lines of the logarithms, ends extended."""
+    """A method's error at ``spp`` samples: straight lines of the logarithms between those measured, ends extended."""
     x, y = np.log(law["spp"]), np.log(law["error"])
     if len(x) == 1:
         return float(np.exp(y[0]))

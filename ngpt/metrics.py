@@ -20,7 +20,7 @@ FORMULAS = {
     "PSNR": ("-10 log10 mean (x' - r')² in dB, with x' = x / (1 + x)", "higher"),
     "MSE": ("mean of (x - r)²", "lower"),
     "max |x - r|": ("largest |x - r|", "lower"),
-    "SSIM": ("structural similarity of x / (1 + x), Gaussian window, σ = 1.5, mean over channels", "higher"),
+    "SSIM": ("structural similarity of x / (1 + x), Gaussian window of sigma 1.5, mean over channels", "higher"),
     "FLIP": ("mean HDR-FLIP, 67 pixels per degree, exposures computed from the reference", "lower"),
     "E-LPIPS": ("E-LPIPS of SqueezeNet on sRGB(x / (1 + mean_c x)), mean of 16 random transforms", "lower"),
 }
@@ -94,7 +94,8 @@ def exposure_mismatch(image: np.ndarray, reference: np.ndarray) -> float:
 def compare(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
     """The metrics of ``FORMULAS`` that need no package, and ``nonfinite``: how many pixels had to be left out.
 
-    ``ngpt.perceptual`` has the others. Raises NgptError if the images differ in size or have no pixel that is finite in both.
+    ``ngpt.perceptual`` has the others. Raises NgptError if the images differ in size or have no pixel that is finite in
+    both.
     """
     check_size(image, reference)
     finite = (np.isfinite(image) & np.isfinite(reference)).all(axis=-1)

@@ -6,10 +6,10 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
 
 [survey, equation 24; Bitterli et al. 2016, "Nonlinearly weighted first-order regression for denoising Monte Carlo
 renderings", section 4], with weights w of non-local means on the colours, and what a fit says of all pixels of its
-neighbourhood is averaged, weighted alike (their collaborative filtering). Bitterli et al. have two half buffers, of which
-one weights what of the other is fitted; a gradient stack holds one image, so the patch distance subtracts what its
-variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4]. Of
-two bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the half buffers.
+neighbourhood is averaged, weighted alike (their collaborative filtering). Bitterli et al. have two half buffers, of
+which one weights what of the other is fitted; a stack holds one image, so the patch distance subtracts what its
+variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4]. Of two
+bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the half buffers.
 """
 
 from collections.abc import Iterator

@@ -81,8 +81,8 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
 def make_elpips(backbone: str, weights: str) -> Any:
     """E-LPIPS by SqueezeNet as a function (image, reference) -> float, of files that docs/losses.md explains.
 
-    d(x, r) averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"], of sRGB(x / (1 + mean_c x)); the draws are
-    the same for all images. Raises NgptError for files that are missing or not what they should be.
+    d(x, r) averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"], of sRGB(x / (1 + mean_c x)); the draws
+    are the same for all images. Raises NgptError for files that are missing or not what they should be.
     """
     if missing("E-LPIPS"):
         raise NgptError(missing("E-LPIPS"))
@@ -96,9 +96,7 @@ def make_elpips(backbone: str, weights: str) -> Any:
 
     def distance(image: np.ndarray, reference: np.ndarray) -> float:
         check_size(image, reference)
-        x, r = (
-            torch.from_numpy(np.ascontiguousarray(i, np.float32)).permute(2, 0, 1)[None] for i in (image, reference)
-        )
+        x, r = (torch.from_numpy(i.astype(np.float32)).permute(2, 0, 1)[None] for i in (image, reference))
         with torch.inference_mode():
             return float(loss(x, r, torch.Generator().manual_seed(0))[0])
 
