@@ -18,6 +18,9 @@ from ngpt.metrics import FORMULAS
 #   path       path tracing alone, likewise
 KINDS = ("gradients", "features", "path")
 
+# Of which seeds pictures are kept.
+IMAGES = ("first", "all", "none")
+
 
 @dataclass(frozen=True)
 class Column:
@@ -51,7 +54,7 @@ class Config:
     reference_seconds: float = 60.0
     timing_spp: int = 32
     timing_repeats: int = 3
-    images: bool = True
+    images: str = "first"
     elpips: dict[str, str] = field(default_factory=dict)
     references: dict[str, str] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
@@ -66,6 +69,7 @@ class Config:
             (self.reference_spp <= 0 and self.reference_seconds <= 0, "set reference_spp or reference_seconds"),
             (bool(unknown), f"no metric '{''.join(unknown[:1])}'; there are: {', '.join(FORMULAS)}"),
             (self.primary not in self.metrics, f"primary = '{self.primary}' is not among metrics"),
+            (self.images not in IMAGES, f"images = '{self.images}': choose one of: {', '.join(IMAGES)}"),
             (len(set(self.methods)) < len(self.methods), "a method is listed twice"),
         ):
             if bad:

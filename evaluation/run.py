@@ -14,6 +14,7 @@ from typing import Any
 import ngpt
 from evaluation.cells import Scorer, absence, versions
 from evaluation.config import Column, Config
+from evaluation.gradientmap import write_map
 from evaluation.results import write_results
 from evaluation.stacks import SceneStacks, reference_noise
 from ngpt.advice import describe
@@ -115,20 +116,20 @@ def _scene(
     _check_reference(first, reference, file)
     # Relative, so that the folder can be moved.
     picture = out / "images" / name / "reference.exr"
-    if config.images:
+    if wanted(config.images, 0):
         picture.parent.mkdir(parents=True, exist_ok=True)
         ngpt.write(picture, pixels, overwrite=True)
     entry["exposure"] = auto_exposure(pixels)
     entry["pilot"] = describe(first) if "primal_var" in first else None
     attributes = reference.attributes
     entry["reference"] = {
-        "image": f"images/{name}/reference.exr" if config.images else None,
+        "image": f"images/{name}/reference.exr" if wanted(config.images, 0) else None,
         "spp": _number(attributes.get("ngpt:spp")),
         "seconds": _number(attributes.get("ngpt:seconds")),
         "noise": _number(reference_noise(reference)) if "primal_var" in reference else None,
     }
     entry["absent"] = None
-    cells = []
+    cells: list[dict[str, Any]] = []
     for spp in config.spp:
         for seed in range(config.seeds):
             held: dict[str, GradientStack] = {}
@@ -144,9 +145,9 @@ def _scene(
                         held[kind] = stacks.stack(kind, n, s)
                     return held[kind]
 
-                image = out / "images" / name / f"{spp}-{column.name}.exr" if config.images and seed == 0 else None
+                image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
                 key = [stacks.stack_key(column.stack, used, seed), _reference_key(file)]
-                cell = scorer.cell(column, load, pixels, key, image)
+                cell = scorer.cell(column, load, pixels, key, out / image if image else None)
                 if cell["absent"]:
                     cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
                     continue
@@ -163,13 +164,37 @@ def _scene(
                         "spp used": used,
                         "seconds": seconds,
                         "metrics": cell["metrics"],
-                        "image": f"images/{name}/{spp}-{column.name}.exr" if image else None,
+                        "image": image,
                         "absent": None,
                     }
                 )
+    maps = gradient_map(stacks, costs, out)
+    if maps:
+        entry["gradients"] = maps
     # All at once: a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
+
+
+def gradient_map(stacks: SceneStacks, costs: dict, out: Path) -> str | None:
+    """Draws where gradients pay and where they hurt, from the stack of most samples; its path relative to ``out``."""
+    spp = max(stacks.config.spp)
+    stack = stacks.stack("gradients", stacks.samples("gradients", spp, costs), 0)
+    if not all(layer in stack for layer in ("direct", "primal_var", "dx_var", "dy_var")):
+        return None
+    path = f"plots/gradients-{stacks.name}.png"
+    write_map(out / path, stack)
+    return path
+
+
+def wanted(images: str, seed: int) -> bool:
+    """Whether the configuration's entry ``images`` has pictures of a seed kept."""
+    return images == "all" or (images == "first" and seed == 0)
+
+
+def picture_path(scene: str, spp: int, method: str, seed: int) -> str:
+    """A cell's picture, relative to the folder of results."""
+    return f"images/{scene}/{spp}-{method}{f'-seed{seed}' if seed else ''}.exr"
 
 
 def _check_reference(stack: GradientStack, reference: GradientStack, file: str) -> None:

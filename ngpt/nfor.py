@@ -8,11 +8,12 @@ For each pixel p, the light of its neighbourhood is fitted by a linear function 
 renderings", section 4], with weights w of non-local means on the colours, and what a fit says of all pixels of its
 neighbourhood is averaged, weighted alike (their collaborative filtering). Bitterli et al. have two half buffers, of
 which one weights what of the other is fitted; a stack holds one image, so the patch distance subtracts what its
-variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4]. Of two
-bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the half buffers.
+variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4].
+Of two bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the halves.
 """
 
 from collections.abc import Iterator
+from itertools import product
 
 import numpy as np
 from scipy.ndimage import uniform_filter
@@ -101,17 +102,16 @@ def _gathered(values: np.ndarray, image: np.ndarray, variance: np.ndarray, bandw
 
 
 def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Iterator[tuple[int, int, np.ndarray]]:
-    """Offsets (dy, dx) and the weights (H, W) of the pixels there, 0 outside the image."""
+    """Offsets (dy, dx) and the weights (H, W) of the pixels there, 0 where those are outside the image."""
     height, width = image.shape[:2]
     floor = 1e-6 * float(np.mean(image.astype(np.float64) ** 2)) + 1e-30
-    for dy in range(-RADIUS, RADIUS + 1):
-        for dx in range(-RADIUS, RADIUS + 1):
-            here = np.s_[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)]
-            there = np.s_[max(dy, 0) : height - max(-dy, 0), max(dx, 0) : width - max(-dx, 0)]
-            weights = np.zeros((height, width), np.float32)
-            if weights[here].size:
-                both = variance[here] + variance[there]
-                distance = ((image[here] - image[there]) ** 2 - both) / (floor + bandwidth**2 * both)
-                patch = uniform_filter(np.mean(distance, axis=-1), 2 * PATCH + 1)
-                weights[here] = np.exp(-np.maximum(patch, 0))
-            yield dy, dx, weights
+    reach = [range(-min(RADIUS, n - 1), min(RADIUS, n - 1) + 1) for n in (height, width)]
+    for dy, dx in product(*reach):
+        here = np.s_[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)]
+        there = np.s_[max(dy, 0) : height - max(-dy, 0), max(dx, 0) : width - max(-dx, 0)]
+        both = variance[here] + variance[there]
+        distance = ((image[here] - image[there]) ** 2 - both) / (floor + bandwidth**2 * both)
+        patch = uniform_filter(np.mean(distance, axis=-1), 2 * PATCH + 1)
+        weights = np.zeros((height, width), np.float32)
+        weights[here] = np.exp(-np.maximum(patch, 0))
+        yield dy, dx, weights

@@ -102,9 +102,9 @@ def nlm(data: Repaired) -> np.ndarray:
     # The image itself travels along, too small to count in the distance: its means are of radiance, not of logarithms,
     # which would darken it.
     tiny = 1e-6 / max(float(image.max()), 1e-30)
-    guides = [weight * data.features[name] for name, weight in _NLM_FEATURES.items()]
-    stacked = np.concatenate([encoded, *guides, tiny * image], axis=-1)
     bandwidth = max(_NLM_BANDWIDTH * sigma, 1e-6)
+    guides = [bandwidth * weight * data.features[name] for name, weight in _NLM_FEATURES.items()]
+    stacked = np.concatenate([encoded, *guides, tiny * image], axis=-1)
     filtered = denoise_nl_means(stacked, patch_size=5, patch_distance=9, h=bandwidth, channel_axis=-1)
     return (filtered[..., -3:] / tiny).astype(np.float32)
 
