@@ -7,6 +7,7 @@ DIR/cache: an interrupted run goes on when it is started again, and only what ch
 import argparse
 import shlex
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 from evaluation.config import read_config
@@ -21,14 +22,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", required=True, metavar="TOML")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
     parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
     parser.add_argument("--advice", type=Path, metavar="FILE", help="also write the table that `ngpt advise` reads")
     parser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
     args = parser.parse_args(arguments)
     console = Console(args.quiet)
-    command = shlex.join(["python", "eval.py", "--config", args.config, "--out", str(args.out)])
+    command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
     try:
-        results = evaluate(read_config(args.config), args.out, console, command, args.cache)
+        config = read_config(args.config)
+        config = replace(config, scenes=(*config.scenes, *args.scenes))
+        results = evaluate(config, args.out, console, command, args.cache)
         if args.advice:
             write_json(args.advice, make_table(results))
     except NgptError as error:

@@ -160,10 +160,10 @@ def render_stack(
     check_options(spp, seed, sampler, seconds, memory)
     if sampler == "auto":
         sampler, _ = choose_sampler(*describe(scene))
-    start = time.perf_counter()
-    passes = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop}
     if not with_features and sampler != "primal":
         raise NgptError(f"sampler '{sampler}' always renders features; only 'primal' can leave them out")
+    start = time.perf_counter()
+    passes = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop}
     film = render_film(sampler, scene, seed, spp, diagnostics, passes, with_features)
     layers = film.develop()
     attributes = {

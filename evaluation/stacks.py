@@ -49,7 +49,7 @@ def content_hash(scene: str) -> str:
         data = path.read_bytes()
         digest.update(hashlib.sha256(data).digest())
         if path.suffix == ".xml":
-            names = sorted(set(re.findall(r'value="([^"$]+)"', data.decode(errors="replace"))))
+            names = sorted(set(re.findall(r'(?:value|filename)="([^"$]+)"', data.decode(errors="replace"))))
             queue += [file for name in names if (file := Path(scene).parent / name).is_file()]
     return digest.hexdigest()
 

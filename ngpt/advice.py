@@ -27,7 +27,7 @@ from ngpt.stack import GradientStack
 
 # Of the ridge, in scenes' worth of evidence: a law starts as that of plain averaging.
 _RIDGE = 0.5
-_LARGEST_SPP = 1 << 20
+LARGEST_SPP = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -180,7 +180,7 @@ def advise(
         else:
             assert error is not None
             spp = _samples(laws, method, pilot, error)
-        if spp >= 2 and spp < _LARGEST_SPP:
+        if spp >= 2 and spp < LARGEST_SPP:
             expected = math.exp(laws.log_error(method, pilot, spp))
             deviation = math.exp(float(np.std(spread[method])))
             found.append((method, stack, spp, after + spp * each, expected, expected / deviation, expected * deviation))
@@ -189,15 +189,15 @@ def advise(
         raise NgptError(
             f"nothing fits into {seconds:g} s: the cheapest takes {cheapest:.2g} s"
             if seconds is not None
-            else f"no method reaches an error of {error:g} with fewer than {_LARGEST_SPP} samples; ask for more"
+            else f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; ask for more"
         )
     found.sort(key=lambda f: f[4] if seconds is not None else f[3])
     return [Advice(*f, sure=_sure(f, found, spread, seconds is not None)) for f in found]
 
 
 def _samples(laws: Laws, method: str, pilot: dict[str, float], error: float) -> int:
-    """The fewest samples whose expected error is at most ``error``; _LARGEST_SPP where none are enough."""
-    low, high = 2, _LARGEST_SPP
+    """The fewest samples whose expected error is at most ``error``; LARGEST_SPP where none are enough."""
+    low, high = 2, LARGEST_SPP
     while low < high:
         middle = (low + high) // 2
         if laws.log_error(method, pilot, middle) <= math.log(error):

@@ -15,10 +15,10 @@ from ngpt.repair import Repaired
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 REMEDY = "pip install 'ngpt-recon[peers]'"
 
-# Weights of the features beside the logarithm of radiance in the patch distance of nlm, and the bandwidth in standard
-# deviations of the noise: about the best of 20 choices on four scenes at 4, 16 and 64 spp.
-_NLM_FEATURES = {"albedo": 2.0, "normal": 1.0}
-_NLM_BANDWIDTH = 1.3
+# The bandwidth of nlm in standard deviations of the noise, and the weights of features against it: the noisier the
+# image, the more they count. About the best of 20 choices on four scenes at 4, 16 and 64 spp.
+_NLM_BANDWIDTH = 1.7
+_NLM_FEATURES = {"albedo": 16.0, "normal": 8.0}
 
 
 def oidn_missing() -> str:

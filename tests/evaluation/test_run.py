@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import ngpt
+from eval import main as command
 from evaluation import cells
 from evaluation.config import read_config
 from evaluation.run import evaluate, picture_path
@@ -193,6 +194,29 @@ def test_errors_of_the_configuration(tmp_path, entry, message):
     assert message in str(error.value) and "config.toml" in str(error.value)
 
 
+def test_the_configurations_that_ship_are_legal():
+    paths = sorted(Path(__file__).parents[2].glob("configs/eval-*.toml"))
+    assert len(paths) >= 7
+    for path in paths:
+        config = read_config(path)
+        named = [column.name for column in config.columns()]
+        assert not set(config.variants) - set(named), path
+
+
+def test_the_command(room, capsys):
+    folder, _ = room
+    out = folder / "out"
+    write_scene(folder / "hall", np.random.default_rng(1))
+    arguments = ["--config", str(folder / "config.toml"), "--out", str(out), "--scenes", str(folder / "hall"), "-q"]
+    assert command(arguments) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert set(results["scenes"]) == {"room", "hall"} and "--scenes" in results["command"]
+    assert command(["--config", str(folder / "none.toml"), "--out", str(out)]) == 2
+    assert "none.toml: cannot be read" in capsys.readouterr().err
+    (folder / "hall" / "reference.exr").unlink()
+    assert command(arguments) == 1
+
+
 def test_stability(room):
     folder, config = room
     evaluate(config, folder / "out", QUIET, "")
@@ -203,7 +227,7 @@ def test_stability(room):
     assert (folder / "out/stability/room-4-l2.png").read_bytes().startswith(b"\x89PNG")
     assert "`primal`" in (folder / "out/stability.md").read_text()
     (folder / "out" / picture_path("room", 4, "l2", 1)).unlink()
-    with pytest.raises(NgptError, match="4-l2-seed1.exr: no such picture"):
+    with pytest.raises(NgptError, match=r"4-l2-seed1\.exr: no such picture"):
         study(folder / "out")
 
 
