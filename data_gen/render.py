@@ -15,6 +15,7 @@ from data_gen.builtin import SCENES
 from data_gen.camera import DEFAULT_MEMORY, CameraSamples, Progress, render_passes
 from data_gen.features import features
 from data_gen.film import GradientFilm
+from data_gen.lights import emission_seen
 from data_gen.spectrum import to_rgb
 from ngpt.errors import NgptError
 from ngpt.exr import with_channels
@@ -152,7 +153,7 @@ def render_stack(
     ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is called with (samples done, spp) before the first pass
     and after each; for it, ``memory`` and ``stop`` see ``data_gen.camera.render_passes()``. With ``diagnostics`` the
     stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels; without
-    ``with_features``, which sampler "primal" alone can do without, it has no albedo, normal and depth. The scene's
+    ``with_features``, which sampler "primal" alone can do without, it holds the primal alone. The scene's
     reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
 
     The same seed and number of samples give the same bits, however they came about.
@@ -222,4 +223,6 @@ def sample_primal(scene, integrator, with_features: bool, camera: CameraSamples,
     L, _, _ = integrator.sample(scene, camera.random.clone(), ray, camera.sensor.get_medium())
     film.put("primal", to_rgb(L * importance, ray.wavelengths))
     if with_features:
+        Le = emission_seen(scene, integrator, camera.sensor.get_medium(), ray, mi.Bool(True))
+        film.put("direct", to_rgb(Le * importance, ray.wavelengths))
         film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))

@@ -16,13 +16,15 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import uniform_filter
+from scipy.ndimage import median_filter, uniform_filter
 
 RADIUS = 9  # of the neighbourhood, 19x19 pixels
 PATCH = 3  # radius of the patches that are compared
 BANDWIDTHS = (0.5, 1.0)
 # A feature is believed as far as its spread in the neighbourhood exceeds this share of its range in the image.
 RIDGE = 1e-3
+# Variance, over the median of the neighbourhood, at which a pixel counts half.
+OUTLIER = 1000.0
 _TILE = 48  # pixels of a tile's side: what is summed for it stays in the processor's cache
 
 
@@ -35,9 +37,10 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/LOG.md).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
     design = _design(features, image.shape[:2])
+    trust = _trust(image, variance)
     results, errors = [], []
     for bandwidth in BANDWIDTHS:
-        result, own = _filtered(image, variance, design, bandwidth)
+        result, own = _filtered(image, variance, trust, design, bandwidth)
         results.append(result)
         # Stein: E|F - truth|² = E[|F - I|² - σ² + 2 σ² dF/dI].
         error = np.mean((result - image) ** 2 - variance + 2 * variance * own[..., None], axis=-1)
@@ -45,6 +48,22 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     better = (errors[1] < errors[0]).astype(np.float32)
     share = uniform_filter(better, 2 * PATCH + 1)[..., None]
     return ((1 - share) * results[0] + share * results[1]).astype(np.float32)
+
+
+def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(H, W, 1) in (0, 1]: near 1 but for pixels whose variance is far beyond that of their neighbourhood.
+
+    A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it are
+    alike: without this it is smeared over them.
+    """
+    total = variance.mean(axis=-1)
+    usual = OUTLIER * median_filter(total, 2 * RADIUS + 1) + _floor(image)
+    return (usual / (usual + total))[..., None].astype(np.float32)
+
+
+def _floor(image: np.ndarray) -> float:
+    """A variance that is nothing beside the image."""
+    return 1e-6 * float(np.mean(image.astype(np.float64) ** 2)) + 1e-30
 
 
 def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
@@ -60,7 +79,7 @@ def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
 
 
 def _filtered(
-    image: np.ndarray, variance: np.ndarray, design: np.ndarray, bandwidth: float
+    image: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """The collaborative fits at one bandwidth, and how much of itself each pixel keeps, about dF/dI."""
     n = design.shape[-1]
@@ -68,7 +87,7 @@ def _filtered(
     products = design[..., rows] * design[..., columns]
     targets = (design[..., :, None] * image[..., None, :]).reshape(*image.shape[:2], -1)
     moments = np.concatenate([products, targets], axis=-1).astype(np.float32)
-    sums = _gathered(moments, image, variance, bandwidth)
+    sums = _gathered(moments * trust, image, variance, bandwidth)
     gram = np.empty((*image.shape[:2], n, n))
     gram[..., rows, columns] = gram[..., columns, rows] = sums[..., : len(rows)]
     # Ridge on the slopes only, in proportion to the weights' sum, so that flat features cannot make the fit unstable.
@@ -81,7 +100,7 @@ def _filtered(
     leverage = np.einsum("...i,...i", design, np.linalg.solve(gram, design[..., None].astype(np.float64))[..., 0])
     spread = np.concatenate([fits.reshape(*image.shape[:2], -1), np.ones((*image.shape[:2], 1), np.float32)], axis=-1)
     del sums, gram, right
-    gathered = _gathered(spread, image, variance, bandwidth)
+    gathered = _gathered(spread * trust, image, variance, bandwidth)
     fits = gathered[..., :-1].reshape(*image.shape[:2], n, 3) / gathered[..., -1:, None]
     return np.einsum("...i,...ic->...c", design, fits), np.clip(leverage, 0, 1)
 
@@ -104,7 +123,7 @@ def _gathered(values: np.ndarray, image: np.ndarray, variance: np.ndarray, bandw
 def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Iterator[tuple[int, int, np.ndarray]]:
     """Offsets (dy, dx) and the weights (H, W) of the pixels there, 0 where those are outside the image."""
     height, width = image.shape[:2]
-    floor = 1e-6 * float(np.mean(image.astype(np.float64) ** 2)) + 1e-30
+    floor = _floor(image)
     reach = [range(-min(RADIUS, n - 1), min(RADIUS, n - 1) + 1) for n in (height, width)]
     for dy, dx in product(*reach):
         here = np.s_[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)]

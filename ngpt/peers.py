@@ -52,10 +52,11 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
         features["albedo"] = np.clip(features["albedo"], 0, 1)
     if auxiliary == "prefiltered":
         features = {name: _prefiltered(name, layer) for name, layer in features.items()}
-    image = np.ascontiguousarray(data.image, np.float32)
+    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    image = np.ascontiguousarray(data.image + data.direct, np.float32)
     options = {"hdr": True, "clean_aux": auxiliary in ("prefiltered", "clean"), "quality": level}
     # A copy: the result is a view of a buffer that OIDN owns.
-    return np.array(mitsuba_oidn.denoise(image, **features, **options))
+    return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
 
 
 def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:

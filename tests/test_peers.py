@@ -77,6 +77,16 @@ def test_nfor_keeps_what_is_free_of_noise(rng):
     assert np.isfinite(unknown).all()
 
 
+def test_nfor_does_not_smear_a_spot_of_light_over_the_dark():
+    """Seen on veach-mis: the reflection of a small lamp on a black plate, with a variance to match."""
+    image, variance = np.zeros((2, 30, 30, 3), np.float32)
+    image[15, 15:17], variance[15, 15:17] = 165, 88**2
+    feature = np.linspace(0, 1, 900, dtype=np.float32).reshape(30, 30, 1)
+    result = nfor(image, variance, [feature])
+    result[15, 15:17] = 0
+    assert np.abs(result).max() < 0.05
+
+
 @pytest.mark.parametrize("size", [(1, 1), (3, 50), (17, 5)])
 def test_nfor_takes_any_size(rng, size):
     image = rng.random((*size, 3)).astype(np.float32)

@@ -52,7 +52,7 @@ def test_paths_alone_are_those_with_features(scene_file):
 
     scene = load_scene(scene_file(), (17, 5))
     bare, full = (render_stack(scene, 4, 0, "primal", with_features=flag) for flag in (False, True))
-    assert set(full.names) - set(bare.names) == {"albedo", "normal", "depth"}
+    assert set(full.names) - set(bare.names) == {"direct", "albedo", "normal", "depth"}
     assert np.allclose(bare["primal"], full["primal"], rtol=1e-5)
     with pytest.raises(NgptError, match="sampler 'gpt' always renders features"):
         render_stack(scene, 4, 0, "gpt", with_features=False)
