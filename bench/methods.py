@@ -14,10 +14,13 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
+from evaluation.config import scene_name
+from evaluation.results import write_text
+from evaluation.stacks import reference_noise
 from ngpt.display import auto_exposure, to_srgb8
 from ngpt.files import atomic_output
 from ngpt.methods import METHODS, reconstruct
-from ngpt.metrics import EPSILON, compare, relative_squared_error
+from ngpt.metrics import compare, relative_squared_error
 from ngpt.png import encode_png
 from ngpt.stack import GradientStack
 
@@ -64,11 +67,6 @@ def main() -> None:
             write_picture(args.pictures / f"{method}-fails.png", method, cells, images, references)
 
 
-def scene_name(scene: str) -> str:
-    path = Path(scene)
-    return f"{path.parent.name}{path.stem.removeprefix('scene')}" if path.suffix == ".xml" else scene
-
-
 def cached(scene: str, spp: int, sampler: str, seed: int, args: argparse.Namespace) -> GradientStack:
     """A rendered stack, from the cache if it is there."""
     from data_gen.render import load_scene, render_stack
@@ -79,11 +77,6 @@ def cached(scene: str, spp: int, sampler: str, seed: int, args: argparse.Namespa
         print(f"rendering {path.name}", flush=True)
         ngpt.write(path, render_stack(load_scene(scene, (width, height)), spp, seed, sampler))
     return ngpt.read(path)
-
-
-def reference_noise(reference: GradientStack) -> float:
-    """What the reference's own noise adds to every relMSE: the mean of its variance / (r² + epsilon)."""
-    return float(np.mean(reference["primal_var"] / (reference["primal"] ** 2 + EPSILON)))
 
 
 def table(cells: dict, noise: dict) -> str:
@@ -114,11 +107,6 @@ def energy_table(cells: dict) -> str:
         kept = [[c["energy"] for (_, s, m), c in cells.items() if (s, m) == (spp, method)] for method in methods]
         lines.append(f"| {spp} spp | " + " | ".join(f"{np.median(k):.3f} ({min(k):.3f})" for k in kept) + " |")
     return "\n".join(lines) + "\n"
-
-
-def write_text(path: Path, text: str) -> None:
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(text)
 
 
 def write_picture(path: Path, method: str, cells: dict, images: dict, references: dict) -> None:

@@ -14,7 +14,7 @@ Rendered are the built-in scenes and each FOLDER/*/scene.xml that is without med
 
 References are rendered for a fixed time, kept in CACHE, and taken from there the next time. A run that was broken off
 goes on where it ended if it is started with the same arguments. Written are bench/results/sampler.json, the table, and
-for each scene named by --maps docs/images/NAME-gradients.png, see bench/gradientmap.py.
+for each scene named by --maps docs/images/NAME-gradients.png, see evaluation/gradientmap.py.
 """
 
 import argparse
@@ -29,8 +29,10 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save, summary
-from bench.gradientmap import variances_of_differences, write_map
-from bench.methods import reference_noise, scene_name, write_text
+from evaluation.config import scene_name
+from evaluation.gradientmap import variances_of_differences, write_map
+from evaluation.results import write_text
+from evaluation.stacks import reference_noise
 from ngpt.methods import reconstruct
 from ngpt.metrics import compare
 from ngpt.stack import GradientStack

@@ -96,3 +96,14 @@ def shared_emission(scene, lights: Lights, x1, Le, p, y, y1, J) -> tuple[mi.Spec
     p1 = dr.select(shared, p * dr.select(escapes, 1, J / dr.abs(ratio)), 0)
     anew = (x1.emitter(scene) != None) & ~shared  # noqa: E711 - a comparison of arrays of pointers
     return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew), lambda *known: known)
+
+
+def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:
+    """What a camera ray meets of emitters before anything else: the layer ``direct``.
+
+    Zero where ``integrator`` hides it, and where the camera is in a ``medium``, which would dim it.
+    """
+    if integrator.hide_emitters or medium is not None:
+        return dr.zeros(mi.Spectrum, dr.width(ray))
+    si = scene.ray_intersect(ray, active)
+    return si.emitter(scene, active).eval(si, active)

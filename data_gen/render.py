@@ -15,6 +15,7 @@ from data_gen.builtin import SCENES
 from data_gen.camera import DEFAULT_MEMORY, CameraSamples, Progress, render_passes
 from data_gen.features import features
 from data_gen.film import GradientFilm
+from data_gen.lights import emission_seen
 from data_gen.spectrum import to_rgb
 from ngpt.errors import NgptError
 from ngpt.exr import with_channels
@@ -144,13 +145,15 @@ def render_stack(
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
     diagnostics: bool = False,
+    with_features: bool = True,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
 
     ``spp`` is the number of (base) paths per pixel, ``seconds`` a limit of wall-clock time (one of them may be None),
     ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is called with (samples done, spp) before the first pass
     and after each; for it, ``memory`` and ``stop`` see ``data_gen.camera.render_passes()``. With ``diagnostics`` the
-    stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels. The scene's
+    stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels; without
+    ``with_features``, which sampler "primal" alone can do without, it holds the primal alone. The scene's
     reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
 
     The same seed and number of samples give the same bits, however they came about.
@@ -158,9 +161,11 @@ def render_stack(
     check_options(spp, seed, sampler, seconds, memory)
     if sampler == "auto":
         sampler, _ = choose_sampler(*describe(scene))
+    if not with_features and sampler != "primal":
+        raise NgptError(f"sampler '{sampler}' always renders features; only 'primal' can leave them out")
     start = time.perf_counter()
     passes = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop}
-    film = render_film(sampler, scene, seed, spp, diagnostics, passes)
+    film = render_film(sampler, scene, seed, spp, diagnostics, passes, with_features)
     layers = film.develop()
     attributes = {
         "ngpt:spp": film.samples,
@@ -192,7 +197,13 @@ def check_options(spp: int | None, seed: int, sampler: str, seconds: float | Non
 
 
 def render_film(
-    sampler: str, scene: mi.Scene, seed: int, spp: int | None, diagnostics: bool = False, passes: dict | None = None
+    sampler: str,
+    scene: mi.Scene,
+    seed: int,
+    spp: int | None,
+    diagnostics: bool = False,
+    passes: dict | None = None,
+    with_features: bool = True,
 ) -> GradientFilm:
     """Runs the sampler of that name; ``passes`` are options of ``data_gen.camera.render_passes()``."""
     sensor, passes = scene.sensors()[0], passes or {}
@@ -202,12 +213,16 @@ def render_film(
     if sampler == "gpt-basic":
         gpt = mi.load_dict({"type": "gpt_basic", "integrator": integrator})
         return gpt.render_film(scene, sensor, seed, spp, **passes)
-    return render_passes(partial(sample_primal, scene, integrator), sensor, seed, spp, **passes)
+    sample = partial(sample_primal, scene, integrator, with_features)
+    return render_passes(sample, sensor, seed, spp, **passes)
 
 
-def sample_primal(scene, integrator, camera: CameraSamples, film: GradientFilm) -> None:
-    """One sample of radiance and features for each camera sample, by Mitsuba's integrator alone."""
+def sample_primal(scene, integrator, with_features: bool, camera: CameraSamples, film: GradientFilm) -> None:
+    """One sample of radiance, and of features, for each camera sample, by Mitsuba's integrator alone."""
     ray, importance, _ = camera.rays()
     L, _, _ = integrator.sample(scene, camera.random.clone(), ray, camera.sensor.get_medium())
     film.put("primal", to_rgb(L * importance, ray.wavelengths))
-    film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
+    if with_features:
+        Le = emission_seen(scene, integrator, camera.sensor.get_medium(), ray, mi.Bool(True))
+        film.put("direct", to_rgb(Le * importance, ray.wavelengths))
+        film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ngpt import controlvariates, poisson, runtime, weighted
+from ngpt import controlvariates, nfor, peers, poisson, runtime, weighted
 from ngpt.errors import NgptError
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
@@ -71,6 +71,11 @@ def _cv(data: Repaired) -> np.ndarray:
     return controlvariates.cv(data.image, data.dx, data.dy, data.trusted)
 
 
+def _nfor(data: Repaired) -> np.ndarray:
+    assert data.noise is not None
+    return nfor.nfor(data.image, data.noise, [data.features[name] for name in _FEATURES])
+
+
 def _with_variances(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
     return lambda data: solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
 
@@ -108,8 +113,6 @@ def _neural(name: str) -> dict[str, Any]:
             from ngpt.network import inference
 
             return inference.run(data, path, device)
-        if (lack := missing()) and ("ONNX" in lack or not weights):
-            raise NgptError(f"method '{name}': {lack}")
         return _by_onnx(data, path, device, memory)
 
     return {"run": run, "options": {"weights": "", "device": "auto", "memory": runtime.MEMORY}, "missing": missing}
@@ -153,6 +156,22 @@ METHODS = {
         "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES), **_neural("ngpt-fast")
     ),
     "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
+    # Those below see no gradients.
+    "nlm": Method(
+        "peer: joint non-local means of scikit-image",
+        ("primal", "albedo", "normal", "primal_var"),
+        peers.nlm,
+        {},
+        peers.nlm_missing,
+    ),
+    "nfor": Method("peer: first-order regression on features", ("primal", *_FEATURES, "primal_var"), _nfor, {}),
+    "oidn": Method(
+        "peer: Intel Open Image Denoise",
+        ("primal", "albedo", "normal"),
+        peers.oidn,
+        {"auxiliary": "prefiltered", "quality": "high"},
+        peers.oidn_missing,
+    ),
 }
 
 
@@ -194,7 +213,10 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     for option in options:
         if option not in entry.options:
             raise NgptError(f"method '{name}' has no option '{option}'; it has: {', '.join(entry.options) or 'none'}")
-    stack.require(*entry.needs, why=f"method '{name}'")
+    if entry.missing() and not options.get("weights"):
+        raise NgptError(f"method '{name}': {entry.missing()}")
+    # What the weights of a network need, they say themselves.
+    stack.require(*(("primal",) if options.get("weights") else entry.needs), why=f"method '{name}'")
     data = repair(stack)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):

@@ -19,6 +19,7 @@ class Repaired:
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
     ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
     ``variances``  of image, dx and dy, (H, W, 3), NaN where not known; None where the stack lacks a layer of them
+    ``noise``    the variance of image alone, (H, W, 3), NaN where not known; None where the stack lacks it
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
@@ -33,6 +34,7 @@ class Repaired:
     pixels: int
     gradients: int
     features: dict[str, np.ndarray] = field(default_factory=dict)
+    noise: np.ndarray | None = None
 
 
 def repair(stack: GradientStack) -> Repaired:
@@ -52,8 +54,11 @@ def repair(stack: GradientStack) -> Repaired:
     else:
         image, direct = _from_neighbours(primal, direct, good), np.where(good[..., None], direct, 0)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
+    # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
+    known = good & ~direct.any(axis=-1)
+    noise = _where(known, stack["primal_var"]) if "primal_var" in stack else None
     if "dx" not in stack or "dy" not in stack:
-        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features)
+        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features, noise)
     gradients, trusted = [], []
     for name, axis in (("dx", 1), ("dy", 0)):
         both = good.copy()
@@ -70,9 +75,11 @@ def repair(stack: GradientStack) -> Repaired:
         trusted.append(both)
     lost = int(sum(np.sum(~t) for t in trusted))
     flags = (trusted[0], trusted[1]) if lost else None
-    variances = _variances(stack, good & ~direct.any(axis=-1), trusted)
+    variances = None
+    if noise is not None and "dx_var" in stack and "dy_var" in stack:
+        variances = (noise, _where(trusted[0], stack["dx_var"]), _where(trusted[1], stack["dy_var"]))
     dx, dy = gradients
-    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features)
+    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features, noise)
 
 
 def _finite(layer: np.ndarray) -> np.ndarray:
@@ -80,20 +87,9 @@ def _finite(layer: np.ndarray) -> np.ndarray:
     return layer if good.all() else np.where(good, layer, np.float32(0))
 
 
-def _variances(stack: GradientStack, known: np.ndarray, trusted: list[np.ndarray]) -> tuple | None:
-    """Variances of primal - direct, dx and dy, NaN where they are not those of what is reconstructed.
-
-    Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
-    """
-    names = ("primal_var", "dx_var", "dy_var")
-    if not all(name in stack for name in names):
-        return None
-    pairs = zip(names, (known, *trusted), strict=True)
-    primal, dx, dy = (
-        stack[name] if flags.all() else np.where(flags[..., None], stack[name], np.float32(np.nan))
-        for name, flags in pairs
-    )
-    return primal, dx, dy
+def _where(flags: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """The variance where ``flags`` hold, NaN elsewhere."""
+    return variance if flags.all() else np.where(flags[..., None], variance, np.float32(np.nan))
 
 
 def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.gradientmap import log_ratio, variances_of_differences, write_map
+from evaluation.gradientmap import log_ratio, variances_of_differences, write_map
 from ngpt.stack import GradientStack
 
 

@@ -18,7 +18,7 @@ def test_auto_takes_what_the_stack_allows(noisy_stack):
 
 
 # Those that need nothing but a stack.
-CLASSICAL = [name for name in METHODS if not name.startswith("ngpt")]
+CLASSICAL = [name for name, method in METHODS.items() if not {"albedo", "weights"} & {*method.needs, *method.options}]
 
 
 @pytest.mark.parametrize("method", CLASSICAL)

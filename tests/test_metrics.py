@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.metrics import compare
+from ngpt.metrics import FORMULAS, compare, exposure_mismatch
 
 
 def test_by_hand():
@@ -12,6 +12,8 @@ def test_by_hand():
     image = np.array([[[2.0, 0.1, 2.0], [0.5, 0.5, 0.5]]])
     metrics = compare(image, reference)
     assert metrics["relMSE"] == pytest.approx((1 / 1.001 + 0.01 / 0.001) / 6)
+    grey = [np.mean([1, 0, 2]), 0.5]
+    assert metrics["relMSE NGPT"] == pytest.approx((1 + 0.01) / 3 / (grey[0] ** 2 + 0.001) / 2)
     assert metrics["SMAPE"] == pytest.approx((2 / 3 + 2) / 6)
     assert metrics["MSE"] == pytest.approx((1 + 0.01) / 6)
     assert metrics["max |x - r|"] == pytest.approx(1)
@@ -50,3 +52,17 @@ def test_errors(rng):
         compare(np.zeros((4, 5, 3)), np.zeros((4, 4, 3)))
     with pytest.raises(NgptError, match="none of 16 pixels"):
         compare(np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)))
+
+
+def test_every_metric_has_a_formula(rng):
+    image = rng.random((4, 4, 3))
+    assert set(compare(image, image)) - {"nonfinite"} <= set(FORMULAS)
+
+
+def test_exposure_mismatch_is_in_stops_and_survives_fireflies(rng):
+    reference = rng.random((60, 50, 3)) + 0.1
+    image = 4 * reference
+    assert exposure_mismatch(image, reference) == pytest.approx(2)
+    image[3, 4], image[5, 6] = 1e6, np.nan
+    assert exposure_mismatch(image, reference) == pytest.approx(2, abs=0.02)
+    assert exposure_mismatch(0 * reference, reference) == 0

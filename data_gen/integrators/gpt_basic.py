@@ -23,6 +23,7 @@ from data_gen.camera import CameraSamples, render_passes
 from data_gen.features import features
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.integrators.common import GradientIntegrator
+from data_gen.lights import emission_seen
 from data_gen.spectrum import to_rgb
 
 
@@ -70,10 +71,7 @@ class GPTBasic(GradientIntegrator):
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.
         L, _, _ = self.nested.sample(scene, camera.random.clone(), ray, medium, inside)
-        Le = dr.zeros(mi.Spectrum, dr.width(inside))
-        if not self.nested.hide_emitters and medium is None:
-            si = scene.ray_intersect(ray, inside)
-            Le = si.emitter(scene, inside).eval(si, inside)
+        Le = emission_seen(scene, self.nested, medium, ray, inside)
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
         dr.eval(L, Le, inside)
         return L, Le, inside

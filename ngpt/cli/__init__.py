@@ -21,6 +21,7 @@ VERBS = {
     "denoise": "reconstruct images from gradient stacks",
     "info": "say what a file holds, or what a scene requires",
     "diff": "compare two images",
+    "advise": "say which method and how many samples to use, for a time or an error",
 }
 
 

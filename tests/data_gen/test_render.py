@@ -47,6 +47,17 @@ def test_crop_window_shows_its_part_of_the_image(scene_file):
     assert np.abs(part["dx"][:, :-1] - whole["dx"][5:20, 10:29]).mean() < 0.01
 
 
+def test_paths_alone_are_those_with_features(scene_file):
+    from data_gen.render import load_scene, render_stack
+
+    scene = load_scene(scene_file(), (17, 5))
+    bare, full = (render_stack(scene, 4, 0, "primal", with_features=flag) for flag in (False, True))
+    assert set(full.names) - set(bare.names) == {"direct", "albedo", "normal", "depth"}
+    assert np.allclose(bare["primal"], full["primal"], rtol=1e-5)
+    with pytest.raises(NgptError, match="sampler 'gpt' always renders features"):
+        render_stack(scene, 4, 0, "gpt", with_features=False)
+
+
 def test_the_primal_sampler_agrees_with_mitsuba(renderer):
     from data_gen.render import load_scene, render_stack
     from ngpt.testing import z_test

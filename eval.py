@@ -1,0 +1,52 @@
+"""Every method on the same scenes with the same clock: python eval.py --config configs/eval-NAME.toml --out DIR
+
+Writes DIR/results.json, results.csv, results.md, plots and pictures (docs/evaluation.md). What is done is kept in
+DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew.
+"""
+
+import argparse
+import shlex
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+from evaluation.config import read_config
+from evaluation.run import evaluate
+from evaluation.stacks import write_json
+from ngpt.advice import make_table
+from ngpt.console import Console
+from ngpt.errors import NgptError
+
+
+def main(arguments: list[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--config", required=True, metavar="TOML")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
+    parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
+    parser.add_argument("--advice", type=Path, metavar="FILE", help="also write the table that `ngpt advise` reads")
+    parser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
+    args = parser.parse_args(arguments)
+    console = Console(args.quiet)
+    command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
+    try:
+        config = read_config(args.config)
+        config = replace(config, scenes=(*config.scenes, *args.scenes))
+        results = evaluate(config, args.out, console, command, args.cache)
+        if args.advice:
+            write_json(args.advice, make_table(results))
+    except NgptError as error:
+        console.error(error)
+        return 2
+    except KeyboardInterrupt:
+        console.error("interrupted; the same command goes on from here")
+        return 130
+    absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
+    if absent:
+        console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")
+    console.say(f"{args.out}/results.md")
+    return 1 if absent else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,86 @@
+"""Logarithmic axes of a picture drawn by hand as SVG."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from html import escape
+
+
+@dataclass(frozen=True)
+class Axes:
+    """Two logarithmic axes with the ranges they show, in a picture of ``width`` x ``height``."""
+
+    x_range: tuple[float, float]
+    y_range: tuple[float, float]
+    width: int = 680
+    height: int = 420
+    left: int = 70
+    margin: int = 160  # at the right, for names
+
+    @property
+    def right(self) -> int:
+        return self.width - self.margin
+
+    @property
+    def bottom(self) -> int:
+        return self.height - 46
+
+    def x(self, value: float) -> float:
+        return self.left + _share(value, self.x_range) * (self.right - self.left)
+
+    def y(self, value: float) -> float:
+        return self.bottom - _share(value, self.y_range) * (self.bottom - 30)
+
+    def frame(self, x_label: str, y_label: str, title: str) -> list[str]:
+        """The beginning of the SVG: grid, numbers, labels."""
+        parts = [
+            f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width} {self.height}" '
+            'font-family="sans-serif" font-size="12">',
+            f'<rect width="{self.width}" height="{self.height}" fill="white"/>',
+            f'<text x="{self.left}" y="18" font-size="14">{escape(title)}</text>',
+        ]
+        for value in ticks(*self.y_range):
+            parts.append(f'<path d="M{self.left} {self.y(value):.1f}H{self.right}" stroke="#e4e4e4"/>')
+            parts.append(f'<text x="{self.left - 6}" y="{self.y(value) + 4:.1f}" text-anchor="end">{value:.3g}</text>')
+        for value in ticks(*self.x_range):
+            parts.append(f'<path d="M{self.x(value):.1f} 30V{self.bottom}" stroke="#e4e4e4"/>')
+            parts.append(
+                f'<text x="{self.x(value):.1f}" y="{self.bottom + 16}" text-anchor="middle">{value:.3g}</text>'
+            )
+        middle = (self.left + self.right) / 2
+        parts.append(f'<text x="{middle}" y="{self.height - 10}" text-anchor="middle">{escape(x_label)}</text>')
+        parts.append(
+            f'<text transform="translate(16 {(self.bottom + 30) / 2}) rotate(-90)" text-anchor="middle">'
+            f"{escape(y_label)}</text>"
+        )
+        return parts
+
+    def level(self, value: float, color: str, label: str) -> str:
+        """A dashed horizontal line."""
+        y = self.y(value)
+        return (
+            f'<path d="M{self.left} {y:.1f}H{self.right}" stroke="{color}" stroke-dasharray="4 4"/>'
+            f'<text x="{self.left + 6}" y="{y - 4:.1f}" fill="{color}" font-size="11">{escape(label)}</text>'
+        )
+
+    def legend(self, names: list[tuple[str, str]]) -> list[str]:
+        """Names with their colours, at the right."""
+        parts = []
+        for i, (name, color) in enumerate(names):
+            y = 40 + 17 * i
+            parts.append(f'<path d="M{self.right + 10} {y}h18" stroke="{color}" stroke-width="3"/>')
+            parts.append(f'<text x="{self.right + 34}" y="{y + 4}">{escape(name)}</text>')
+        return parts
+
+
+def ticks(low: float, high: float) -> list[float]:
+    """1, 2 and 5 times powers of ten between the two; powers alone where that would be many."""
+    powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
+    steps = (1, 2, 5) if math.log10(high / low) < 3.5 else (1,)
+    return [value for p in powers for m in steps if low <= (value := m * 10.0**p) <= high]
+
+
+def _share(value: float, limits: tuple[float, float]) -> float:
+    low, high = (math.log(limit) for limit in limits)
+    return (math.log(value) - low) / (high - low) if high > low else 0.5

@@ -1,0 +1,136 @@
+"""NFOR: nonlinearly weighted first-order regression on features, the strongest classical denoiser of path tracing.
+
+For each pixel p, the light of its neighbourhood is fitted by a linear function of the features f,
+
+    min over F_p, G_p of  Σ_q  w_pq |F_p + G_pᵀ (f_q - f_p) - I_q|²
+
+[survey, equation 24; Bitterli et al. 2016, "Nonlinearly weighted first-order regression for denoising Monte Carlo
+renderings", section 4], with weights w of non-local means on the colours, and what a fit says of all pixels of its
+neighbourhood is averaged, weighted alike (their collaborative filtering). Bitterli et al. have two half buffers, of
+which one weights what of the other is fitted; a stack holds one image, so the patch distance subtracts what its
+variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-local means filtering", equation 4].
+Of two bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the halves.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+
+import numpy as np
+from scipy.ndimage import median_filter, uniform_filter
+
+RADIUS = 9  # of the neighbourhood, 19x19 pixels
+PATCH = 3  # radius of the patches that are compared
+BANDWIDTHS = (0.5, 1.0)
+# A feature is believed as far as its spread in the neighbourhood exceeds this share of its range in the image.
+RIDGE = 1e-3
+# Variance, over the median of the neighbourhood, at which a pixel counts half.
+OUTLIER = 1000.0
+_TILE = 48  # pixels of a tile's side: what is summed for it stays in the processor's cache
+
+
+def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) -> np.ndarray:
+    """The denoised image, (H, W, 3) float32.
+
+    ``image`` is (H, W, 3), finite, ``variance`` that of its pixels as means, NaN where it is not known, ``features`` a
+    list of (H, W, C). Memory is about 100 floats a pixel.
+    """
+    # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/LOG.md).
+    variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
+    design = _design(features, image.shape[:2])
+    trust = _trust(image, variance)
+    results, errors = [], []
+    for bandwidth in BANDWIDTHS:
+        result, own = _filtered(image, variance, trust, design, bandwidth)
+        results.append(result)
+        # Stein: E|F - truth|² = E[|F - I|² - σ² + 2 σ² dF/dI].
+        error = np.mean((result - image) ** 2 - variance + 2 * variance * own[..., None], axis=-1)
+        errors.append(uniform_filter(error, 2 * RADIUS + 1))
+    better = (errors[1] < errors[0]).astype(np.float32)
+    share = uniform_filter(better, 2 * PATCH + 1)[..., None]
+    return ((1 - share) * results[0] + share * results[1]).astype(np.float32)
+
+
+def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """(H, W, 1) in (0, 1]: near 1 but for pixels whose variance is far beyond that of their neighbourhood.
+
+    A spot of light in the dark differs from the dark by little more than its own noise, and the patches around it are
+    alike: without this it is smeared over them.
+    """
+    total = variance.mean(axis=-1)
+    usual = OUTLIER * median_filter(total, 2 * RADIUS + 1) + _floor(image)
+    return (usual / (usual + total))[..., None].astype(np.float32)
+
+
+def _floor(image: np.ndarray) -> float:
+    """A variance that is nothing beside the image."""
+    return 1e-6 * float(np.mean(image.astype(np.float64) ** 2)) + 1e-30
+
+
+def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
+    """(H, W, 1 + features) float32: the constant, and the features less their means over their ranges."""
+    columns = [np.ones((*size, 1), np.float32)]
+    for feature in features:
+        for channel in np.moveaxis(feature, -1, 0):
+            low, high = np.percentile(channel, (1, 99))
+            spread = high - low
+            if spread > 1e-6 * max(abs(low), abs(high)):
+                columns.append(((np.clip(channel, low, high) - (low + high) / 2) / spread)[..., None])
+    return np.concatenate(columns, axis=-1).astype(np.float32)
+
+
+def _filtered(
+    image: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The collaborative fits at one bandwidth, and how much of itself each pixel keeps, about dF/dI."""
+    n = design.shape[-1]
+    rows, columns = np.triu_indices(n)
+    products = design[..., rows] * design[..., columns]
+    targets = (design[..., :, None] * image[..., None, :]).reshape(*image.shape[:2], -1)
+    moments = np.concatenate([products, targets], axis=-1).astype(np.float32)
+    sums = _gathered(moments * trust, image, variance, bandwidth)
+    gram = np.empty((*image.shape[:2], n, n))
+    gram[..., rows, columns] = gram[..., columns, rows] = sums[..., : len(rows)]
+    # Ridge on the slopes only, in proportion to the weights' sum, so that flat features cannot make the fit unstable.
+    weight = gram[..., 0, 0].copy()
+    index = np.arange(1, n)
+    gram[..., index, index] += RIDGE * weight[..., None]
+    right = sums[..., len(rows) :].reshape(*image.shape[:2], n, 3)
+    fits = np.linalg.solve(gram, right.astype(np.float64)).astype(np.float32)
+    # A pixel's own weight in its own fit: the hat matrix's diagonal.
+    leverage = np.einsum("...i,...i", design, np.linalg.solve(gram, design[..., None].astype(np.float64))[..., 0])
+    spread = np.concatenate([fits.reshape(*image.shape[:2], -1), np.ones((*image.shape[:2], 1), np.float32)], axis=-1)
+    del sums, gram, right
+    gathered = _gathered(spread * trust, image, variance, bandwidth)
+    fits = gathered[..., :-1].reshape(*image.shape[:2], n, 3) / gathered[..., -1:, None]
+    return np.einsum("...i,...ic->...c", design, fits), np.clip(leverage, 0, 1)
+
+
+def _gathered(values: np.ndarray, image: np.ndarray, variance: np.ndarray, bandwidth: float) -> np.ndarray:
+    """Σ_q w_pq values_q for each pixel p; the weights are symmetric."""
+    height, width = image.shape[:2]
+    padded = np.pad(values, ((RADIUS, RADIUS), (RADIUS, RADIUS), (0, 0)))
+    result = np.zeros_like(values)
+    for dy, dx, weights in _weights(image, variance, bandwidth):
+        for y in range(0, height, _TILE):
+            for x in range(0, width, _TILE):
+                here = np.s_[y : min(y + _TILE, height), x : min(x + _TILE, width)]
+                rows = slice(here[0].start + RADIUS + dy, here[0].stop + RADIUS + dy)
+                columns = slice(here[1].start + RADIUS + dx, here[1].stop + RADIUS + dx)
+                result[here] += weights[here][..., None] * padded[rows, columns]
+    return result
+
+
+def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Iterator[tuple[int, int, np.ndarray]]:
+    """Offsets (dy, dx) and the weights (H, W) of the pixels there, 0 where those are outside the image."""
+    height, width = image.shape[:2]
+    floor = _floor(image)
+    reach = [range(-min(RADIUS, n - 1), min(RADIUS, n - 1) + 1) for n in (height, width)]
+    for dy, dx in product(*reach):
+        here = np.s_[max(-dy, 0) : height - max(dy, 0), max(-dx, 0) : width - max(dx, 0)]
+        there = np.s_[max(dy, 0) : height - max(-dy, 0), max(dx, 0) : width - max(-dx, 0)]
+        both = variance[here] + variance[there]
+        distance = ((image[here] - image[there]) ** 2 - both) / (floor + bandwidth**2 * both)
+        patch = uniform_filter(np.mean(distance, axis=-1), 2 * PATCH + 1)
+        weights = np.zeros((height, width), np.float32)
+        weights[here] = np.exp(-np.maximum(patch, 0))
+        yield dy, dx, weights

@@ -1,0 +1,112 @@
+"""Tables and plots of cells whose order is known."""
+
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+
+from evaluation.axes import Axes, ticks
+from evaluation.frontier import Point, draw, pareto
+from evaluation.results import as_csv, summarised
+from evaluation.stacks import content_hash
+from evaluation.tables import tables
+
+
+def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
+    """Two scenes, one spp, with these errors by method, one for each seed; the second scene's are a hundred times."""
+    stacks = {"primal": "path", "oidn": "features"}
+    results = {
+        "title": "Title",
+        "command": "command",
+        "date": "today",
+        "metadata": {"versions": {}, "threads": 1, "cpu": "cpu", "commit": None},
+        "primary": "relMSE",
+        "metrics": {"relMSE": {"formula": "f", "better": "lower"}, "PSNR": {"formula": "p", "better": "higher"}},
+        "settings": {"spp": [16], "seeds": 3, "size": [8, 8]},
+        "methods": {m: {"stack": stacks.get(m, "gradients"), "absent": None} for m in errors},
+        "scenes": {s: {"reference": {"noise": noise}, "cost": {}, "absent": None} for s in ("a", "b")},
+        "cells": [],
+    }
+    for scene, factor in (("a", 1), ("b", 100)):
+        for method, values in errors.items():
+            for seed, value in enumerate(values):
+                cell = {"scene": scene, "spp": 16, "method": method, "seed": seed, "spp used": 20, "absent": None}
+                cell["seconds"] = {"render": 2.0, "reconstruct": seed + 1.0, "total": seed + 3.0}
+                cell["metrics"] = {"relMSE": value * factor, "PSNR": 10.0 * factor}
+                results["cells"].append(cell)
+    results["summary"] = summarised(results)
+    return results
+
+
+def row_of(text: str, scene: str) -> list[str]:
+    line = next(line for line in text.splitlines() if line.startswith(f"| {scene} "))
+    return [cell.strip() for cell in line.strip("|").split("|")]
+
+
+def test_medians_and_means():
+    results = make_results({"l1": [0.01, 0.02, 0.09], "oidn": [0.03, 0.03, 0.03]})
+    rows = {(row["scene"], row["method"]): row for row in results["summary"]}
+    assert rows["a", "l1"]["error"] == 0.02 and rows["a", "l1"]["seeds"] == 3
+    assert rows["a", "l1"]["metrics"]["relMSE"] == pytest.approx({"median": 0.02, "low": 0.015, "high": 0.055})
+    assert rows["a", "l1"]["seconds"] == {"render": 2.0, "reconstruct": 2.0, "total": 4.0}
+    # Geometric for errors, arithmetic for decibels.
+    assert rows[None, "l1"]["error"] == pytest.approx(0.2)
+    assert rows[None, "l1"]["metrics"]["PSNR"]["median"] == pytest.approx(505)
+    assert rows["a", "l1"]["pareto"] and not rows["a", "oidn"]["pareto"]
+
+
+def test_a_mean_is_of_methods_that_are_on_all_scenes():
+    results = make_results({"l1": [0.01], "oidn": [0.03]})
+    results["cells"] = [c for c in results["cells"] if (c["scene"], c["method"]) != ("b", "oidn")]
+    assert {row["method"] for row in summarised(results) if row["scene"] is None} == {"l1"}
+
+
+def test_losses_are_marked():
+    text = tables(make_results({"primal": [0.5], "l1": [0.2], "wcv": [0.04], "oidn": [0.1]}))
+    assert row_of(text, "a") == ["a", "16", "0.5000", "*0.2000*", "**0.0400**", "0.1000", "0.00000"]
+    assert "| `primal`† | `l1` | `wcv` | `oidn`† |" in text
+
+
+def test_what_the_reference_cannot_tell_is_marked():
+    text = tables(make_results({"l1": [0.2, 0.2, 0.2], "oidn": [0.1, 0.1, 0.4]}, noise=0.05))
+    assert row_of(text, "a")[2:4] == ["*0.2000*", "**0.1000 ±75% ~**"]
+
+
+def test_csv_has_a_line_for_each_cell():
+    lines = as_csv(make_results({"l1": [0.01, 0.02]})).splitlines()
+    assert lines[0] == "scene,spp,method,seed,spp used,render s,reconstruct s,total s,relMSE,PSNR,absent"
+    assert lines[1] == "a,16,l1,0,20,2.0,1.0,3.0,0.01,10.0," and len(lines) == 5
+
+
+def test_the_pareto_set():
+    points = [Point("a", 4, 1, 3), Point("a", 8, 2, 2), Point("b", 4, 2, 2.5), Point("b", 8, 3, 1), Point("c", 4, 3, 3)]
+    assert pareto(points) == [True, True, False, True, False]
+
+
+def test_the_plot_is_legal_and_names_everything():
+    points = [Point("l1 <&>", 4, 0.5, 0.1), Point("l1 <&>", 16, 2.0, 0.02), Point("oidn", 4, 1.0, 0.01)]
+    root = ElementTree.fromstring(draw(points, "a & b", "relMSE", noise=0.015))
+    texts = [element.text for element in root.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"a & b", "relMSE", "l1 <&>", "oidn", "noise of reference"} <= set(texts)
+    circles = list(root.iter("{http://www.w3.org/2000/svg}circle"))
+    assert [circle.get("stroke") for circle in circles] == ["black", None, "black"]
+    assert float(circles[0].get("cx")) < float(circles[1].get("cx"))
+    assert float(circles[0].get("cy")) < float(circles[1].get("cy"))  # y goes down, and so does the error
+
+
+def test_axes_of_a_single_point_and_ticks():
+    assert ticks(0.9, 21) == [1, 2, 5, 10, 20] and ticks(1e-6, 1.5) == pytest.approx([10.0**p for p in range(-6, 1)])
+    assert Axes((1, 1), (1, 1)).x(1) == pytest.approx(Axes((0.1, 10), (1, 1)).x(1))
+
+
+def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
+    (tmp_path / "scene.xml").write_text('<scene><include filename="part.xml"/></scene>')
+    (tmp_path / "part.xml").write_text('<string name="filename" value="meshes/m.ply"/><float value="0.5"/>')
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/m.ply").write_text("one")
+    hashes = [content_hash(str(tmp_path / "scene.xml"))]
+    assert hashes[0] == content_hash(str(tmp_path / "scene.xml"))
+    (tmp_path / "meshes/m.ply").write_text("two")
+    hashes.append(content_hash(str(tmp_path / "scene.xml")))
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    hashes.append(content_hash(str(tmp_path / "scene.xml")))
+    assert len({*hashes, content_hash("diffuse"), content_hash("glossy")}) == 5

@@ -1,0 +1,264 @@
+"""Whole evaluations: of folders of stacks, which need no renderer, and one that renders."""
+
+import csv
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ngpt
+from eval import main as command
+from evaluation import cells
+from evaluation.config import read_config
+from evaluation.run import evaluate, picture_path
+from evaluation.stability import flicker_and_bias, rolling_shutter, study
+from ngpt.console import Console
+from ngpt.errors import NgptError
+from ngpt.exr import read_image
+from ngpt.gradients import forward_differences
+from ngpt.stack import GradientStack
+
+QUIET = Console(quiet=True)
+CONFIG = """
+scenes = ["{folder}"]
+spp = [4, 16]
+seeds = 2
+methods = ["primal", "l2", "wcv", "nfor", "oracle"]
+metrics = ["relMSE", "relMSE trimmed", "PSNR"]
+images = "all"
+"""
+
+
+def write_scene(folder: Path, rng: np.random.Generator, spp=(4, 16), seeds=2) -> np.ndarray:
+    """A folder of stacks of a smooth image, 24x17, whose noise falls with the samples; returns the image."""
+    folder.mkdir()
+    y, x = np.mgrid[0:17, 0:24] / 10
+    clean = np.stack([1 + np.sin(x + c) * np.cos(y) / 2 for c in range(3)], axis=-1)
+    features = {"albedo": clean / 2, "normal": np.zeros_like(clean), "depth": np.ones((17, 24, 1))}
+    for n in spp:
+        for seed in range(seeds):
+            noisy = {"primal": clean + rng.normal(0, 0.5 / n**0.5, clean.shape)}
+            noisy["primal_var"] = np.full_like(clean, 0.25 / n)
+            for name, difference in zip(("dx", "dy"), forward_differences(clean), strict=True):
+                noisy[name] = difference + rng.normal(0, 0.1 / n**0.5, clean.shape)
+                noisy[f"{name}_var"] = np.full_like(clean, 0.01 / n)
+            primal = {name: noisy[name] for name in ("primal", "primal_var")}
+            attributes = {"ngpt:seconds": 0.1 * n, "ngpt:spp": n}
+            for kind, layers in (("gradients", noisy | features), ("features", primal | features), ("path", primal)):
+                stack = GradientStack.from_arrays(attributes=attributes, **layers)
+                ngpt.write(folder / f"{kind}-{n}-{seed}.exr", stack)
+    ngpt.write(folder / "reference.exr", clean.astype(np.float32))
+    return clean
+
+
+def read(text: str, folder: Path):
+    path = folder / "config.toml"
+    path.write_text(text)
+    return read_config(path)
+
+
+@pytest.fixture
+def room(tmp_path, rng):
+    write_scene(tmp_path / "room", rng)
+    return tmp_path, read(CONFIG.format(folder=tmp_path / "room"), tmp_path)
+
+
+def test_the_folder_of_results(room):
+    folder, config = room
+    out = folder / "out"
+    evaluate(config, out, QUIET, "the command")
+    results = json.loads((out / "results.json").read_text())
+    found = {(c["spp"], c["method"], c["seed"]): c for c in results["cells"]}
+    assert len(found) == len(results["cells"]) == 2 * 2 * 5
+    assert all(found[16, m, 0]["metrics"]["relMSE"] < found[4, m, 0]["metrics"]["relMSE"] for m in ("primal", "l2"))
+    cell = found[16, "l2", 1]
+    assert cell["seconds"]["render"] == pytest.approx(1.6)
+    assert cell["seconds"]["total"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"])
+    assert results["methods"]["primal"]["stack"] == "path" and results["methods"]["nfor"]["stack"] == "features"
+    assert results["methods"]["wcv"]["stack"] == "gradients"
+    for cell in results["cells"]:
+        if not cell["absent"]:
+            assert read_image(out / cell["image"]).shape == (17, 24, 3)
+    means = [row for row in results["summary"] if row["scene"] is None]
+    assert {row["method"] for row in means} == {"primal", "l2", "wcv", "nfor"}
+    assert any(row["pareto"] for row in results["summary"])
+    with open(out / "results.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert len(lines) == 20 and float(lines[0]["relMSE"]) == found[4, "primal", 0]["metrics"]["relMSE"]
+    assert (out / results["plots"]["frontier"]["room"]).read_text().startswith("<svg")
+    assert "the command" in (out / "results.md").read_text()
+
+
+def test_a_missing_method_is_a_row_that_says_why(room):
+    folder, config = room
+    results = evaluate(config, folder / "out", QUIET, "")
+    rows = [cell for cell in results["cells"] if cell["method"] == "oracle"]
+    assert len(rows) == 4 and all("no method 'oracle'" in row["absent"] for row in rows)
+    assert "- `oracle`: there is no method 'oracle'" in (folder / "out" / "results.md").read_text()
+
+
+def test_what_is_done_is_not_done_again(room, monkeypatch):
+    folder, config = room
+    first = evaluate(config, folder / "out", QUIET, "")
+    monkeypatch.setattr(cells, "reconstruct", lambda *a, **k: pytest.fail("reconstructed again"))
+    assert evaluate(config, folder / "out", QUIET, "")["cells"] == first["cells"]
+
+
+def test_killed_half_way_goes_on(room, monkeypatch):
+    folder, config = room
+    real, calls = cells.reconstruct, []
+
+    def dies(*arguments, **options):
+        calls.append(arguments)
+        if len(calls) == 7:
+            raise KeyboardInterrupt
+        return real(*arguments, **options)
+
+    monkeypatch.setattr(cells, "reconstruct", dies)
+    with pytest.raises(KeyboardInterrupt):
+        evaluate(config, folder / "out", QUIET, "")
+    done = len(list((folder / "out" / "cache" / "cells").glob("*.json")))
+    assert done > 0
+    calls[:] = [None] * 8
+    results = evaluate(config, folder / "out", QUIET, "")
+    assert sum(not cell["absent"] for cell in results["cells"]) == 16
+    # One warm-up for each method, and the cells that were left.
+    assert len(calls) - 8 == 4 + 16 - done
+
+
+def test_a_changed_stack_is_another_cell(room, rng):
+    folder, config = room
+    first = evaluate(config, folder / "out", QUIET, "")
+    shutil.rmtree(folder / "room")
+    write_scene(folder / "room", rng)
+    second = evaluate(config, folder / "out", QUIET, "")
+    assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda room, clean: ngpt.write(room / "reference.exr", clean[:-1], overwrite=True), "24x17 and 24x16"),
+        (lambda room, clean: ngpt.write(room / "reference.exr", 8 * clean, overwrite=True), "3.0 stops brighter"),
+        (lambda room, clean: (room / "reference.exr").unlink(), "no reference"),
+        (lambda room, clean: (room / "gradients-16-1.exr").unlink(), "gradients-16-1.exr: no such stack"),
+    ],
+)
+def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message):
+    clean = write_scene(tmp_path / "room", rng).astype(np.float32)
+    write_scene(tmp_path / "hall", rng)
+    spoil(tmp_path / "room", clean)
+    scenes = f'"{tmp_path}/room", "{tmp_path}/hall", "{tmp_path}/none"'
+    config = read(CONFIG.replace('"{folder}"', scenes), tmp_path)
+    results = evaluate(config, tmp_path / "out", QUIET, "")
+    absent = {cell["absent"] for cell in results["cells"] if cell["scene"] == "room" and cell["method"] == "l2"}
+    assert any(why and message in why for why in absent)
+    assert results["scenes"]["hall"]["absent"] is None
+    assert all(cell["absent"] for cell in results["cells"] if cell["scene"] == "none")
+    assert message in (tmp_path / "out" / "results.md").read_text()
+
+
+def test_a_stack_without_features_is_an_absent_cell(room):
+    folder, config = room
+    for path in (folder / "room").glob("features-*.exr"):
+        path.unlink()
+        shutil.copy(path.with_name(path.name.replace("features", "path")), path)
+    results = evaluate(config, folder / "out", QUIET, "")
+    rows = {cell["method"]: cell["absent"] for cell in results["cells"]}
+    assert "method 'nfor' needs layers 'albedo'" in rows["nfor"] and rows["l2"] is None
+
+
+@pytest.mark.parametrize(
+    ("entry", "message"),
+    [
+        ("colour = 1", "unknown entry 'colour'"),
+        ('spp = "4"', "spp = '4': must be like"),
+        ("spp = [4.5]", "must be a list of int"),
+        ("seeds = 0", "must be at least 1"),
+        ('metrics = ["beauty"]', "no metric 'beauty'"),
+        ('primary = "SSIM"', "primary = 'SSIM' is not among metrics"),
+        ('methods = ["l1", "l1"]', "listed twice"),
+        ('images = "some"', "images = 'some'"),
+        ('[variants.x]\nstack = "left"\nmethod = "l1"', "stack must be one of"),
+        ("[variants.x]\nalpha = 1", "variants.x: method is missing"),
+    ],
+)
+def test_errors_of_the_configuration(tmp_path, entry, message):
+    text = f'scenes = ["diffuse"]\n{entry}\n'
+    if entry.startswith("primary"):
+        text += 'metrics = ["relMSE"]\n'
+    with pytest.raises(NgptError) as error:
+        read(text, tmp_path)
+    assert message in str(error.value) and "config.toml" in str(error.value)
+
+
+def test_the_configurations_that_ship_are_legal():
+    paths = sorted(Path(__file__).parents[2].glob("configs/eval-*.toml"))
+    assert len(paths) >= 7
+    for path in paths:
+        config = read_config(path)
+        named = [column.name for column in config.columns()]
+        assert not set(config.variants) - set(named), path
+
+
+def test_the_command(room, capsys):
+    folder, _ = room
+    out = folder / "out"
+    write_scene(folder / "hall", np.random.default_rng(1))
+    arguments = ["--config", str(folder / "config.toml"), "--out", str(out), "--scenes", str(folder / "hall"), "-q"]
+    assert command(arguments) == 0
+    results = json.loads((out / "results.json").read_text())
+    assert set(results["scenes"]) == {"room", "hall"} and "--scenes" in results["command"]
+    assert command(["--config", str(folder / "none.toml"), "--out", str(out)]) == 2
+    assert "none.toml: cannot be read" in capsys.readouterr().err
+    (folder / "hall" / "reference.exr").unlink()
+    assert command(arguments) == 1
+
+
+def test_stability(room):
+    folder, config = room
+    evaluate(config, folder / "out", QUIET, "")
+    rows = {(r["spp"], r["method"]): r for r in study(folder / "out")}
+    # Noise of 0.5 / sqrt(n) on values of about 1.
+    assert 4 * rows[16, "primal"]["flicker"] == pytest.approx(rows[4, "primal"]["flicker"], rel=0.2)
+    assert rows[4, "l2"]["flicker"] < 0.5 * rows[4, "primal"]["flicker"]
+    assert (folder / "out/stability/room-4-l2.png").read_bytes().startswith(b"\x89PNG")
+    assert "`primal`" in (folder / "out/stability.md").read_text()
+    (folder / "out" / picture_path("room", 4, "l2", 1)).unlink()
+    with pytest.raises(NgptError, match=r"4-l2-seed1\.exr: no such picture"):
+        study(folder / "out")
+
+
+def test_flicker_and_bias_add_up(rng):
+    reference = np.ones((40, 50, 3))
+    images = reference + 0.3 + rng.normal(0, 0.2, (8, 40, 50, 3))
+    parts = flicker_and_bias(images, reference, share=0)
+    assert parts["bias"] == pytest.approx(0.09 / 1.001, rel=0.03)
+    assert parts["flicker"] == pytest.approx(0.04 / 1.001, rel=0.03)
+    with pytest.raises(NgptError, match="at least 2 seeds"):
+        flicker_and_bias(images[:1], reference)
+
+
+def test_rolling_shutter_takes_each_row_of_its_seed():
+    images = np.arange(3.0)[:, None, None, None] * np.ones((1, 7, 2, 3))
+    assert rolling_shutter(images)[:, 0, 0].tolist() == [0, 0, 0, 1, 1, 2, 2]
+
+
+def test_the_tiny_configuration(renderer, tmp_path):
+    config = read_config(Path(__file__).parents[2] / "configs/eval-tiny.toml")
+    results = evaluate(config, tmp_path, QUIET, "")
+    assert not any(entry["absent"] for entry in results["scenes"].values())
+    costs = results["scenes"]["glossy"]["cost"]
+    assert costs["gradients"]["median"] > costs["path"]["median"]
+    used = {(c["method"], c["spp"]): c["spp used"] for c in results["cells"] if c["scene"] == "glossy"}
+    ratio = costs["gradients"]["median"] / costs["path"]["median"]
+    assert used["primal", 16] == round(16 * ratio) and used["primal-gpt", 16] == used["l1", 16] == 16
+    errors = {(r["method"], r["spp"]): r["error"] for r in results["summary"] if r["scene"] is None}
+    assert errors["wcv", 16] < errors["primal-gpt", 16] and errors["nfor", 16] < errors["primal-gpt", 16]
+    stack = next((tmp_path / "cache").glob("glossy-*/path-*-0.exr"))
+    assert "albedo" not in ngpt.read(stack)
+    # A second run renders nothing.
+    stamp = stack.stat().st_mtime_ns
+    assert evaluate(config, tmp_path, QUIET, "")["cells"] == results["cells"] and stack.stat().st_mtime_ns == stamp
