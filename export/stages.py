@@ -24,10 +24,10 @@ FUNCTIONS = f"""
 <domain: "ngpt", opset_import: ["": 18]>
 Finite (x) => (finite)
 {{
-    nan = IsNaN (x)
-    infinite = IsInf (x)
-    bad = Or (nan, infinite)
-    finite = Not (bad)
+    # What is not finite is not 0 less than itself.
+    difference = Sub (x, x)
+    zero = Constant <value_float: float = 0.0> ()
+    finite = Equal (difference, zero)
 }}
 
 <domain: "ngpt", opset_import: ["": 18]>
@@ -238,6 +238,18 @@ SignedLog (x) => (y)
 }}
 
 <domain: "ngpt", opset_import: ["": 18]>
+Encoded (x) => (y)
+{{
+    # SignedLog for networks, which do not see 6e-8 more or less.
+    one = Constant <value_float: float = 1.0> ()
+    size = Abs (x)
+    more = Add (size, one)
+    logarithm = Log (more)
+    sign = Sign (x)
+    y = Mul (sign, logarithm)
+}}
+
+<domain: "ngpt", opset_import: ["": 18]>
 SignedExp (y) => (x)
 {{
     # As ONNX has no expm1: u = exp y, (u - 1) y / log(u) [Kahan].
@@ -444,6 +456,7 @@ _SCALE = Template("""
     i4 = Constant <value_ints: ints = [4]> ()
     i5 = Constant <value_ints: ints = [5]> ()
     zero = Constant <value_float: float = 0.0> ()
+    one = Constant <value_float: float = 1.0> ()
     given_exposure = Slice (statistics, i0, i1)
     given_number = ReduceMax <keepdims: int = 0> (given_exposure)
     is_given = Greater (given_number, zero)
@@ -515,11 +528,11 @@ _PADS = f"""
 def _encode(name: str) -> str:
     """Nodes that make ``NAME_encoded``, as ``ngpt.network.features`` tells."""
     if name == "base":
-        return "base_positive = Max (base_scaled, zero)\nbase_encoded = ngpt.SignedLog (base_positive)"
+        return "base_positive = Max (base_scaled, zero)\nbase_more = Add (base_positive, one)\nbase_encoded = Log (base_more)"
     if name == "primal":
-        return "primal_positive = Max (primal_scaled, zero)\nprimal_encoded = ngpt.SignedLog (primal_positive)"
+        return "primal_positive = Max (primal_scaled, zero)\nprimal_more = Add (primal_positive, one)\nprimal_encoded = Log (primal_more)"
     if name in ("dx", "dy"):
-        return f"{name}_encoded = ngpt.SignedLog ({name}_scaled)"
+        return f"{name}_encoded = ngpt.Encoded ({name}_scaled)"
     if name == "depth":
         return """
     tiny_depth = Constant <value_float: float = 1e-10> ()
@@ -533,7 +546,8 @@ def _encode(name: str) -> str:
     {name}_root = Sqrt ({name}_positive)
     {name}_scaled = Div ({name}_root, exposure)
     {name}_mean = ReduceMean <keepdims: int = 1> ({name}_scaled, i1)
-    {name}_encoded = ngpt.SignedLog ({name}_mean)"""
+    {name}_more = Add ({name}_mean, one)
+    {name}_encoded = Log ({name}_more)"""
     return f"{name}_encoded = Identity ({name}_clean)"
 
 

@@ -178,8 +178,6 @@ def _session(path: str, _modified: int, device: str, threads: int):
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
     options.log_severity_level = 3
-    # Memory once used would be kept; tiles are large enough to make little of getting it anew.
-    options.enable_cpu_mem_arena = False
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])
     except Exception as error:

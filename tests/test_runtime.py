@@ -29,7 +29,7 @@ def image():
     return layers, Network(FAST).reconstruct(layers)
 
 
-@pytest.mark.parametrize(("memory", "batch"), [(50, 1), (30, 1), (22, 1), (60, 2), (90, 3)])
+@pytest.mark.parametrize(("memory", "batch"), [(70, 1), (42, 1), (32, 1), (84, 2), (126, 3)])
 def test_tiles_do_not_show(network, image, memory, batch):
     layers, whole = image
     tiles, size = network.plan(197, 303, memory, batch)
@@ -39,7 +39,7 @@ def test_tiles_do_not_show(network, image, memory, batch):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 900), (1080, 1920), (333, 1001), (4320, 8192)])
-@pytest.mark.parametrize("memory", [25, 300, 2048])
+@pytest.mark.parametrize("memory", [35, 300, 2048])
 def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
     tiles, (rows, columns) = network.plan(*size, memory)
     count = np.zeros(size, np.uint8)
@@ -61,12 +61,12 @@ def test_a_file_that_is_on_disk_twice_is_loaded_twice_and_once_otherwise(tmp_pat
 def test_progress_and_stop(network, image):
     layers, _ = image
     calls = []
-    network.reconstruct(layers, memory=30, progress=lambda *call: calls.append(call))
+    network.reconstruct(layers, memory=42, progress=lambda *call: calls.append(call))
     total = calls[0][1]
     assert total > 3 and calls == [(i, total) for i in range(total + 1)]
     seen = []
     with pytest.raises(Cancelled, match=f"2 of {total}"):
-        network.reconstruct(layers, memory=30, progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2)
+        network.reconstruct(layers, memory=42, progress=lambda *call: seen.append(call), stop=lambda: len(seen) > 2)
 
 
 def test_memory_that_does_not_hold_a_tile_is_refused_with_what_would(network, image):
@@ -121,7 +121,7 @@ def test_bad_files(tmp_path, image):
         Network(WEIGHTS / "ngpt-fast.statistics.onnx")
     shutil.copy(FAST, tmp_path / "alone.onnx")
     with pytest.raises(NgptError, match=r"alone\.statistics\.onnx: no such file"):
-        Network(tmp_path / "alone.onnx").reconstruct(image[0], memory=30)
+        Network(tmp_path / "alone.onnx").reconstruct(image[0], memory=42)
 
 
 def test_missing_layers_are_named(network):
