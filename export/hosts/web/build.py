@@ -1,8 +1,8 @@
 """One HTML file that runs a network in a browser, without a server: ONNX Runtime, the model and an example inside.
 
-    npm install --prefix FOLDER onnxruntime-web@1.30.0
-    ngpt render glossy --spp 16 --size 192x144 -o example.exr
-    python -m export.hosts.web.build --runtime FOLDER/node_modules/onnxruntime-web --example example.exr -o ngpt.html
+npm install --prefix FOLDER onnxruntime-web@1.30.0
+ngpt render glossy --spp 16 --size 192x144 -o example.exr
+python -m export.hosts.web.build --runtime FOLDER/node_modules/onnxruntime-web --example example.exr -o ngpt.html
 """
 
 import argparse
@@ -80,7 +80,9 @@ def _embedded(name: str, content: bytes) -> str:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m export.hosts.web.build", description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m export.hosts.web.build", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--runtime", type=Path, required=True, help="folder of the npm package onnxruntime-web")
     parser.add_argument("--example", type=Path, required=True, help="gradient stack to show at first")
     parser.add_argument("--model", type=Path, default=MODEL, help="default: ngpt-fast.onnx")

@@ -34,6 +34,8 @@ async function startWorker() {
 // --- from a file to a clean image ------------------------------------------------------------------------------------
 
 const NEEDED = ["primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"];
+// Pixels in one run at most: each takes 1.6 kB, and WebAssembly has no more than 4 GiB.
+const MOST = 2 ** 20, TILE = 512;
 let worker, turn = 0, stack = null, clean = null, exposure = 0;
 
 async function open(name, contents) {
@@ -54,7 +56,8 @@ async function open(name, contents) {
     if (direct) layers.primal = layers.primal.map((value, i) => value - direct[i]);
     $("status").textContent = `Reconstructing ${name}, ${read.width}x${read.height}…`;
     worker ??= startWorker();
-    (await worker).postMessage({turn, layers, width: read.width, height: read.height});
+    const {width, height} = read, tile = width * height > MOST ? TILE : 0;
+    (await worker).postMessage({turn: mine, layers, width, height, tile});
   } catch (error) {
     if (mine === turn) complain(`${name}: ${error.message}`);
   }
@@ -91,13 +94,14 @@ function draw(canvas, pixels) {
   const {width, height} = stack, n = width * height, gain = 2 ** (stack.stops + exposure);
   Object.assign(canvas, {width, height});
   const context = canvas.getContext("2d"), image = context.createImageData(width, height);
+  image.data.fill(255);
   for (let i = 0; i < n; i++) {
-    const color = [pixels[i], pixels[n + i], pixels[2 * n + i]];
-    const shown = color.some(Number.isNaN) ? [255, 0, 255] : color.map(value => {
-      const x = clamp(value * gain, 0, 1);
-      return Math.round(255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055));
-    });
-    image.data.set([...shown, 255], 4 * i);
+    for (let c = 0; c < 3; c++) {
+      const x = clamp(pixels[c * n + i] * gain, 0, 1);
+      image.data[4 * i + c] = 255 * (x <= 0.0031308 ? 12.92 * x : 1.055 * x ** (1 / 2.4) - 0.055);  // rounds itself
+    }
+    // Not a number is magenta, as everywhere in ngpt.
+    if (Number.isNaN(pixels[i] + pixels[n + i] + pixels[2 * n + i])) image.data.set([255, 0, 255], 4 * i);
   }
   context.putImageData(image, 0, 0);
 }
