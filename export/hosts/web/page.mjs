@@ -146,7 +146,10 @@ const openFile = file => file && open(file.name, file.arrayBuffer());
 const openExample = () => open("example.exr", unpacked("stack").then(bytes => bytes.buffer));
 
 $("open").onclick = () => $("file").click();
-$("file").onchange = () => { openFile($("file").files[0]); };
+$("file").onchange = () => {
+  openFile($("file").files[0]);
+  $("file").value = "";  // so that the same file, rendered anew, can be picked again
+};
 $("example").onclick = openExample;
 $("exposure").oninput = () => expose(Number($("exposure").value));
 addEventListener("resize", fit);
