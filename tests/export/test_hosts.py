@@ -310,7 +310,7 @@ class Page(Session):
     """The page in a browser, with time for the model to be loaded and run."""
 
     def settle(self):
-        end = time.monotonic() + 120
+        end = time.monotonic() + 60
         while time.monotonic() < end:
             if self.ask("root.dataset.ready") == "true" or self.ask("root.dataset.error"):
                 return
@@ -322,13 +322,27 @@ class Page(Session):
         height, width = self.ask("stack.height"), self.ask("stack.width")
         return np.frombuffer(base64.b64decode(self.ask(text)), "<f4").reshape(1, 3, height, width)
 
-    def give(self, *paths):
-        """As if the user had picked the files."""
+    def give(self, path):
+        """As if the user had picked the file."""
         self.ask("root.dataset.ready = 'false'; delete root.dataset.error")
-        node_id = self.call(
-            "DOM.querySelector", nodeId=self.call("DOM.getDocument")["root"]["nodeId"], selector="#file"
-        )
-        self.call("DOM.setFileInputFiles", files=[str(path) for path in paths], nodeId=node_id["nodeId"])
+        root = self.call("DOM.getDocument")["root"]["nodeId"]
+        picker = self.call("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+        self.call("DOM.setFileInputFiles", files=[str(path)], nodeId=picker)
+        self.settle()
+
+    def send(self, layers, tile, then=""):
+        """Has the worker reconstruct layers that are in no file; runs the script ``then`` before it can answer."""
+        data = {name: base64.b64encode(layer.tobytes()).decode() for name, layer in layers.items()}
+        height, width = layers["primal"].shape[2:]
+        self.ask(f"""worker.then(worker => {{
+            const layers = {json.dumps(data)}, width = {width}, height = {height};
+            for (const name in layers)
+                layers[name] = new Float32Array(Uint8Array.from(atob(layers[name]), c => c.charCodeAt(0)).buffer);
+            root.dataset.ready = "false";
+            stack = {{turn: ++turn, name: "layers", width, height, layers}};
+            worker.postMessage({{turn, layers, width, height, tile: {tile}}});
+            {then}
+        }})""")
         self.settle()
 
 
@@ -360,17 +374,8 @@ def test_direct_emission_is_kept_aside(page, tmp_path):
 
 
 def test_tiles_of_the_page_agree_with_the_whole(page, wide):
-    """By the page's own code, in the page: the model that its worker has is not to be had here."""
     folder, expected = wide
-    layers = read_vector(folder)
-    page.ask(f"wide = {json.dumps({name: base64.b64encode(a.tobytes()).decode() for name, a in layers.items()})}")
-    page.ask("root.dataset.ready = 'false'; turn++; stack = {name: 'wide', width: 348, height: 23, layers: {}}")
-    page.ask(
-        "for (const name in wide) stack.layers[name] = new Float32Array("
-        "Uint8Array.from(atob(wide[name]), c => c.charCodeAt(0)).buffer)"
-    )
-    page.ask("worker.then(w => w.postMessage({turn, layers: stack.layers, width: 348, height: 23, tile: 96}))")
-    page.settle()
+    page.send(read_vector(folder), 96)
     agree(page.pixels("clean"), expected)
 
 
@@ -412,6 +417,21 @@ def test_the_page_says_what_is_wrong_and_goes_on(page, tmp_path):
     assert page.ask("$('problem').hidden") is True and page.ask("root.dataset.error ?? null") is None
     agree(page.pixels("clean"), layers["image"])
     assert page.complaints == []
+
+
+def test_a_file_may_be_dropped(page):
+    page.ask("""root.dataset.ready = 'false'; delete root.dataset.error; dropped = new DataTransfer();
+        dropped.items.add(new File(['not an image'], 'dropped.exr'));
+        document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: dropped, bubbles: true}))""")
+    page.settle()
+    assert page.ask("$('problem').textContent") == "dropped.exr: it is not an OpenEXR file"
+
+
+def test_a_bad_file_does_not_end_the_work_on_a_good_one(page, wide):
+    folder, expected = wide
+    page.send(read_vector(folder), 0, "open('bad.exr', new ArrayBuffer(3)).then(() => delete root.dataset.error)")
+    assert page.ask("$('problem').textContent") == "bad.exr: it is not an OpenEXR file"
+    agree(page.pixels("clean"), expected)
 
 
 @pytest.mark.slow

@@ -49,7 +49,7 @@ async function open(name, contents) {
     const missing = NEEDED.filter(layer => !(layer in read.layers));
     if (missing.length) throw new Error(`the network needs the layers ${missing.join(", ")}, which it has not`);
     if (mine !== turn) return;
-    [stack, clean] = [{name, ...read}, null];
+    [stack, clean] = [{turn: mine, name, ...read}, null];
     show();
     // Emission that the camera sees has no noise; it is kept aside.
     const {direct, ...layers} = read.layers;
@@ -64,7 +64,7 @@ async function open(name, contents) {
 }
 
 function answered(data) {
-  if (data.turn !== undefined && data.turn !== turn) return;
+  if (data.turn !== stack.turn) return;
   const {name, width, height, layers: {direct}} = stack;
   if (data.error) return complain(`${name}: ${data.error}`);
   if (data.all) return void ($("status").textContent = `Reconstructing ${name}: ${data.done} of ${data.all} tiles`);
@@ -117,12 +117,13 @@ function show() {
   split(Number($("wipe").getAttribute("aria-valuenow") ?? 50));
 }
 
-/** As large as fits; by whole factors where it is enlarged. */
+/** As large as fits; enlarged by whole factors, but for the first. */
 function fit() {
   if (!stack) return;
   const {width, height} = stack, style = $("frame").style;
   const factor = Math.min($("stage").clientWidth / width, $("stage").clientHeight / height);
-  const scale = factor > 1 ? Math.floor(factor) : factor;
+  const scale = factor > 2 ? Math.floor(factor) : factor;
+  $("frame").classList.toggle("enlarged", scale > 1);
   [style.width, style.height] = [`${width * scale}px`, `${height * scale}px`];
 }
 
