@@ -151,6 +151,8 @@ def test_a_host_says_what_is_wrong(host, tmp_path):
 
     output = tmp_path / "image.pfm"
     refused(2, "usage", MODEL)
+    refused(2, "usage", MODEL, VECTOR, output, "-5")
+    refused(2, "usage", MODEL, VECTOR, output, 0, "many")
     refused(1, "none.onnx", tmp_path / "none.onnx", VECTOR, output)
     refused(1, "statistics|ngpt.inputs", MODEL.with_suffix(".statistics.onnx"), VECTOR, output)
     layers = read_vector(VECTOR)

@@ -161,7 +161,10 @@ void write_pfm(const std::string &path, Layer &image) {
 }
 
 int main(int count, char **arguments) try {
-    if (count < 4 || count > 6) {
+    bool understood = count >= 4 && count <= 6;
+    for (int i = 4; i < count; i++)
+        understood &= std::string(arguments[i]).find_first_not_of("0123456789") == std::string::npos;
+    if (!understood) {
         std::fprintf(stderr, "usage: ngpt-host MODEL.onnx FOLDER OUTPUT.pfm [TILE [RUNS]]\n");
         return 2;
     }

@@ -15,7 +15,7 @@ import {Model} from "../javascript/model.mjs";
 const SUFFIX = /\.onnx$/;
 
 async function main([path, folder, output, tile = "0", runs = "1"]) {
-  if (output === undefined) {
+  if (output === undefined || !/^\d+$/.test(tile) || !/^\d+$/.test(runs)) {
     console.error("usage: node host.mjs MODEL.onnx FOLDER OUTPUT.pfm [TILE [RUNS]]");
     return 2;
   }
