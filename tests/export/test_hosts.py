@@ -1,0 +1,451 @@
+"""The hosts in other languages: each is built and run, and must agree with ONNX Runtime in Python.
+
+C++ wants a compiler and ONNX Runtime's headers and library, of the system or in ORT_ROOT; Node and the browser want
+onnxruntime-node and onnxruntime-web in a node_modules that NODE_PATH names, or beside the host. See docs/hosts.md.
+"""
+
+import base64
+import json
+import os
+import re
+import shutil
+import subprocess
+import time
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+from exr_files import noise, same_bits, window, write_raw
+from test_report import Session
+
+import ngpt
+
+ort = pytest.importorskip("onnxruntime")
+
+ROOT = Path(__file__).parents[2]
+HOSTS, VECTOR = ROOT / "export" / "hosts", ROOT / "export" / "vector"
+MODEL = Path(ngpt.__file__).parent / "weights" / "ngpt-fast.onnx"
+LETTERS = {"normal": "XYZ", "depth": "Z"}
+
+
+# --- what is expected ------------------------------------------------------------------------------------------------
+
+
+def read_vector(folder) -> dict[str, np.ndarray]:
+    shapes = {name: item["shape"] for name, item in json.loads((folder / "vector.json").read_text()).items()}
+    return {name: np.fromfile(folder / f"{name}.f32", "<f4").reshape(shape) for name, shape in shapes.items()}
+
+
+def write_vector(folder, layers) -> Path:
+    folder.mkdir()
+    for name, layer in layers.items():
+        (folder / f"{name}.f32").write_bytes(layer.astype("<f4").tobytes())
+    (folder / "vector.json").write_text(json.dumps({name: {"shape": layer.shape} for name, layer in layers.items()}))
+    return folder
+
+
+def repeated(height, width) -> dict[str, np.ndarray]:
+    """The vector's layers again and again, sixteen times as bright at the right as at the left."""
+    brightness, layers = np.exp2(4 * np.arange(width) / width), {}
+    for name, layer in read_vector(VECTOR).items():
+        if name != "image":
+            power = 2 if name.endswith("_var") else 0 if name in ("albedo", "normal", "depth") else 1
+            many = np.tile(layer, (1, 1, -(-height // 23), -(-width // 29)))[:, :, :height, :width]
+            layers[name] = (many * brightness**power).astype(np.float32)
+    return layers
+
+
+@pytest.fixture(scope="module")
+def python():
+    """ONNX Runtime in Python: layers in, image out."""
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    session = ort.InferenceSession(MODEL, options, providers=["CPUExecutionProvider"])
+    return lambda layers: session.run(["image"], layers)[0]
+
+
+@pytest.fixture(scope="module")
+def wide(tmp_path_factory, python):
+    """A folder with layers so wide that tiles do not see all of them, and their image."""
+    layers = repeated(23, 348)
+    return write_vector(tmp_path_factory.mktemp("wide") / "layers", layers), python(layers)
+
+
+def read_pfm(path) -> np.ndarray:
+    kind, size, scale, pixels = path.read_bytes().split(b"\n", 3)
+    assert (kind, scale) == (b"PF", b"-1.0")
+    width, height = map(int, size.split())
+    return np.frombuffer(pixels, "<f4").reshape(height, width, 3)[::-1].transpose(2, 0, 1)[None]
+
+
+def agree(image, expected):
+    assert image.shape == expected.shape
+    assert np.abs(image - expected).max() <= 1e-4 * np.abs(expected).max()
+
+
+# --- C++ and Node, which are called alike ----------------------------------------------------------------------------
+
+
+def cpp_host(folder) -> list[str]:
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("neither g++ nor clang++ is installed")
+    root = Path(os.environ.get("ORT_ROOT", "/usr"))
+    headers = [path for path in (root / "include", root / "include" / "onnxruntime") if path.is_dir()]
+    if not any((path / "onnxruntime_cxx_api.h").exists() for path in headers):
+        pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include; name a release's folder in ORT_ROOT")
+    program, library = folder / "ngpt-host", root / "lib"
+    command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / "host.cpp", "-o", program]
+    command += [flag for path in headers for flag in ("-isystem", path) if path != Path("/usr/include")]
+    command += [f"-L{library}", f"-Wl,-rpath,{library}", "-lonnxruntime"]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert result.returncode == 0, result.stderr
+    return [str(program)]
+
+
+def node_modules(package, host) -> Path:
+    folders = [*filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep)), HOSTS / host / "node_modules"]
+    found = next((Path(folder) / package for folder in folders if (Path(folder) / package).is_dir()), None)
+    if found is None:
+        pytest.skip(f"{package} is neither in NODE_PATH nor in export/hosts/{host}/node_modules; npm install {package}")
+    return found
+
+
+def node() -> str:
+    return shutil.which("node") or pytest.skip("node is not installed")
+
+
+def node_host(_folder) -> list[str]:
+    node_modules("onnxruntime-node", "node")
+    return [node(), str(HOSTS / "node" / "host.mjs")]
+
+
+@pytest.fixture(scope="module", params=[cpp_host, node_host], ids=["cpp", "node"])
+def host(request, tmp_path_factory):
+    command = request.param(tmp_path_factory.mktemp("host"))
+    return lambda *arguments: subprocess.run(
+        [*command, *map(str, arguments)], capture_output=True, text=True, timeout=500
+    )
+
+
+def test_a_host_agrees_with_the_vector(host, tmp_path):
+    result = host(MODEL, VECTOR, tmp_path / "image.pfm", 0, 2)
+    assert re.fullmatch(r"(\d+\.\d ms\n){2}", result.stdout) and not result.stderr, result
+    agree(read_pfm(tmp_path / "image.pfm"), read_vector(VECTOR)["image"])
+
+
+def test_tiles_of_a_host_agree_with_the_whole(host, wide, tmp_path):
+    folder, expected = wide
+    # 99 is no multiple of the alignment: the host must make one of it.
+    result = host(MODEL, folder, tmp_path / "image.pfm", 99)
+    assert result.returncode == 0, result.stderr
+    agree(read_pfm(tmp_path / "image.pfm"), expected)
+
+
+def test_a_host_says_what_is_wrong(host, tmp_path):
+    def refused(status, message, *arguments):
+        result = host(*arguments)
+        assert result.returncode == status and re.search(message, result.stderr), result
+        assert result.stderr.count("\n") == 1 and not list(tmp_path.glob("*.pfm"))
+
+    output = tmp_path / "image.pfm"
+    refused(2, "usage", MODEL)
+    refused(2, "usage", MODEL, VECTOR, output, "-5")
+    refused(2, "usage", MODEL, VECTOR, output, 0, "many")
+    refused(1, "none.onnx", tmp_path / "none.onnx", VECTOR, output)
+    refused(1, "statistics|ngpt.inputs", MODEL.with_suffix(".statistics.onnx"), VECTOR, output)
+    layers = read_vector(VECTOR)
+    refused(
+        1, "albedo", MODEL, write_vector(tmp_path / "a", {n: x for n, x in layers.items() if n != "albedo"}), output
+    )
+    other = write_vector(tmp_path / "b", layers | {"depth": layers["depth"][..., 1:]})
+    refused(1, "depth", MODEL, other, output)
+
+
+@pytest.mark.slow
+def test_a_host_at_640x360(host, python, tmp_path, capsys, request):
+    layers = repeated(360, 640)
+    folder = write_vector(tmp_path / "layers", layers)
+    host_times, times = [], []
+    for _ in range(3):
+        warm = host(MODEL, folder, tmp_path / "image.pfm", 0, 2).stdout.splitlines()[-1]
+        host_times.append(float(warm.removesuffix(" ms")))
+        start = time.perf_counter()
+        expected = python(layers)
+        times.append(1000 * (time.perf_counter() - start))
+    tell(capsys, request.node.name, host_times, times, read_pfm(tmp_path / "image.pfm"), expected)
+
+
+def tell(capsys, name, host_times, times, image, expected):
+    """What docs/hosts.md publishes; medians."""
+    agree(image, expected)
+    worst = np.abs(image - expected).max() / np.abs(expected).max()
+    with capsys.disabled():
+        print(
+            f"\n{name}: {np.median(host_times):.0f} ms, Python {np.median(times):.0f} ms, worst difference {worst:.1e}"
+        )
+
+
+@pytest.mark.parametrize("path", [*HOSTS.glob("*/*.cpp"), *HOSTS.glob("*/*.mjs"), *HOSTS.glob("*/*.py")], ids=str)
+def test_hosts_are_short(path):
+    assert path.read_text().count("\n") < 200
+
+
+# --- the browser's reader of stacks, in Node -------------------------------------------------------------------------
+
+READER = """
+const {readStack} = await import(process.argv[1]), {readFileSync} = await import("node:fs");
+const answers = [];
+for (const path of process.argv.slice(2)) try {
+  const bytes = readFileSync(path), {width, height, layers} = await readStack(Uint8Array.from(bytes).buffer);
+  for (const name in layers) layers[name] = Buffer.from(layers[name].buffer).toString("base64");
+  answers.push({width, height, layers});
+} catch (error) { answers.push(error.message); }
+console.log(JSON.stringify(answers));
+"""
+
+
+def read_in_node(*paths) -> list:
+    command = [node(), "--input-type=module", "-e", READER, (HOSTS / "web" / "exr.mjs").as_uri(), *map(str, paths)]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=100)
+    assert result.returncode == 0, result.stderr
+    answers = json.loads(result.stdout)
+    for answer in answers:
+        if isinstance(answer, dict):
+            for name, text in answer["layers"].items():
+                pixels = np.frombuffer(base64.b64decode(text), "<f4")
+                answer["layers"][name] = pixels.reshape(-1, answer["height"], answer["width"])
+    return answers
+
+
+def channels(name, layer, root="primal") -> dict[str, np.ndarray]:
+    """A layer (C, H, W) as channels of an EXR."""
+    return {
+        letter if name == root else f"{name}.{letter}": plane
+        for letter, plane in zip(LETTERS.get(name, "RGB"), layer, strict=True)
+    }
+
+
+def test_the_reader_gives_the_bits_that_were_written(tmp_path, rng):
+    primal, dx, half = (noise(rng, (3, 37, 29), dtype) for dtype in (np.float32, np.float32, np.float16))
+    everything = channels("primal", primal) | channels("dx", dx) | channels("albedo", half) | {"A": half[0]}
+    header = {"dataWindow": window(-5, 3, 29, 37), "displayWindow": window(0, 0, 40, 50)}
+    paths = [
+        write_raw(tmp_path / f"{name}.exr", (everything, header | {"compression": getattr(OpenEXR, name)}))
+        for name in ("NO_COMPRESSION", "ZIPS_COMPRESSION", "ZIP_COMPRESSION")
+    ]
+    zeros = dict.fromkeys("RGB", np.zeros((37, 29), np.float32))  # so that blocks do become smaller
+    parts = ((zeros, {}, "ngpt"), (channels("primal", primal, "") | channels("dx", dx), {}, "beauty"))
+    paths.append(write_raw(tmp_path / "parts.exr", *parts, (dict(zip("RGB", half, strict=True)), {}, "albedo")))
+    for answer in read_in_node(*paths):
+        assert (answer["width"], answer["height"]) == (29, 37) and set(answer["layers"]) == {"primal", "dx", "albedo"}
+        assert same_bits(answer["layers"]["primal"], primal) and same_bits(answer["layers"]["dx"], dx)
+        np.testing.assert_array_equal(answer["layers"]["albedo"], half.astype(np.float32))
+
+
+def test_the_reader_says_what_it_cannot_read(tmp_path, rng):
+    image = dict(zip("RGB", rng.random((3, 40, 24)).astype(np.float32), strict=True))
+    compressions = ("RLE", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB")
+    paths = [
+        write_raw(tmp_path / f"{name}.exr", (image, {"compression": getattr(OpenEXR, f"{name}_COMPRESSION")}))
+        for name in compressions
+    ]
+    for name, answer in zip(compressions, read_in_node(*paths), strict=True):
+        assert f"compression is {name};" in answer
+    smooth = {name: np.round(plane) for name, plane in image.items()}  # so that blocks are compressed
+    good = write_raw(tmp_path / "good.exr", (smooth,)).read_bytes()
+    tiles = {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    tiled = write_raw(tmp_path / "tiled.exr", (image, tiles))
+    other = {
+        "no.exr": b"",
+        "text.exr": b"not an image at all",
+        "cut.exr": good[: len(good) // 2],
+        "head.exr": good[:99],
+    }
+    other["damaged.exr"] = good[:-90] + bytes(90)
+    for name, data in other.items():
+        (tmp_path / name).write_bytes(data)
+    answers = read_in_node(tiled, *(tmp_path / name for name in other))
+    for answer, words in zip(
+        answers, ("tiled", "not an OpenEXR", "not an OpenEXR", "cut", "cut", "damaged"), strict=True
+    ):
+        assert isinstance(answer, str) and words in answer, answer
+
+
+# --- the page --------------------------------------------------------------------------------------------------------
+
+
+def write_stack(path, layers) -> Path:
+    return write_raw(
+        path, ({k: v for name, a in layers.items() if name != "image" for k, v in channels(name, a[0]).items()},)
+    )
+
+
+@pytest.fixture(scope="module")
+def fake_runtime(tmp_path_factory):
+    """The folder of a package whose files are there, and do nothing."""
+    folder = tmp_path_factory.mktemp("runtime")
+    (folder / "dist").mkdir()
+    for name in ("ort.wasm.min.js", "ort-wasm-simd-threaded.mjs", "ort-wasm-simd-threaded.wasm"):
+        (folder / "dist" / name).write_text("")
+    (folder / "package.json").write_text('{"version": "1.2.3"}')
+    return folder
+
+
+def test_the_page_is_one_file_that_asks_for_no_other(fake_runtime, tmp_path, capsys):
+    from export.hosts.web.build import main
+
+    example = write_stack(tmp_path / "example.exr", read_vector(VECTOR))
+    arguments = ["--runtime", str(fake_runtime), "--example", str(example), "-o", str(tmp_path / "page.html")]
+    assert main(arguments) == 0
+    text = (tmp_path / "page.html").read_text()
+    assert not re.search(r"{{|https?:|//[a-z]+\.|@import|url\(|\bfetch\(|<link|<iframe|^import |^export ", text, re.M)
+    assert "ONNX Runtime 1.2.3" in text
+    assert main(arguments) == 2
+    assert main([*arguments[:1], str(tmp_path), *arguments[2:], "--force"]) == 2
+    errors = capsys.readouterr().err
+    assert "exists already" in errors and "ort.wasm.min.js: cannot be read" in errors
+    assert (tmp_path / "page.html").read_text() == text
+
+
+class Page(Session):
+    """The page in a browser, with time for the model to be loaded and run."""
+
+    def settle(self):
+        end = time.monotonic() + 60
+        while time.monotonic() < end:
+            if self.ask("root.dataset.ready") == "true" or self.ask("root.dataset.error"):
+                return
+            time.sleep(0.1)
+        pytest.fail(f"the page never became ready: {self.ask('$(`status`).textContent')}")
+
+    def pixels(self, expression) -> np.ndarray:
+        text = f"btoa(Array.from(new Uint8Array(({expression}).buffer), n => String.fromCharCode(n)).join(''))"
+        height, width = self.ask("stack.height"), self.ask("stack.width")
+        return np.frombuffer(base64.b64decode(self.ask(text)), "<f4").reshape(1, 3, height, width)
+
+    def give(self, path):
+        """As if the user had picked the file."""
+        self.ask("root.dataset.ready = 'false'; delete root.dataset.error")
+        root = self.call("DOM.getDocument")["root"]["nodeId"]
+        picker = self.call("DOM.querySelector", nodeId=root, selector="#file")["nodeId"]
+        self.call("DOM.setFileInputFiles", files=[str(path)], nodeId=picker)
+        self.settle()
+
+    def send(self, layers, tile, then=""):
+        """Has the worker reconstruct layers that are in no file; runs the script ``then`` before it can answer."""
+        data = {name: base64.b64encode(layer.tobytes()).decode() for name, layer in layers.items()}
+        height, width = layers["primal"].shape[2:]
+        self.ask(f"""worker.then(worker => {{
+            const layers = {json.dumps(data)}, width = {width}, height = {height};
+            for (const name in layers)
+                layers[name] = new Float32Array(Uint8Array.from(atob(layers[name]), c => c.charCodeAt(0)).buffer);
+            root.dataset.ready = "false";
+            stack = {{turn: ++turn, name: "layers", width, height, layers}};
+            worker.postMessage({{turn, layers, width, height, tile: {tile}}});
+            {then}
+        }})""")
+        self.settle()
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory):
+    from export.hosts.web.build import build
+
+    runtime, folder = node_modules("onnxruntime-web", "web"), tmp_path_factory.mktemp("page")
+    example = write_stack(folder / "example.exr", read_vector(VECTOR))
+    session = Page(folder / "profile", build(folder / "page.html", runtime, example).as_uri())
+    yield session
+    session.close()
+
+
+def test_the_page_agrees_with_python(page):
+    layers = read_vector(VECTOR)
+    assert page.ask("root.dataset.error ?? null") is None
+    assert re.fullmatch(r"example.exr: 29x23 in .* s, after .* s of loading", page.ask("$('status').textContent"))
+    assert same_bits(page.pixels("stack.layers.primal"), layers["primal"])
+    agree(page.pixels("clean"), layers["image"])
+
+
+def test_direct_emission_is_kept_aside(page, tmp_path):
+    layers = read_vector(VECTOR)
+    direct = np.where(layers["depth"] < 2.5, np.float32(40), 0) * np.ones_like(layers["primal"])
+    page.give(write_stack(tmp_path / "lamp.exr", layers | {"primal": layers["primal"] + direct, "direct": direct}))
+    assert page.ask("$('status').textContent").startswith("lamp.exr: 29x23")
+    agree(page.pixels("clean"), layers["image"] + direct)
+
+
+def test_tiles_of_the_page_agree_with_the_whole(page, wide):
+    folder, expected = wide
+    page.send(read_vector(folder), 96)
+    agree(page.pixels("clean"), expected)
+
+
+def test_keys_mouse_and_exposure(page):
+    def split():
+        return float(page.ask("$('wipe').getAttribute('aria-valuenow')"))
+
+    left, top, width, height = page.ask(
+        "(({x, y, width, height}) => [x, y, width, height])($('frame').getBoundingClientRect())"
+    )
+    page.mouse("mousePressed", left + 0.5 * width, top + 0.5 * height)
+    page.mouse("mouseMoved", left + 0.25 * width, top + 0.5 * height)
+    page.mouse("mouseReleased", left + 0.25 * width, top + 0.5 * height)
+    assert split() == pytest.approx(25, abs=0.2)
+    before = split()
+    page.key("ArrowRight")
+    assert split() == pytest.approx(before + 1)
+    page.key("Home")
+    assert split() == 0 and page.ask("$('noisy').style.clipPath") == "inset(0px 100% 0px 0px)"
+    page.ask("probe = new OffscreenCanvas(1, 1).getContext('2d', {willReadFrequently: true})")
+    colour = "probe.drawImage($('clean'), 3, 3, 1, 1, 0, 0, 1, 1); Array.from(probe.getImageData(0, 0, 1, 1).data)"
+    first = page.ask(colour)
+    page.ask("$('exposure').value = -1; $('exposure').oninput()")
+    assert page.ask("$('stops').textContent") == "-1.00"
+    assert all(darker < colour for darker, colour in zip(page.ask(colour)[:3], first[:3], strict=True))
+
+
+def test_the_page_says_what_is_wrong_and_goes_on(page, tmp_path):
+    layers = read_vector(VECTOR)
+    page.give(write_stack(tmp_path / "plain.exr", {"primal": layers["primal"], "depth": layers["depth"]}))
+    message = page.ask("$('problem').textContent")
+    assert message.startswith("plain.exr: the network needs the layers dx, dy, albedo, normal, primal_var")
+    (tmp_path / "text.exr").write_text("not an image")
+    page.give(tmp_path / "text.exr")
+    page.give(tmp_path / "text.exr")  # a file may be picked again: it may be another one by now
+    assert page.ask("$('problem').textContent") == "text.exr: it is not an OpenEXR file"
+    page.ask("$('example').click()")
+    page.settle()
+    assert page.ask("$('problem').hidden") is True and page.ask("root.dataset.error ?? null") is None
+    agree(page.pixels("clean"), layers["image"])
+    assert page.complaints == []
+
+
+def test_a_file_may_be_dropped(page):
+    page.ask("""root.dataset.ready = 'false'; delete root.dataset.error; dropped = new DataTransfer();
+        dropped.items.add(new File(['not an image'], 'dropped.exr'));
+        document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: dropped, bubbles: true}))""")
+    page.settle()
+    assert page.ask("$('problem').textContent") == "dropped.exr: it is not an OpenEXR file"
+
+
+def test_a_bad_file_does_not_end_the_work_on_a_good_one(page, wide):
+    folder, expected = wide
+    page.send(read_vector(folder), 0, "open('bad.exr', new ArrayBuffer(3)).then(() => delete root.dataset.error)")
+    assert page.ask("$('problem').textContent") == "bad.exr: it is not an OpenEXR file"
+    agree(page.pixels("clean"), expected)
+
+
+@pytest.mark.slow
+def test_the_page_at_640x360(page, python, tmp_path, capsys):
+    layers = repeated(360, 640)
+    stack = write_stack(tmp_path / "stack.exr", layers)
+    page_times, times = [], []
+    for _ in range(3):
+        page.give(stack)
+        page_times.append(1000 * float(re.search(r"in ([\d.]+) s", page.ask("$('status').textContent"))[1]))
+        start = time.perf_counter()
+        expected = python(layers)
+        times.append(1000 * (time.perf_counter() - start))
+    tell(capsys, "page", page_times, times, page.pixels("clean"), expected)
