@@ -137,7 +137,8 @@ class SceneStacks:
             stack, seconds = timed(scene, kind, spp, seed)
             stack.attributes["ngpt:seconds"] = seconds
             ngpt.write(path, stack)
-        return ngpt.read(path)
+        # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
+        return ngpt.read(path, {"direct": "direct"} if kind == "features" and not self.given else None)
 
     def stack_key(self, kind: str, spp: int, seed: int) -> list:
         """What the stack depends on, without rendering it."""
