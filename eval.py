@@ -1,6 +1,6 @@
 """Every method on the same scenes with the same clock: python eval.py --config configs/eval-NAME.toml --out DIR
 
-Writes DIR/results.json, results.csv, results.md, plots and pictures (docs/evaluation.md). What is done is kept in
+Writes DIR/results.json, results.csv, results.md, plots, pictures and report.html (docs/evaluation.md). What is done is kept in
 DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew.
 """
 
@@ -16,6 +16,7 @@ from evaluation.stacks import write_json
 from ngpt.advice import make_table
 from ngpt.console import Console
 from ngpt.errors import NgptError
+from ngpt.report_evaluation import write_evaluation_report
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -33,6 +34,7 @@ def main(arguments: list[str] | None = None) -> int:
         config = read_config(args.config)
         config = replace(config, scenes=(*config.scenes, *args.scenes))
         results = evaluate(config, args.out, console, command, args.cache)
+        write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
         if args.advice:
             write_json(args.advice, make_table(results))
     except NgptError as error:
@@ -44,7 +46,7 @@ def main(arguments: list[str] | None = None) -> int:
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
     if absent:
         console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")
-    console.say(f"{args.out}/results.md")
+    console.say(f"{args.out}/results.md, {args.out}/report.html")
     return 1 if absent else 0
 
 

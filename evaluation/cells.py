@@ -22,7 +22,15 @@ from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
 # Not what decides an image or a number.
-_PRESENTATION = {"report.py", "display.py", "png.py", "console.py", "advice.py"}
+_PRESENTATION = {
+    "report.py",
+    "display.py",
+    "png.py",
+    "console.py",
+    "advice.py",
+    "report_evaluation.py",
+    "pixelcodec.py",
+}
 
 
 class Scorer:
