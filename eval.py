@@ -1,7 +1,7 @@
 """Every method on the same scenes with the same clock: python eval.py --config configs/eval-NAME.toml --out DIR
 
-Writes DIR/results.json, results.csv, results.md, plots, pictures and report.html (docs/evaluation.md). What is done is kept in
-DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew.
+Writes DIR/results.json, results.csv, results.md, plots, pictures and report.html (docs/evaluation.md). What is done is
+kept in DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew.
 """
 
 import argparse

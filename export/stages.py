@@ -527,10 +527,11 @@ _PADS = f"""
 
 def _encode(name: str) -> str:
     """Nodes that make ``NAME_encoded``, as ``ngpt.network.features`` tells."""
-    if name == "base":
-        return "base_positive = Max (base_scaled, zero)\nbase_more = Add (base_positive, one)\nbase_encoded = Log (base_more)"
-    if name == "primal":
-        return "primal_positive = Max (primal_scaled, zero)\nprimal_more = Add (primal_positive, one)\nprimal_encoded = Log (primal_more)"
+    if name in ("base", "primal"):
+        return f"""
+    {name}_positive = Max ({name}_scaled, zero)
+    {name}_more = Add ({name}_positive, one)
+    {name}_encoded = Log ({name}_more)"""
     if name in ("dx", "dy"):
         return f"{name}_encoded = ngpt.Encoded ({name}_scaled)"
     if name == "depth":

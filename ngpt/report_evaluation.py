@@ -96,7 +96,9 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     facts = [
         f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of gradients; times are render and method"
     ]
-    facts += [f"reference {reference['spp']:g} spp"] if image is not None else ["no reference"]
+    # Of references from elsewhere the number of samples may not be known.
+    samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
+    facts += [samples] if image is not None else ["no reference"]
     facts += ["without " + ", ".join(absent)] if absent else []
     return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries)
 
