@@ -74,12 +74,11 @@ def stack_of(width: int, height: int) -> GradientStack:
 
 def half_precision(folder: Path) -> Path | None:
     try:
-        from export.network import network_model, statistics_model
+        from export.network import network_model
     except ModuleNotFoundError:
         return None
     path, weights = folder / "half.onnx", WEIGHTS / "ngpt-fast.safetensors"
     path.write_bytes(network_model(weights, "ngpt-fast", "float16").SerializeToString())
-    path.with_suffix(".statistics.onnx").write_bytes(statistics_model(weights, "ngpt-fast").SerializeToString())
     return path
 
 

@@ -9,7 +9,8 @@ say where they differ; tests hold the two together. All of it is float32.
 from string import Template
 
 from ngpt.controlvariates import SWEEPS
-from ngpt.network.features import CHANNELS, KEY, RADIANCE
+from ngpt.exposure import KEY
+from ngpt.network.features import CHANNELS, RADIANCE
 from ngpt.network.model import ModelConfig
 from ngpt.network.padding import MARGIN
 from ngpt.variances import FLOOR

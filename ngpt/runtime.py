@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.exposure import statistics
 
 # MiB that the network may use beside the image's own layers.
 MEMORY = 2048
@@ -36,7 +37,7 @@ class Cancelled(NgptError):
 class Network:
     """A network's file, loaded; thread-safe.
 
-    ``path``     model.onnx; where tiles are needed, ``model.statistics.onnx`` is expected beside it
+    ``path``     model.onnx, as ``python -m export`` writes it
     ``device``   one of ``DEVICES``; "auto" is "cpu"
     ``threads``  of the CPU, 0 for as many as it has cores
 
@@ -92,7 +93,7 @@ class Network:
             raise NgptError(f"network {self.path.name} needs layers {', '.join(missing)}, which are not given")
         height, width = layers["primal"].shape[:2]
         tiles, (rows, columns) = self.plan(height, width, memory, batch)
-        statistics = self._statistics(layers) if len(tiles) > 1 else np.zeros(5, np.float32)
+        shared = statistics(layers)
         image = np.empty((height, width, 3), np.float32)
         progress(0, len(tiles))
         for first in range(0, len(tiles), batch):
@@ -101,7 +102,7 @@ class Network:
             group = tiles[first : first + batch]
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
-            results = self._run(self.session, feed | {"statistics": statistics})
+            results = self._run(self.session, feed | {"statistics": shared})
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]
                 image[inner_y, inner_x] = np.moveaxis(part, 0, -1)
@@ -143,10 +144,6 @@ class Network:
             if not cuts or size < cuts[-1][1]:
                 cuts.append((pieces, size))
         return cuts
-
-    def _statistics(self, layers: Mapping[str, np.ndarray]) -> np.ndarray:
-        session = self._session(self.path.with_suffix(".statistics.onnx"))
-        return self._run(session, {i.name: planes(layers[i.name])[None] for i in session.get_inputs()})
 
     def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
         try:

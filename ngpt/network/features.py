@@ -20,6 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ngpt.exposure import BLOCK, KEY
 from ngpt.network.transfer import signed_log
 
 CHANNELS = {
@@ -37,11 +38,6 @@ CHANNELS = {
 
 # The layers that grow with the light of the scene.
 RADIANCE = frozenset({"primal", "dx", "dy", "base", "primal_se", "dx_se", "dy_se"})
-
-# What the typical radiance of an image is brought to: 4 is ln(5) = 1.6 after compression, so that what is 40 times
-# darker is still where the logarithm is not linear.
-KEY = 4.0
-_BLOCK = 16
 
 
 def channels(inputs: tuple[str, ...]) -> int:
@@ -71,7 +67,7 @@ def exposure(primal: Tensor) -> Tensor:
     brightness, the same at any sample count but for noise, and indifferent to what a few pixels hold. Wants finite
     values.
     """
-    size = min(_BLOCK, primal.shape[-2]), min(_BLOCK, primal.shape[-1])
+    size = min(BLOCK, primal.shape[-2]), min(BLOCK, primal.shape[-1])
     blocks = avg_pool2d(primal.float().clamp(min=0).mean(1, keepdim=True), size, ceil_mode=True).flatten(1)
     values = torch.sort(blocks, 1, descending=True).values
     lit = torch.sum(values > 0, 1, keepdim=True)

@@ -18,7 +18,9 @@ from full_stack import full_layers
 from export.__main__ import main
 from export.network import network_model, overlap, statistics_model
 from export.vector import example_layers, quiet
+from ngpt.exposure import statistics
 from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.network.features import exposure
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.weights import load_weights, save_weights
 from ngpt.stack import GradientStack
@@ -159,13 +161,13 @@ def test_tiles_of_a_host_make_the_whole(weights, name):
     tell = {item.key: item.value for item in model.metadata_props}
     alignment, margin = int(tell["ngpt.alignment"]), int(tell["ngpt.overlap"])
     onnx_session, layers = session(model), noisy(50, 290)
-    statistics = run(session(statistics_model(path, name)), layers)
+    shared = run(session(statistics_model(path, name)), layers)
     whole, tiled = run(onnx_session, layers), np.zeros((1, 3, 50, 290), np.float32)
     step = 20 * alignment
     for x in range(0, 290, step):
         begin = max(x - margin, 0)
         part = {key: layer[..., begin : x + step + margin].copy() for key, layer in layers.items()}
-        image = run(onnx_session, part, statistics=statistics)
+        image = run(onnx_session, part, statistics=shared)
         tiled[..., x : x + step] = image[..., x - begin : x - begin + step]
     assert_close(tiled, whole, 2e-5)
     wrong = run(onnx_session, {key: layer[..., :100].copy() for key, layer in layers.items()})
@@ -180,6 +182,17 @@ def test_half_precision_is_within_percents(fast):
     error = np.sqrt(np.mean((half_image - full_image) ** 2) / np.mean(full_image**2))
     assert 0 < error < 0.01
     assert half.ByteSize() < 0.6 * (WEIGHTS / "ngpt-fast.onnx").stat().st_size
+
+
+@pytest.mark.parametrize("size", [(1, 1), (16, 32), (37, 300), (700, 9)])
+@pytest.mark.parametrize("scale", [0.0, 1.0, 1e9])
+def test_statistics_are_the_same_by_the_graph_in_numpy_and_in_torch(size, scale):
+    layers = noisy(*size, scale)
+    layers["primal"][0, :, 0, 0] *= -1
+    graph = run(onnxruntime.InferenceSession(WEIGHTS / "ngpt-fast.statistics.onnx", quiet()), layers)
+    ours = statistics({name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+    assert np.allclose(ours[:4], graph[:4], rtol=1e-5)
+    assert np.isclose(ours[0], float(exposure(torch.from_numpy(layers["primal"]))), rtol=1e-5)
 
 
 def test_several_tiles_in_one_run(fast):
