@@ -57,7 +57,7 @@ def measure(config, job) -> dict:
     ideal = 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = job.path or str(made_scene(config, job.scene, Path(folder)))
-        scene = load_scene(path, None, job.parameters | {"parallel": False})
+        scene = load_scene(path, None, job.parameters)
     for crop in record["crops"]:
         View(**crop["view"]).apply(scene)
         start = time.perf_counter()

@@ -38,11 +38,12 @@ def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            scene = mi.load_file(name, **parameters)
+            # Merged as Mitsuba would, shapes and emitters come in another order each time, and with them other bits.
+            scene = mi.load_file(name, optimize=False, **parameters)
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
-            scene = mi.load_dict(SCENES[name]())
+            scene = mi.load_dict(SCENES[name](), optimize=False)
         else:
             raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
     except (RuntimeError, TypeError, ValueError) as error:

@@ -42,8 +42,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
     try:
         with tempfile.TemporaryDirectory() as temporary:
             path = job.path or str(made_scene(config, job.scene, Path(temporary)))
-            # Loaded in parallel, the parts of a scene come in another order each time, and kernels with them.
-            scene = load_scene(path, None, job.parameters | {"parallel": False})
+            scene = load_scene(path, None, job.parameters)
         around = Surroundings(scene, job.box)
     except (NgptError, RuntimeError) as error:
         stop_if_interrupted(error)

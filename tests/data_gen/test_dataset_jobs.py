@@ -166,6 +166,18 @@ def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
     assert what_shows(around, find_view(around, rng, 64, 20, 0.005)) > 0
 
 
+def test_a_scene_has_its_parts_in_the_same_order_whenever_it_is_loaded(renderer, tmp_path):
+    """Merging of equal parts shuffles them, and with the lamps the light that a random number stands for."""
+    from data_gen.render import load_scene
+
+    path = str(make_scene((1, 2), tmp_path))
+    orders = set()
+    for _ in range(6):
+        scene = load_scene(path)
+        orders.add(tuple(float(x) for shape in scene.shapes() for x in (*shape.bbox().min, *shape.bbox().max)))
+    assert len(orders) == 1
+
+
 def test_views_of_a_scene_share_their_kernels(renderer):
     """Where two factors of the projection were equal to the last bit, everything was compiled once more."""
     import drjit as dr

@@ -11,7 +11,7 @@ from ngpt.network.cost import cost
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.settings import read_settings
 
-CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith("data-"))
+CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
 
 
 @pytest.fixture

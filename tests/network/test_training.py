@@ -320,7 +320,7 @@ def test_a_stack_without_what_the_weights_read_is_explained(tmp_path):
     path = str(tmp_path / "weights.safetensors")
     stack = CROPS[0].stack(0)
     poor = ngpt.GradientStack.from_arrays(primal=stack["primal"], dx=stack["dx"], dy=stack["dy"])
-    with pytest.raises(NgptError, match="'albedo' and 'normal' and 'depth'"):
+    with pytest.raises(NgptError, match="need layers albedo, normal, depth, which the stack lacks"):
         ngpt.denoise(poor, "ngpt", weights=path)
 
 
