@@ -10,13 +10,16 @@ from string import Template
 
 from ngpt.controlvariates import SWEEPS
 from ngpt.exposure import KEY
-from ngpt.network.features import CHANNELS, RADIANCE
+from ngpt.network.features import CHANNELS, IMAGES, RADIANCE, SOURCES
 from ngpt.network.model import ModelConfig
 from ngpt.network.padding import MARGIN
 from ngpt.variances import FLOOR
 
 # The layers a graph may read, in the order of its inputs.
-LAYERS = ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var")
+LAYERS = (
+    *("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"),
+    *("denoised", "denoised_base"),
+)
 
 # What all tiles of an image share, see contract().
 STATISTICS = ("exposure", "largest depth", "least radiance", "largest radiance", "mean variance")
@@ -371,7 +374,7 @@ ControlVariates (primal, dx, dy, known_x, known_y, primal_var, dx_var, dy_var, m
 
 def layers(config: ModelConfig) -> tuple[str, ...]:
     """The inputs of the graph of such a model."""
-    return tuple(name for name in LAYERS if name in config.needs)
+    return tuple(name for name in LAYERS if name in (*config.needs, *config.layers))
 
 
 def signature(names: tuple[str, ...]) -> str:
@@ -428,17 +431,19 @@ def before(config: ModelConfig) -> str:
     base_default = ", float[1,3,0,0] base = {}" if config.base else ""
     lines = [cleaned(names), _SCALE.substitute(own=statistics(config))]
     scaled = [name for name in names if name in RADIANCE]
+    completed = [_computed(name) for name in config.inputs if name in SOURCES]
     lines += [f"{name}_scaled = Div ({name}_clean, exposure)" for name in scaled]
     if config.base:
-        lines += [_BASE, "log_base = ngpt.SignedLog (base_scaled)"]
-    lines += [_encode(name) for name in config.inputs]
+        lines += [_BASE]
+    lines += [f"start_{name} = Identity ({name}_scaled)" for name in config.start]
+    lines += [*completed, *(_encode(name) for name in config.inputs)]
     lines += [_PADS, *(_pad(name) for name in config.inputs)]
     padded = ", ".join(f"{name}_padded" for name in config.inputs)
     outputs = (
         "float[tiles,channel_count,rows,columns] channels, float exposure, float low, float high, int64 height_now, "
     )
     outputs += "int64 width_now"
-    outputs += ", float[tiles,3,height,width] log_base" if config.base else ""
+    outputs += starts(config)
     count = sum(CHANNELS[name] for name in config.inputs)
     lines += [f"channels = Concat <axis: int = 1> ({padded})"]
     body = "\n".join(lines)
@@ -526,9 +531,42 @@ _PADS = f"""
 """
 
 
+def _computed(name: str) -> str:
+    """Nodes that make ``NAME_computed`` of scaled layers, as ``ngpt.network.features.completed`` does."""
+    source = SOURCES[name][0]
+    if name.endswith("_change"):
+        return f"""
+    {name}_log = ngpt.SignedLog ({source}_scaled)
+    {name}_log_denoised = ngpt.SignedLog (denoised_scaled)
+    {name}_computed = Sub ({name}_log, {name}_log_denoised)"""
+    if name.endswith("_noise"):
+        return f"""
+    {name}_clean = ngpt.Clean ({source.replace("_se", "_var")})
+    {name}_positive = Max ({name}_clean, zero)
+    {name}_root = Sqrt ({name}_positive)
+    {name}_scaled = Div ({name}_root, exposure)
+    {name}_mean = ReduceMean <keepdims: int = 1> ({name}_scaled, i1)
+    {name}_size = Abs (denoised_scaled)
+    {name}_brightness = ReduceMean <keepdims: int = 1> ({name}_size, i1)
+    {name}_divisor = Add ({name}_brightness, one)
+    {name}_computed = Div ({name}_mean, {name}_divisor)"""
+    image, axis = SOURCES[name][1], "i3" if name.startswith("dx") else "i2"
+    return f"""
+    {name}_last = Constant <value_ints: ints = [-1]> ()
+    {name}_beyond = Constant <value_ints: ints = [1000000000]> ()
+    {name}_edge = Slice ({image}_scaled, {name}_last, {name}_beyond, {axis})
+    {name}_rest = Slice ({image}_scaled, i1, {name}_beyond, {axis})
+    {name}_next = Concat <axis: int = {axis[1]}> ({name}_rest, {name}_edge)
+    {name}_difference = Sub ({name}_next, {image}_scaled)
+    {name}_contradiction = Sub ({source}_scaled, {name}_difference)
+    {name}_size = Abs (denoised_scaled)
+    {name}_divisor = Add ({name}_size, one)
+    {name}_computed = Div ({name}_contradiction, {name}_divisor)"""
+
+
 def _encode(name: str) -> str:
     """Nodes that make ``NAME_encoded``, as ``ngpt.network.features`` tells."""
-    if name in ("base", "primal"):
+    if name in IMAGES:
         return f"""
     {name}_positive = Max ({name}_scaled, zero)
     {name}_more = Add ({name}_positive, one)
@@ -540,6 +578,17 @@ def _encode(name: str) -> str:
     tiny_depth = Constant <value_float: float = 1e-10> ()
     depth_divisor = Add (depth_scale, tiny_depth)
     depth_encoded = Div (depth_clean, depth_divisor)"""
+    if name.endswith("_noise"):
+        return f"""
+    {name}_hundred = Constant <value_float: float = 100.0> ()
+    {name}_large = Mul ({name}_computed, {name}_hundred)
+    {name}_more = Add ({name}_large, one)
+    {name}_encoded = Log ({name}_more)"""
+    if name in SOURCES:
+        return f"""
+    {name}_twenty = Constant <value_float: float = 20.0> ()
+    {name}_large = Mul ({name}_computed, {name}_twenty)
+    {name}_encoded = ngpt.SignedLog ({name}_large)"""
     if name.endswith("_se"):
         layer = name.replace("_se", "_var")
         return f"""
@@ -556,13 +605,13 @@ def _encode(name: str) -> str:
 def _pad(name: str) -> str:
     """Nodes that make ``NAME_padded``. Signs survive the logarithm, so padding may come after it."""
     if name.startswith("dx"):
-        step = "column_distance" if name.endswith("_se") else "column_step"
+        step = "column_distance" if name.endswith(("_se", "_noise")) else "column_step"
         return f"""
     {name}_wide = Gather <axis: int = 3> ({name}_encoded, columns_nearest)
     {name}_signed = Mul ({name}_wide, {step})
     {name}_padded = Gather <axis: int = 2> ({name}_signed, rows_here)"""
     if name.startswith("dy"):
-        step = "row_distance" if name.endswith("_se") else "row_step"
+        step = "row_distance" if name.endswith(("_se", "_noise")) else "row_step"
         return f"""
     {name}_tall = Gather <axis: int = 2> ({name}_encoded, rows_nearest)
     {name}_signed = Mul ({name}_tall, {step})
@@ -572,12 +621,48 @@ def _pad(name: str) -> str:
     {name}_padded = Gather <axis: int = 3> ({name}_tall, columns_here)"""
 
 
+def starts(config: ModelConfig) -> str:
+    """What ``before`` passes on to ``after`` of the images that the network starts from."""
+    return "".join(f", float[tiles,3,height,width] start_{name}" for name in config.start)
+
+
+def _corrected(config: ModelConfig) -> str:
+    """Nodes that make ``logarithm`` of the network's output, ``cropped``, and of the images it starts from."""
+    if not config.start:
+        return "logarithm = Identity (cropped)"
+    if len(config.start) == 1:
+        return f"""
+    log_start = ngpt.SignedLog (start_{config.start[0]})
+    logarithm = Add (cropped, log_start)"""
+    lines = [
+        "colours = Constant <value_ints: ints = [3]> ()",
+        f"all = Constant <value_ints: ints = [{config.outputs}]> ()",
+        "first = Constant <value_ints: ints = [0]> ()",
+        "channel_axis = Constant <value_ints: ints = [1]> ()",
+        "correction = Slice (cropped, first, colours, channel_axis)",
+        "logits = Slice (cropped, colours, all, channel_axis)",
+        "weights = Softmax <axis: int = 1> (logits)",
+    ]
+    for i, name in enumerate(config.start):
+        lines += [
+            f"begin_{i} = Constant <value_ints: ints = [{i}]> ()",
+            f"end_{i} = Constant <value_ints: ints = [{i + 1}]> ()",
+            f"weight_{i} = Slice (weights, begin_{i}, end_{i}, channel_axis)",
+            f"part_{i} = Mul (weight_{i}, start_{name})",
+        ]
+    parts = ", ".join(f"part_{i}" for i in range(len(config.start)))
+    lines += [
+        f"mean = Sum ({parts})",
+        "log_start = ngpt.SignedLog (mean)",
+        "logarithm = Add (correction, log_start)",
+    ]
+    return "\n    ".join(lines)
+
+
 def after(config: ModelConfig) -> str:
     """The graph from the network's output, and what ``before`` passes on, to the image."""
-    base = ", float[tiles,3,height,width] log_base" if config.base else ""
-    total = "Add (correction, log_base)" if config.base else "Identity (correction)"
-    return f"""after (float[tiles,3,rows,columns] prediction, float exposure, float low, float high, int64 height_now,
-    int64 width_now{base}) => (float[tiles,3,height,width] image)
+    return f"""after (float[tiles,{config.outputs},rows,columns] prediction, float exposure, float low, float high,
+    int64 height_now, int64 width_now{starts(config)}) => (float[tiles,3,height,width] image)
 {{
     as_list = Constant <value_ints: ints = [1]> ()
     margins = Constant <value_ints: ints = [{MARGIN}, {MARGIN}]> ()
@@ -586,8 +671,8 @@ def after(config: ModelConfig) -> str:
     sizes = Concat <axis: int = 0> (height_list, width_list)
     ends = Add (margins, sizes)
     axes = Constant <value_ints: ints = [2, 3]> ()
-    correction = Slice (prediction, margins, ends, axes)
-    logarithm = {total}
+    cropped = Slice (prediction, margins, ends, axes)
+    {_corrected(config)}
     bounded_below = Max (logarithm, low)
     bounded = Min (bounded_below, high)
     radiance = ngpt.SignedExp (bounded)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ngpt import controlvariates, nfor, peers, poisson, runtime, weighted
+from ngpt import combine, controlvariates, nfor, peers, poisson, runtime, weighted
 from ngpt.errors import NgptError
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
@@ -92,17 +92,20 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     return auto_alpha(primal_var, dx_var, dy_var, norm)
 
 
-def _neural(name: str) -> dict[str, Any]:
+def _neural(name: str, also_missing: Callable[[], str] = lambda: "") -> dict[str, Any]:
     """What the entries of all networks share; they take the network of that name in the package, or a file.
 
-    A .onnx runs in ONNX Runtime, .safetensors in PyTorch, each on the devices it has.
+    A .onnx runs in ONNX Runtime, .safetensors in PyTorch, each on the devices it has. ``also_missing`` is asked for what
+    else the method cannot do without.
     """
     shipped = WEIGHTS / f"{name}.onnx"
 
     def missing() -> str:
         if find_spec("onnxruntime") is None:
             return "ONNX Runtime is not installed: pip install onnxruntime"
-        return "" if shipped.is_file() else "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
+        if not shipped.is_file():
+            return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
+        return also_missing()
 
     def run(data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
         path = Path(weights or shipped)
@@ -125,10 +128,11 @@ def _by_onnx(data: Repaired, path: Path, device: str, memory: int) -> np.ndarray
         layers |= {"dx": data.dx, "dy": data.dy}
     if data.variances is not None:
         layers |= dict(zip(_VARIANCES, data.variances, strict=True))
-    if lacking := [name for name in network.inputs if name not in layers]:
+    if lacking := [name for name in network.needs if name not in layers]:
         raise NgptError(f"weights {path} need layers {', '.join(lacking)}, which the stack lacks")
     # NumPy does these sweeps several times faster than the graph would.
     base = METHODS[network.base].run(data, **METHODS[network.base].options) if network.base else None
+    layers |= combine.images(data, base, network.inputs)
     return network.reconstruct(layers, base, memory=memory)
 
 
@@ -154,6 +158,11 @@ METHODS = {
     "wl2": Method("least squares weighted by variance", (*_GRADIENTS, *_VARIANCES), _with_variances(weighted.wl2), {}),
     "ngpt-fast": Method(
         "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES), **_neural("ngpt-fast")
+    ),
+    "ngpt-combine": Method(
+        "OIDN's images and the gradients, weighed and corrected by a small network",
+        (*_GRADIENTS, *_FEATURES, *_VARIANCES),
+        **_neural("ngpt-combine", peers.oidn_missing),
     ),
     "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
     # Those below see no gradients.

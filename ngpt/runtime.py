@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
+from ngpt import combine
 from ngpt.errors import NgptError
 from ngpt.exposure import statistics
 
@@ -62,8 +63,8 @@ class Network:
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The layers of a stack it reads."""
-        return self.inputs
+        """The layers of a stack that its inputs are, or are made of."""
+        return tuple(name for name in self.inputs if name not in combine.IMAGES)
 
     def reconstruct(
         self,
@@ -77,7 +78,7 @@ class Network:
     ) -> np.ndarray:
         """The image (H, W, 3) float32, scene-linear, without direct emission.
 
-        ``layers``    (H, W, C) float32, all of ``needs``; ``primal`` without direct emission
+        ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
         ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
         ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5
         ``batch``     tiles in one run, which fills GPUs

@@ -11,10 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ngpt.network.features import RADIANCE
+
 Layers = dict[str, Tensor]
 
 # Layers with three colours that change with those of the light, and with those of the surfaces.
-_LIGHT = frozenset({"primal", "dx", "dy", "base", "target", "primal_se", "dx_se", "dy_se"})
+_LIGHT = RADIANCE | {"target"}
 _COLOR = _LIGHT | {"albedo"}
 
 

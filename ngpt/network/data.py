@@ -9,6 +9,7 @@ import torch
 from torch.utils.data import Dataset as TorchDataset
 
 import ngpt
+from ngpt import combine
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.network import features, padding
@@ -118,7 +119,8 @@ def layers_of(data: Repaired, config: ModelConfig) -> Layers:
         arrays |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
     if config.base:
         arrays["base"] = base_image(data, config)
-    return {name: torch.from_numpy(np.array(arrays[name].transpose(2, 0, 1), order="C")) for name in config.inputs}
+    arrays |= combine.images(data, arrays.get("base"), config.layers)
+    return {name: torch.from_numpy(np.array(arrays[name].transpose(2, 0, 1), order="C")) for name in config.layers}
 
 
 def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:
@@ -177,6 +179,7 @@ class Examples(TorchDataset):
         crop = self.crops[which]
         k = int(rng.integers(crop.inputs))
         layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
+        layers = features.completed(layers, self.config.inputs)
         top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
         padded = padding.pad(layers, (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left))
         edge = padding.MARGIN + JITTER

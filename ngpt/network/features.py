@@ -6,8 +6,19 @@
     normal       3   as it is, camera space, [-1, 1]
     depth        1   over the image's largest, [0, 1]; 0 where the path escapes
     base         3   as primal: a classical reconstruction the network starts from
+    denoised, denoised_base
+                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.combine``
     primal_se, dx_se, dy_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
+
+Relative to the denoised image D, with L the signed log, and enlarged: what tells small differences apart in 16 bits:
+
+    primal_change, base_change, denoised_base_change
+                 3   L(20 (L(x) - L(D)))
+    dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
+                 3   L(20 (dx - ΔX) / (1 + |D|)), X the image in the name: where it contradicts the gradients
+    primal_noise, dx_noise, dy_noise
+                 1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
 
 [Kettunen et al. 2019, section 4.2 and their code; base and standard errors are ours.] Radiance is divided by the
 exposure before. What a configuration does not list, the network does not see: absent layers are never filled with
@@ -20,6 +31,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ngpt import combine
 from ngpt.exposure import BLOCK, KEY
 from ngpt.network.transfer import signed_log
 
@@ -31,18 +43,66 @@ CHANNELS = {
     "normal": 3,
     "depth": 1,
     "base": 3,
+    "denoised": 3,
+    "denoised_base": 3,
     "primal_se": 1,
     "dx_se": 1,
     "dy_se": 1,
+    "primal_change": 3,
+    "base_change": 3,
+    "denoised_base_change": 3,
+    "dx_denoised": 3,
+    "dy_denoised": 3,
+    "dx_denoised_base": 3,
+    "dy_denoised_base": 3,
+    "primal_noise": 1,
+    "dx_noise": 1,
+    "dy_noise": 1,
+}
+
+# What is computed of other layers: of which.
+SOURCES = {
+    **{f"{name}_change": (name, "denoised") for name in ("primal", "base", "denoised_base")},
+    **{f"{axis}_{name}": (axis, name, "denoised") for axis in ("dx", "dy") for name in combine.IMAGES},
+    **{f"{name}_noise": (f"{name}_se", "denoised") for name in ("primal", "dx", "dy")},
 }
 
 # The layers that grow with the light of the scene.
-RADIANCE = frozenset({"primal", "dx", "dy", "base", "primal_se", "dx_se", "dy_se"})
+RADIANCE = frozenset({"primal", "dx", "dy", "base", "denoised", "denoised_base", "primal_se", "dx_se", "dy_se"})
+
+# Those that are no layers of a stack, but made of them.
+MADE = ("base", *combine.IMAGES)
+
+# Those that are images of the scene: what a network may start from.
+IMAGES = ("primal", *MADE)
 
 
 def channels(inputs: tuple[str, ...]) -> int:
     """The number of channels of these layers together."""
     return sum(CHANNELS[name] for name in inputs)
+
+
+def sources(inputs: tuple[str, ...]) -> tuple[str, ...]:
+    """The layers that these inputs are, or are computed of."""
+    return tuple(dict.fromkeys(source for name in inputs for source in SOURCES.get(name, (name,))))
+
+
+def completed(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
+    """Normalised layers with what is computed of them, for those of ``inputs`` that are; before any padding."""
+    return dict(layers) | {name: _computed(name, layers) for name in inputs if name in SOURCES}
+
+
+def _computed(name: str, layers: Mapping[str, Tensor]) -> Tensor:
+    denoised = layers["denoised"]
+    if name.endswith("_change"):
+        return signed_log(layers[SOURCES[name][0]]) - signed_log(denoised)
+    if name.endswith("_noise"):
+        error = layers[SOURCES[name][0]].mean(-3, keepdim=True)
+        return error / (1 + denoised.abs().mean(-3, keepdim=True))
+    axis = -1 if name.startswith("dx") else -2
+    image = layers[SOURCES[name][1]]
+    last = image.narrow(axis, image.shape[axis] - 1, 1)
+    return (layers[name[:2]] - torch.diff(image, dim=axis, append=last)) / (1 + denoised.abs())
 
 
 def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:
@@ -51,10 +111,14 @@ def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:
 
 
 def _encoded(name: str, layer: Tensor) -> Tensor:
-    if name in ("primal", "base"):
+    if name in IMAGES:
         return torch.log1p(torch.clamp(layer, min=0))
     if name in ("dx", "dy"):
         return signed_log(layer)
+    if name.endswith("_noise"):
+        return torch.log1p(100 * layer)
+    if name in SOURCES:
+        return signed_log(20 * layer)
     if name.endswith("_se"):
         return torch.log1p(torch.mean(layer, 1, keepdim=True))
     return layer

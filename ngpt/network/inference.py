@@ -46,10 +46,10 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
     """
     height, width = layers["primal"].shape[-2:]
     device = next(model.parameters()).device
-    scaled, exposure = features.normalised({name: layers[name] for name in model.config.inputs})
+    scaled, exposure = features.normalised({name: layers[name] for name in model.config.layers})
     low, high = model.bounds(scaled["primal"])
     pads = padding.pads(height, width, model.alignment)
-    padded = padding.pad(scaled, pads)
+    padded = padding.pad(features.completed(scaled, model.config.inputs), pads)
     rows, columns = padded["primal"].shape[-2:]
     logarithm = padded["primal"].new_empty(len(padded["primal"]), 3, rows, columns)
     spans = (_spans(length, tile, model.alignment, model.network.radius) for length in (rows, columns))

@@ -25,7 +25,10 @@ class ModelConfig:
     ``channels``  for each level, finest first: what each unit adds (dense), the width (plain)
     ``units``     for each level, units on the way down and again on the way up (dense only)
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
-    ``base``      the method whose result it corrects, in the logarithm; "" predicts the image itself, as NGPT does
+    ``base``      the classical method whose result is its layer "base"; "" for none
+    ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
+                  and corrects their mean in the logarithm. By default the base; without any it predicts the image
+                  itself, as NGPT does
     """
 
     network: str
@@ -33,11 +36,14 @@ class ModelConfig:
     units: tuple[int, ...]
     inputs: tuple[str, ...]
     base: str = ""
+    start: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise NgptError(f"network '{self.network}': choose one of: {', '.join(NETWORKS)}")
-        for name in ("channels", "units", "inputs"):
+        if self.base and not self.start:
+            object.__setattr__(self, "start", ("base",))
+        for name in ("channels", "units", "inputs", "start"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in self.inputs:
             if name not in features.CHANNELS:
@@ -50,15 +56,34 @@ class ModelConfig:
             raise NgptError(f"units {list(self.units)}: give a positive number for each of {len(self.channels)} levels")
         if self.base and self.base not in BASES:
             raise NgptError(f"base '{self.base}': choose one of: {', '.join(BASES)}")
-        if bool(self.base) != ("base" in self.inputs):
+        if bool(self.base) != ("base" in self.layers):
             raise NgptError(f"base is '{self.base}' while inputs are {', '.join(self.inputs)}: give both or none")
+        if "denoised_base" in self.layers and not self.base:
+            raise NgptError("input 'denoised_base' is the denoised base, and there is no base; set base")
+        for name in self.start:
+            if name not in features.IMAGES or name not in self.layers:
+                raise NgptError(
+                    f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
+                )
+
+    @property
+    def outputs(self) -> int:
+        """Channels the network predicts: RGB, and the logits of weights where there is a choice."""
+        return 3 + (len(self.start) if len(self.start) > 1 else 0)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.data``)."""
+        return features.sources(self.inputs)
 
     @property
     def needs(self) -> tuple[str, ...]:
         """The layers a stack must hold, by the names of the contract."""
         names = {"primal"}
-        for name in self.inputs:
-            names |= {name.replace("_se", "_var")} - {"base"}
+        for name in self.layers:
+            names |= {name.replace("_se", "_var")} - set(features.MADE)
+        if {"denoised", "denoised_base"} & set(self.layers):
+            names |= {"albedo", "normal"}
         if self.base:
             names |= {"dx", "dy"}
         if self.base == "wcv":
@@ -74,7 +99,7 @@ class ModelConfig:
 class Reconstructor(nn.Module):
     """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear, without direct emission.
 
-        exposure, depth scale -> padding -> channels -> network -> (+ log of the base) -> exp -> crop -> exposure
+        exposure, depth scale -> padding -> channels -> network -> (+ log of the start) -> exp -> crop -> exposure
 
     Any H and W. Proportional to the exposure: what goes in ``k`` times as bright comes out ``k`` times as bright. The
     result is bounded by the range of the primal, and 0. Layers hold finite values; see ``ModelConfig.inputs``.
@@ -83,11 +108,11 @@ class Reconstructor(nn.Module):
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.config = config
-        inputs, correction = features.channels(config.inputs), bool(config.base)
+        inputs, correction = features.channels(config.inputs), bool(config.start)
         self.network = (
-            DenseUNet(inputs, config.channels, config.units, zero=correction)
+            DenseUNet(inputs, config.channels, config.units, config.outputs, zero=correction)
             if config.network == "dense"
-            else PlainUNet(inputs, config.channels, zero=correction)
+            else PlainUNet(inputs, config.channels, config.outputs, zero=correction)
         )
 
     @property
@@ -97,18 +122,26 @@ class Reconstructor(nn.Module):
 
     def forward(self, layers: Mapping[str, Tensor]) -> Tensor:
         height, width = layers["primal"].shape[-2:]
-        scaled, exposure = features.normalised({name: layers[name] for name in self.config.inputs})
+        scaled, exposure = features.normalised({name: layers[name] for name in self.config.layers})
         bounds = self.bounds(scaled["primal"])
         pads = padding.pads(height, width, self.alignment)
+        scaled = features.completed(scaled, self.config.inputs)
         logarithm = padding.crop(self.predict(padding.pad(scaled, pads)), pads)
         return signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1])) * exposure
 
     def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
-        """The signed log of the image, unbounded, from layers that are normalised and padded; float32."""
+        """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
         # Channels last is the layout convolutions are fastest in, by half on CPUs.
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
-        logarithm = self.network(x).float()
-        return logarithm + signed_log(scaled["base"]) if self.config.base else logarithm
+        prediction = self.network(x).float()
+        if not self.config.start:
+            return prediction
+        images = [scaled[name] for name in self.config.start]
+        if len(images) == 1:
+            return prediction + signed_log(images[0])
+        weights = torch.softmax(prediction[:, 3:], 1)
+        mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
+        return prediction[:, :3] + signed_log(mean)
 
     @staticmethod
     def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:

@@ -26,17 +26,18 @@ def pad(layers: Mapping[str, Tensor], pads: Pads) -> dict[str, Tensor]:
 
     dx and dy become the differences of the reflected image: across a mirror their sign is the other one, and the unused
     last column of dx (row of dy), inside the image now, is that of its mirror. Sizes smaller than the padding are
-    reflected to and fro.
+    reflected to and fro. So do layers whose names begin with dx or dy; those that end with _se or _noise have no sign.
     """
     height, width = next(iter(layers.values())).shape[-2:]
     device = next(iter(layers.values())).device
     rows, columns = _mirror(height, *pads[:2], device), _mirror(width, *pads[2:], device)
     padded = {}
     for name, layer in layers.items():
-        if name in ("dx", "dx_se"):
-            padded[name] = _differences(layer, columns, -1, signed=name == "dx").index_select(-2, rows[:-1])
-        elif name in ("dy", "dy_se"):
-            padded[name] = _differences(layer, rows, -2, signed=name == "dy").index_select(-1, columns[:-1])
+        signed = not name.endswith(("_se", "_noise"))
+        if name.startswith("dx"):
+            padded[name] = _differences(layer, columns, -1, signed).index_select(-2, rows[:-1])
+        elif name.startswith("dy"):
+            padded[name] = _differences(layer, rows, -2, signed).index_select(-1, columns[:-1])
         else:
             padded[name] = layer.index_select(-2, rows[:-1]).index_select(-1, columns[:-1])
     return padded

@@ -14,21 +14,28 @@ torch = pytest.importorskip("torch")
 import onnx
 import onnxruntime
 from full_stack import full_layers
+from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
 from export.network import network_model, overlap, statistics_model
 from export.vector import example_layers, quiet
+from ngpt import combine
+from ngpt.errors import NgptError
 from ngpt.exposure import statistics
 from ngpt.methods import WEIGHTS, reconstruct
-from ngpt.network.features import exposure
+from ngpt.network.features import SOURCES, exposure
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.weights import load_weights, save_weights
+from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
 FAST = WEIGHTS / "ngpt-fast.safetensors"
 ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
 CONFIGS = {
     "with a base": ModelConfig("dense", (4, 6), (1, 1), (*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
+    "with a choice": ModelConfig(
+        *("dense", (4, 6), (1, 1), ("primal", "denoised", *SOURCES), "wcv"), start=("base", "denoised", "denoised_base")
+    ),
     "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
     "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
     "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),
@@ -65,8 +72,12 @@ def noisy(height, width, scale=1.0, seed=0):
     return {name: np.ascontiguousarray(layer.transpose(2, 0, 1)[None]) for name, layer in layers.items()}
 
 
+def stack_of(layers):
+    return GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+
+
 def in_torch(layers, path):
-    stack = GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+    stack = stack_of(layers)
     return reconstruct(stack, "ngpt", weights=str(path)).image.transpose(2, 0, 1)[None]
 
 
@@ -88,11 +99,35 @@ def pair(request, weights):
     return path, session(network_model(path, request.param))
 
 
+@pytest.fixture
+def other_denoiser(monkeypatch):
+    """In OIDN's place, which is not everywhere: a blur. Returns the images a combiner is given of it."""
+    monkeypatch.setattr(combine, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
+
+    def images(layers):
+        data = repair(stack_of(layers))
+        made = combine.images(data, reconstruct(stack_of(layers), "wcv").image, combine.IMAGES)
+        return {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in made.items()}
+
+    return images
+
+
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (17, 16), (37, 53)])
-def test_the_same_as_in_torch(pair, size):
+def test_the_same_as_in_torch(pair, size, other_denoiser):
     path, onnx_session = pair
     layers = noisy(*size)
-    assert_close(run(onnx_session, layers), in_torch(layers, path))
+    assert_close(run(onnx_session, layers | other_denoiser(layers)), in_torch(layers, path))
+
+
+def test_a_combiner_is_the_same_by_either_runtime(tmp_path, weights, other_denoiser):
+    path = weights / "with a choice.safetensors"
+    (tmp_path / "m.onnx").write_bytes(network_model(path, "m").SerializeToString())
+    layers = noisy(21, 30)
+    by_onnx = reconstruct(stack_of(layers), "ngpt", weights=str(tmp_path / "m.onnx")).image.transpose(2, 0, 1)[None]
+    assert_close(by_onnx, in_torch(layers, path))
+    without = {name: layer for name, layer in layers.items() if name != "albedo"}
+    with pytest.raises(NgptError, match="albedo"):
+        reconstruct(stack_of(without), "ngpt", weights=str(tmp_path / "m.onnx"))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
@@ -119,8 +154,7 @@ def test_the_same_with_a_scene_that_has_unknown_variances_and_extreme_pixels(fas
 def test_a_base_may_be_given(fast):
     layers = noisy(32, 41)
     theirs = in_torch(layers, FAST)
-    stack = GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
-    base = reconstruct(stack, "wcv").image.transpose(2, 0, 1)[None]
+    base = reconstruct(stack_of(layers), "wcv").image.transpose(2, 0, 1)[None]
     assert_close(run(fast, layers, base=np.ascontiguousarray(base)), theirs)
     assert np.abs(run(fast, layers, base=2 * base) - theirs).max() > 0.1 * theirs.mean(), "the base is not used"
 

@@ -329,3 +329,36 @@ def test_no_code_is_run_from_weight_files(tmp_path, capsys):
 def test_settings_are_checked(settings, complaint):
     with pytest.raises(NgptError, match=complaint):
         make_loss(settings)
+
+
+def test_noise_of_the_target_does_not_move_the_least_of_huber():
+    """Skewed noise, of which the median lies below the mean: an absolute error has its least at the median."""
+    target = 2 * torch.from_numpy(np.random.default_rng(0).gamma(20, 1 / 20, (1, 3, 200, 200))).float()
+    best = {}
+    for name, loss in (("huber", pixelwise.huber), ("l1", pixelwise.l1)):
+        values = torch.linspace(1.9, 2.1, 41)
+        # The slope, as training sees it, changes its sign at the least.
+        slopes = []
+        for value in values:
+            prediction = torch.full_like(target, value.item(), requires_grad=True)
+            loss(prediction, target).backward()
+            slopes.append(prediction.grad.sum().item())
+        best[name] = values[int(np.argmax(np.array(slopes) > 0))].item()
+    assert best["huber"] == pytest.approx(2, abs=0.011)
+    assert best["l1"] < 1.98
+
+
+def test_huber_is_zero_for_equal_images_and_takes_part_in_the_loss():
+    a, b = images(2, 3, 16, 16), images(2, 3, 16, 16, seed=1)
+    assert pixelwise.huber(a, a).item() == 0 < pixelwise.huber(a, b).item()
+    total, parts = make_loss({"kind": "l1", "huber": 2.0, "gradient": 0.0})(a, b, generator())
+    assert total.item() == pytest.approx(parts["l1"].item() + 2 * parts["huber"].item())
+
+
+def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
+    prediction, target = torch.ones(1, 3, 8, 8, requires_grad=True), torch.ones(1, 3, 8, 8)
+    gradients = []
+    for firefly in (10.0, 1e6):
+        target[0, :, 3, 3] = firefly
+        gradients.append(torch.autograd.grad(pixelwise.huber(prediction, target), prediction)[0])
+    assert torch.allclose(*gradients)

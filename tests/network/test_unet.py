@@ -152,6 +152,60 @@ def test_an_untrained_correction_is_its_base():
         assert torch.allclose(Reconstructor(config)(data), data["base"], rtol=1e-4, atol=1e-5)
 
 
+def combiner():
+    """Everything computed of other layers, and a choice of three images to start from; untrained, but not zero."""
+    start = ("base", "denoised", "denoised_base")
+    return ModelConfig("dense", (4, 6), (1, 1), ("primal", "denoised", *features.SOURCES), "wcv", start)
+
+
+def test_an_untrained_combiner_is_the_mean_of_what_it_starts_from():
+    config = combiner()
+    data = layers(20, 20, config.layers)
+    mean = sum(data[name] for name in config.start) / 3
+    with torch.no_grad():
+        assert torch.allclose(Reconstructor(config)(data), mean.clamp(max=data["primal"].amax()), rtol=1e-4, atol=1e-5)
+
+
+def test_weights_of_a_combiner_choose():
+    model = Reconstructor(combiner())
+    head = model.network.head.convolution
+    data = layers(20, 20, model.config.layers)
+    data["primal"][0, :, 0, 0] = 2
+    for i, name in enumerate(model.config.start):
+        torch.nn.init.zeros_(head.bias)
+        head.bias.data[3 + i] = 50
+        with torch.no_grad():
+            assert torch.allclose(model(data), data[name], rtol=1e-4, atol=1e-5)
+
+
+def test_tiles_of_a_combiner_do_not_show():
+    torch.manual_seed(0)
+    model = Reconstructor(combiner()).eval()
+    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.1)
+    data = layers(50, 90, model.config.layers)
+    with torch.no_grad():
+        assert torch.allclose(reconstruct(model, data, tile=48), model(data), rtol=1e-5, atol=1e-6)
+
+
+def test_what_is_computed_agrees_with_padding():
+    """The contradiction of an image and its own differences is none, nor is it across the mirrors of the padding."""
+    data = layers(9, 14, ("denoised", "primal_se"))
+    image = data["denoised"]
+    data |= {"dx": image.diff(dim=-1, append=image[..., -1:]), "dy": image.diff(dim=-2, append=image[..., -1:, :])}
+    data["denoised_base"] = image + 1e-3
+    inputs = ("dx_denoised", "dy_denoised", "denoised_base_change", "dy_denoised_base")
+    completed = features.completed(data, inputs)
+    padded = padding.pad({**completed, "dx": data["dx"]}, padding.pads(9, 14, 4))
+    assert padded["dx_denoised"].abs().max() == padded["dy_denoised"].abs().max() == 0
+    assert padded["dy_denoised_base"].abs().max() < 1e-6
+    assert (completed["denoised_base_change"] - 1e-3 / (1 + image)).abs().max() < 1e-6
+    # One that is wrong by 0.1 in one place.
+    data["dx"][0, 0, 4, 5] += 0.1
+    wrong = features.completed(data, inputs)["dx_denoised"]
+    assert wrong[0, 0, 4, 5].item() == pytest.approx(0.1 / (1 + image[0, 0, 4, 5].item()))
+    assert (wrong != 0).sum() == 1
+
+
 def test_exposure_is_the_typical_radiance():
     image = torch.full((2, 3, 64, 64), 0.5)
     image[1] = 0
@@ -187,12 +241,22 @@ def test_errors_are_explained():
         ModelConfig("dense", (4, 4), (1,), NGPT)
     with pytest.raises(NgptError, match="base is 'l2'"):
         ModelConfig("dense", (4, 4), (1, 1), NGPT, "l2")
+    with pytest.raises(NgptError, match="there is no base"):
+        ModelConfig("plain", (4,), (), ("primal", "denoised_base"))
+    with pytest.raises(NgptError, match="start 'albedo': must be one of"):
+        ModelConfig("plain", (4,), (), ("primal", "albedo"), start=("albedo",))
+    with pytest.raises(NgptError, match="start 'denoised'"):
+        ModelConfig("plain", (4,), (), ("primal",), start=("denoised",))
 
 
 def test_what_a_stack_must_hold():
     assert ModelConfig("plain", (4,), (), ("primal", "albedo")).needs == ("primal", "albedo")
     config = ModelConfig("plain", (4,), (), ("primal", "base", "dx_se"), "wcv")
     assert config.needs == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
+    # The other denoiser wants features, though the network does not read them.
+    twin = ModelConfig("plain", (4,), (), ("primal", "primal_change", "primal_noise"), start=("primal", "denoised"))
+    assert twin.layers == ("primal", "denoised", "primal_se")
+    assert twin.needs == ("primal", "albedo", "normal", "primal_var") and twin.outputs == 5
 
 
 def test_alignment_and_padding_fit():

@@ -24,7 +24,8 @@ class LossSettings:
                      "l1" for none
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
-    ``l1``, ``gradient``, ``relative``, ``logarithmic``  weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0
+    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``
+                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0
     ``backbone``, ``weights``  files of E-LPIPS (docs/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -35,6 +36,7 @@ class LossSettings:
     gradient: float = 0.01
     relative: float = 0.0
     logarithmic: float = 0.0
+    huber: float = 0.0
     backbone: str = ""
     weights: str = ""
 
@@ -69,6 +71,7 @@ class Loss:
             ("gradient", s.gradient, pixelwise.gradient_l1),
             ("relative", s.relative, pixelwise.relative),
             ("logarithmic", s.logarithmic, pixelwise.logarithmic),
+            ("huber", s.huber, pixelwise.huber),
         ):
             if weight:
                 parts[name] = function(prediction, target)

@@ -1,5 +1,6 @@
 """Losses that compare pixel by pixel, in tone-mapped or relative radiance."""
 
+import torch
 from torch import Tensor
 
 from ngpt.network.transfer import signed_log
@@ -33,6 +34,17 @@ def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
 def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tensor:
     """Mean |p - t| / (|p| + |t| + ε), in [0, 1): as much for dark pixels as for bright ones."""
     return ((prediction - target).abs() / (prediction.abs() + target.abs() + epsilon)).mean()
+
+
+def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float = 0.5) -> Tensor:
+    """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, straight beyond it.
+
+    In its gradient √(p² + ε) counts as a constant. Where the target is noisy by less than the knee, the least of it is
+    at the mean of what the target may be, so that noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise",
+    section 3.3]; fireflies of the target, which squares alone would chase, count by their number.
+    """
+    error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
+    return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
 
 
 def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
