@@ -52,7 +52,8 @@ def example_layers() -> dict[str, np.ndarray]:
     disk = (x - 17) ** 2 + (y - 9) ** 2 < 36
     clean = np.stack([0.2 + 0.02 * x, 0.3 + 0.01 * y, np.full_like(x, 0.25)]) * np.where(disk, 6.0, 1.0)
     deviation = 0.4 * clean
-    layers = {"primal": clean * rng.gamma(6.0, 1 / 6.0, clean.shape), "primal_var": deviation**2}
+    others = {"denoised": 1.02 * clean, "denoised_base": 0.99 * clean}
+    layers = others | {"primal": clean * rng.gamma(6.0, 1 / 6.0, clean.shape), "primal_var": deviation**2}
     for name, axis in (("dx", 2), ("dy", 1)):
         slope = np.diff(clean, axis=axis, append=np.take(clean, [-1], axis))
         layers[name] = slope + np.where(slope, 0.1 * clean, 0.02 * clean) * rng.normal(size=clean.shape)
