@@ -78,7 +78,7 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
     regular file, damaged, too large, deep or subsampled, and if it changes while it is read.
     """
     path = Path(path)
-    with _regular_file(path) as file:
+    with regular_file(path) as file:
         before = _state(file)
         headers = read_headers(file, str(path))
         for header in headers:
@@ -116,17 +116,18 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
     if Path(path).suffix.lower() != ".exr":
         raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
     parts = [_writable(part, str(path)) for part in image.parts]
-    with atomic_output(path, overwrite) as temporary:
+    with atomic_output(path, overwrite) as temporary, open(temporary, "r+b") as file:
+        name = _numbered(file)
         try:
-            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(str(temporary))
+            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
-            reason = str(error).replace(str(temporary), str(path)).splitlines()[0]
+            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
             raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
     return Path(path)
 
 
 @contextlib.contextmanager
-def _regular_file(path: Path) -> Iterator[BinaryIO]:
+def regular_file(path: Path) -> Iterator[BinaryIO]:
     """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
     try:
         file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
@@ -145,6 +146,11 @@ def _regular_file(path: Path) -> Iterator[BinaryIO]:
             raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def _numbered(file: BinaryIO) -> str:
+    """A name for an open file: its own may belong to another by now, or be one that OpenEXR cannot encode."""
+    return f"/dev/fd/{file.fileno()}"
+
+
 def _state(file: BinaryIO) -> tuple[int, int]:
     status = os.fstat(file.fileno())
     return status.st_size, status.st_mtime_ns
@@ -152,8 +158,7 @@ def _state(file: BinaryIO) -> tuple[int, int]:
 
 def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
     """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` tell."""
-    # By number, since the name may belong to another file by now, or be one that OpenEXR cannot encode.
-    name = f"/dev/fd/{file.fileno()}"
+    name = _numbered(file)
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
     try:

@@ -33,6 +33,7 @@ _COMPRESSIONS = {
 class PartHeader:
     """What of a part's header says how large it is.
 
+    ``name``      "" if it has none
     ``label``     "part 0 'left'", for messages
     ``size``      (width, height) of the data window
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
@@ -41,6 +42,7 @@ class PartHeader:
     ``ratio``     the most bytes of image that one byte of the file can stand for
     """
 
+    name: str
     label: str
     size: tuple[int, int]
     channels: dict[str, tuple[int, tuple[int, int]]]
@@ -70,6 +72,10 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
         if flags & 0xFF != 2:
             raise NgptError(f"{path}: is of OpenEXR version {flags & 0xFF}, and ngpt reads 2; save it anew")
         parts = [_part(i, values, flags) for i, values in enumerate(_headers(file, flags))]
+        names = [part.name for part in parts]
+        twice = next((name for i, name in enumerate(names) if name and name in names[:i]), None)
+        if twice:
+            raise _Damage(f"two parts are called '{twice[:40]}'")
     except _Damage as damage:
         raise NgptError(f"{path}: damaged or incomplete ({damage}); render or copy it again") from None
     except (struct.error, IndexError):
@@ -151,7 +157,9 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
             raise _Damage(f"{label} has tiles of {across}x{down} pixels")
         chunks = -(-width // across) * -(-height // down)
     channels = dict(_channels(data("channels", "chlist"), label))
-    return PartHeader(label, (width, height), channels, kind.startswith(b"deep") or bool(flags & _DEEP), chunks, ratio)
+    return PartHeader(
+        name, label, (width, height), channels, kind.startswith(b"deep") or bool(flags & _DEEP), chunks, ratio
+    )
 
 
 def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[int, int]]]]:
