@@ -38,7 +38,7 @@ def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
     with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
         copy = Path(folder) / "copy.exr"
         # -P: a folder of strangers' files may hold a numpy.py, and might be the current one.
-        command = [sys.executable, "-P", "-m", "ngpt.isolated", path, copy, str(_BASE + 3 * size)]
+        command = [sys.executable, "-P", "-m", "ngpt.isolated", str(path), str(copy), str(_BASE + 3 * size)]
         environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in map(os.path.abspath, sys.path) if p)}
         seconds = _SECONDS + size / 10e6
         try:
