@@ -37,16 +37,16 @@ class Report:
         self.outcomes[result] += 1
 
 
-def run(target: str, first: int, count: int) -> Report:
+def run(target: str, first: int, count: int, seconds: float = SECONDS) -> Report:
     """Inputs first .. first + count - 1 of ``target``; a new process goes on behind one that dies or hangs."""
     report, number, begun = Report(), first, time.perf_counter()
     while number < first + count:
-        number = _batch(report, target, number, first + count)
+        number = _batch(report, target, number, first + count, seconds)
     report.seconds = time.perf_counter() - begun
     return report
 
 
-def _batch(report: Report, target: str, first: int, last: int) -> int:
+def _batch(report: Report, target: str, first: int, last: int, seconds: float) -> int:
     """Lets a process work until it is done, dead or too slow; returns the input to go on with."""
     command = [sys.executable, str(HERE / "child.py"), target, str(first), str(last), str(MEBIBYTES)]
     path = os.pathsep.join([str(HERE.parent.parent), str(HERE.parent), os.environ.get("PYTHONPATH", "")])
@@ -59,11 +59,11 @@ def _batch(report: Report, target: str, first: int, last: int) -> int:
         selector.register(process.stdout, selectors.EVENT_READ)
         current, pending = None, b""
         while True:
-            if not selector.select(START if current is None else SECONDS):
+            if not selector.select(START if current is None else seconds):
                 process.send_signal(signal.SIGKILL)
                 if current is None:
                     raise RuntimeError(f"{target}: the process does not start")
-                report.count(current, f"FAILED hangs: no end after {SECONDS:.0f} s")
+                report.count(current, f"FAILED hangs: no end after {seconds:.0f} s")
                 return current + 1
             data = os.read(process.stdout.fileno(), 1 << 16)
             if not data:

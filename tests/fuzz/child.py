@@ -46,7 +46,9 @@ def main(target: str, first: int, last: int, mib: int = 512) -> None:
     report = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     with tempfile.TemporaryDirectory() as folder:
-        outcome(run, -1, Path(folder))  # whole: imports what is needed, starts threads
+        whole = outcome(run, -1, Path(folder))  # imports what is needed, starts threads
+        if whole != "accepted":
+            raise SystemExit(f"the whole input of {target} is refused: {whole}")
         resource.setrlimit(resource.RLIMIT_AS, (int((mebibytes("VmSize") + 2 * mib) * 2**20), resource.RLIM_INFINITY))
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in range(first, last):

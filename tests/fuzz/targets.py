@@ -4,7 +4,10 @@ A target returns where the input is accepted and handled, raises NgptError where
 failure. Number -1 is a whole input.
 """
 
+import os
 import random
+import signal
+import time
 import tomllib
 from collections.abc import Callable
 from functools import cache
@@ -16,6 +19,7 @@ from exr_mutations import mutate, seeds
 from full_stack import full_stack
 
 import ngpt
+from ngpt.errors import NgptError
 from ngpt.exr import read, write
 from ngpt.methods import WEIGHTS, reconstruct
 
@@ -217,6 +221,25 @@ def _onnx_changed(rng: random.Random, data: bytes) -> bytes:
     return model.SerializeToString()
 
 
+def probe(number: int, folder: Path) -> None:
+    """Does what campaigns are to notice."""
+    match number:
+        case 1:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case 3:
+            time.sleep(60)
+        case 4:
+            np.ones(600 * 2**17)  # 600 MiB
+        case 5:
+            np.empty(8 * 2**30, np.uint8)
+        case 6:
+            raise KeyError("x")
+        case 7:
+            raise NgptError("something is wrong")
+        case 8:
+            raise NgptError(f"{folder}: is refused")
+
+
 TARGETS: dict[str, Callable[[int, Path], None]] = {
-    target.__name__: target for target in (exr, manifest, shard, weights, checkpoint, settings, network)
+    target.__name__: target for target in (exr, manifest, shard, weights, checkpoint, settings, network, probe)
 }

@@ -1,0 +1,58 @@
+"""Broken files by the hundred, and by the ten thousand in `make test-slow`: each is refused by name or handled.
+
+A failure names inputs by number: `python tests/fuzz/campaign.py TARGET --replay NUMBER` does it again.
+"""
+
+import pytest
+from fuzz.campaign import run
+from reliability import record
+
+# Target: what it is to a reader, inputs here, inputs in the slow campaign, what it needs beyond the base.
+TARGETS = {
+    "exr": ("OpenEXR stacks, mutated: read, reconstructed, written", 250, 10_000, ()),
+    "manifest": ("Manifests of training sets, mutated", 150, 5000, ("safetensors",)),
+    "shard": ("Shards of training sets, mutated, with a checksum that fits", 150, 5000, ("safetensors",)),
+    "settings": ("Settings of training and data generation, mutated", 150, 5000, ("torch",)),
+    "weights": ("Weights, mutated", 80, 5000, ("torch", "safetensors")),
+    "checkpoint": ("Checkpoints of training, mutated", 80, 5000, ("torch", "safetensors")),
+    "network": ("ONNX networks given by users, mutated", 40, 1000, ("onnx",)),
+}
+
+
+def campaign(target, first, count):
+    for package in TARGETS[target][3]:
+        pytest.importorskip(package)
+    report = run(target, first, count)
+    assert not report.failures, report.failures
+    assert report.outcomes["named error"] > count / 10 and report.outcomes["accepted"] > count / 100, "does it work?"
+    assert report.outcomes.total() == count
+    return report
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_broken_inputs_are_refused_or_handled(target):
+    campaign(target, 0, TARGETS[target][1])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("target", TARGETS)
+def test_many_broken_inputs_are_refused_or_handled(target):
+    text, _, count, _ = TARGETS[target]
+    report = campaign(target, 1000, count)
+    record(text, count, dict(report.outcomes), worst=report.worst, seconds=round(report.seconds, 1))
+
+
+def test_campaigns_notice_what_they_are_for():
+    """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
+    report = run("probe", 0, 10, seconds=4)
+    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}
+    for number, what in {
+        1: "the process died (-11)",
+        3: "hangs: no end after 4 s",
+        4: "took 6",
+        5: "MemoryError",
+        6: "KeyError",
+        7: "names no file",
+    }.items():
+        assert what in report.failures[number]
