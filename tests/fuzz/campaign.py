@@ -17,8 +17,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-SECONDS, MEBIBYTES = 5.0, 512  # that one input of some kB may take
-START = 60.0  # seconds that a process may take until its first input
+SECONDS, MEBIBYTES = 5.0, 512  # of processor time and memory that one input of some kB may take
+PATIENCE = 60.0  # seconds by the clock, in which a machine with other work to do gives it that much
+START = 300.0  # seconds that a process may take until its first input
 
 
 @dataclass
@@ -37,16 +38,16 @@ class Report:
         self.outcomes[result] += 1
 
 
-def run(target: str, first: int, count: int, seconds: float = SECONDS) -> Report:
+def run(target: str, first: int, count: int, patience: float = PATIENCE) -> Report:
     """Inputs first .. first + count - 1 of ``target``; a new process goes on behind one that dies or hangs."""
     report, number, begun = Report(), first, time.perf_counter()
     while number < first + count:
-        number = _batch(report, target, number, first + count, seconds)
+        number = _batch(report, target, number, first + count, patience)
     report.seconds = time.perf_counter() - begun
     return report
 
 
-def _batch(report: Report, target: str, first: int, last: int, seconds: float) -> int:
+def _batch(report: Report, target: str, first: int, last: int, patience: float) -> int:
     """Lets a process work until it is done, dead or too slow; returns the input to go on with."""
     command = [sys.executable, str(HERE / "child.py"), target, str(first), str(last), str(MEBIBYTES)]
     path = os.pathsep.join([str(HERE.parent.parent), str(HERE.parent), os.environ.get("PYTHONPATH", "")])
@@ -58,13 +59,20 @@ def _batch(report: Report, target: str, first: int, last: int, seconds: float) -
     ):
         selector.register(process.stdout, selectors.EVENT_READ)
         current, pending = None, b""
+        clock, used = time.monotonic(), 0.0
         while True:
-            if not selector.select(START if current is None else seconds):
+            if not selector.select(0.5):
+                waited, busy = time.monotonic() - clock, _processor_seconds(process.pid) - used
+                if (current is None and waited < START) or (
+                    current is not None and waited < patience and busy < SECONDS
+                ):
+                    continue
                 process.send_signal(signal.SIGKILL)
                 if current is None:
                     raise RuntimeError(f"{target}: the process does not start")
-                report.count(current, f"FAILED hangs: no end after {seconds:.0f} s")
+                report.count(current, f"FAILED hangs: no end after {busy:.0f} s of work, {waited:.0f} s by the clock")
                 return current + 1
+            clock, used = time.monotonic(), _processor_seconds(process.pid)
             data = os.read(process.stdout.fileno(), 1 << 16)
             if not data:
                 break
@@ -85,6 +93,15 @@ def _batch(report: Report, target: str, first: int, last: int, seconds: float) -
             raise RuntimeError(f"{target}: the process does not start: {said}")
         report.count(current, f"FAILED the process died ({code}): {said}")
         return current + 1
+
+
+def _processor_seconds(pid: int) -> float:
+    """That the process has used so far; 0 where it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def main() -> None:

@@ -53,10 +53,10 @@ def main(target: str, first: int, last: int, mib: int = 512) -> None:
         resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
         for number in range(first, last):
             print("start", number, file=report)
-            before, begun = mebibytes("VmRSS"), time.perf_counter()
+            before, begun = mebibytes("VmRSS"), time.process_time()
             Path("/proc/self/clear_refs").write_text("5")  # the largest size so far is forgotten
             result = outcome(run, number, Path(folder))
-            seconds, grown = time.perf_counter() - begun, mebibytes("VmHWM") - before
+            seconds, grown = time.process_time() - begun, mebibytes("VmHWM") - before
             if grown > mib and not result.startswith("FAILED"):
                 result = f"FAILED took {grown:.0f} MiB"
             print("end", number, f"{seconds:.4f} {grown:.1f}", result, file=report)

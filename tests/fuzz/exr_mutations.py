@@ -160,11 +160,10 @@ def window_of_many_pixels(rng, exr):
 
 def channels_changed(rng, exr):
     channels = _named(rng, exr, b"channels")
-    entries, data = [], channels.data
-    while data and data[0] and b"\0" in data and len(data) >= data.find(b"\0") + 17:
-        end = data.index(b"\0")
-        entries.append([data[:end], *struct.unpack_from("<iB3x2i", data, end + 1)])
-        data = data[end + 17 :]
+    entries, data, position = [], channels.data, 0
+    while (end := data.find(b"\0", position)) > position and len(data) >= end + 17:
+        entries.append([data[position:end], *struct.unpack_from("<iB3x2i", data, end + 1)])
+        position = end + 17
     if not entries:
         return
     match rng.randrange(8):
