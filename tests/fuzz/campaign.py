@@ -63,9 +63,7 @@ def _batch(report: Report, target: str, first: int, last: int, patience: float) 
         while True:
             if not selector.select(0.5):
                 waited, busy = time.monotonic() - clock, _processor_seconds(process.pid) - used
-                if (current is None and waited < START) or (
-                    current is not None and waited < patience and busy < SECONDS
-                ):
+                if waited < (START if current is None else patience) and (current is None or busy < SECONDS):
                     continue
                 process.send_signal(signal.SIGKILL)
                 if current is None:

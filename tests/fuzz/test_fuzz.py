@@ -3,6 +3,12 @@
 A failure names inputs by number: `python tests/fuzz/campaign.py TARGET --replay NUMBER` does it again.
 """
 
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
 import pytest
 from fuzz.campaign import run
 from reliability import record
@@ -41,6 +47,21 @@ def test_many_broken_inputs_are_refused_or_handled(target):
     text, _, count, _ = TARGETS[target]
     report = campaign(target, 1000, count)
     record(text, count, dict(report.outcomes), worst=report.worst, seconds=round(report.seconds, 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["header", "json", "toml"])
+def test_bytes_that_reach_new_lines(target, tmp_path):
+    """A minute of libFuzzer for each of the parsers in Python."""
+    pytest.importorskip("atheris")
+    program = Path(__file__).with_name("coverage_guided.py")
+    path = os.pathsep.join(map(str, [program.parents[2], program.parents[1]]))
+    command = [sys.executable, str(program), target, "-max_total_time=60"]
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    runs = int(re.search(r"Done (\d+) runs", done.stderr)[1])
+    record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)
 
 
 def test_campaigns_notice_what_they_are_for():
