@@ -67,7 +67,7 @@ def test_bytes_that_reach_new_lines(target, tmp_path):
 def test_campaigns_notice_what_they_are_for():
     """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
     report = run("probe", 0, 10, patience=20)
-    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}
+    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}, report.failures
     for number, what in {
         1: "the process died (-11)",
         3: "hangs: no end after 0 s of work",
