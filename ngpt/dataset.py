@@ -10,20 +10,23 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Iterator
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.records import Shape, check, read_json
 from ngpt.shards import INPUTS, TENSORS, Shard
 from ngpt.stack import GradientStack
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
+_CROP: Shape = {"spp": [int], "seconds": {str: (int, float)}}
+_ENTRY: Shape = {"file": str, "sha256": str, "bytes": int, "scene": str, "crops": [_CROP], "failures": list}
+_MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 
 
 @dataclass(frozen=True)
@@ -68,8 +71,9 @@ class Crop:
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
-    Opens the manifest only; a shard is mapped into memory when one of its crops is read, and anew in each process that
-    an instance is sent to. Raises NgptError with the file and what is wrong with it.
+    Opens the manifest only; a shard is checked and mapped into memory when one of its crops is read, and anew in each
+    process that an instance is sent to. Raises NgptError with the file and what is wrong with it: shards that are
+    missing, are not those that the manifest tells the checksum of, or hold other tensors.
     """
 
     def __init__(self, folder: str | Path):
@@ -93,7 +97,7 @@ class Dataset:
             raise IndexError(f"{self.folder}: crop {index} of {len(self)}")
         entry, place = self._places[index]
         if entry["file"] not in self._open:
-            self._open[entry["file"]] = Shard(self.folder / entry["file"])
+            self._open[entry["file"]] = _checked(self.folder / entry["file"], entry)
         crop = entry["crops"][place]
         return Crop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]))
 
@@ -107,18 +111,18 @@ class Dataset:
 def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of the training set in ``folder``; raises NgptError where there is none of this version."""
     path = folder / MANIFEST
-    try:
-        manifest = json.loads(path.read_text())
-    except FileNotFoundError:
-        raise NgptError(
-            f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{path}: cannot be read: {error}") from error
+    if not path.is_file():
+        raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen")
+    manifest = read_json(path)
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise NgptError(f"{path}: is not the manifest of a training set")
     if manifest.get("version") != VERSION:
         raise NgptError(f"{path}: is of version {manifest.get('version')}, this ngpt reads version {VERSION}")
+    check(manifest, _MANIFEST, str(path))
+    for entry in manifest["shards"]:
+        name = PurePosixPath(entry["file"])
+        if name.is_absolute() or ".." in name.parts or "\0" in entry["file"]:
+            raise NgptError(f"{path}: lists {entry['file']!r}, which is not in its folder; do not trust this file")
     return manifest
 
 
@@ -133,13 +137,15 @@ def problems(folder: Path) -> list[str]:
     found = []
     manifest = read_manifest(folder)
     for entry in manifest["shards"]:
-        path = folder / entry["file"]
-        if not path.is_file():
-            found.append(f"{path}: is missing; remove it from the manifest by running python -m data_gen again")
-        elif (digest := checksum(path)) != entry["sha256"]:
-            found.append(f"{path}: its sha256 is {digest[:12]}..., the manifest says {entry['sha256'][:12]}...")
-        else:
-            found += _shard_problems(path, entry)
+        try:
+            shard = _checked(folder / entry["file"], entry)
+        except NgptError as error:
+            found.append(str(error))
+            continue
+        for name in shard.names if entry["crops"] else ():
+            bad = int(np.sum(~np.isfinite(shard.tensor(name))))
+            if bad:
+                found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
     listed = {entry["file"] for entry in manifest["shards"]}
     on_disk = {path.relative_to(folder).as_posix() for path in (folder / "shards").glob("[!.]*.safetensors")}
     found += [
@@ -148,33 +154,36 @@ def problems(folder: Path) -> list[str]:
     return found
 
 
-def _shard_problems(path: Path, entry: dict[str, Any]) -> list[str]:
-    try:
-        shard = Shard(path)
-    except NgptError as error:
-        return [str(error)]
-    crops = len(entry["crops"])
+def _checked(path: Path, entry: dict[str, Any]) -> Shard:
+    """The shard of a manifest's entry; raises NgptError unless it is that one, and has the tensors that crops need."""
+    if not path.is_file():
+        raise NgptError(f"{path}: is missing; remove it from the manifest by running python -m data_gen again")
+    if (digest := checksum(path)) != entry["sha256"]:
+        told = entry["sha256"][:12]
+        raise NgptError(
+            f"{path}: its sha256 is {digest[:12]}..., the manifest says {told}...; copy it again or remove it"
+        )
+    shard, crops = Shard(path), entry["crops"]
     if not crops:
-        return []
+        return shard
     missing = [name for name in TENSORS if name not in shard.names]
     if missing:
-        return [f"{path}: tensors {', '.join(missing)} are missing"]
-    found = []
-    inputs, height, width = shard.shape("indirect")[1:4]
+        raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
+    shape = shard.shape("indirect")
+    if len(shape) != 5 or 0 in shape or any(len(crop["spp"]) != shape[1] for crop in crops):
+        raise NgptError(f"{path}: tensor 'indirect' is {shape}, and its crops have {len(crops[0]['spp'])} inputs")
+    inputs, height, width = shape[1:4]
     for name in TENSORS:
-        shape = shard.shape(name)
-        expected: tuple[int, ...] = (crops, height, width, 3)
+        expected: tuple[int, ...] = (len(crops), height, width, 3)
         if name == "spp":
-            expected = (crops, inputs)
+            expected = (len(crops), inputs)
         elif name in INPUTS:
-            expected = (crops, inputs, height, width, INPUTS[name])
-        if shape != expected:
-            found.append(f"{path}: tensor '{name}' is {shape}, it must be {expected}")
-            continue
-        bad = int(np.sum(~np.isfinite(shard.tensor(name))))
-        if bad:
-            found.append(f"{path}: tensor '{name}' has {bad} values that are not finite")
-    return found
+            expected = (len(crops), inputs, height, width, INPUTS[name])
+        if shard.shape(name) != expected:
+            raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
+        if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):
+            raise NgptError(f"{path}: tensor '{name}' is of type {shard.type(name)}; it must be of (half) floats")
+    return shard
 
 
 def summary(folder: Path) -> dict[str, Any]:

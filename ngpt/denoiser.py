@@ -27,7 +27,10 @@ class Denoiser:
     """
 
     def __init__(self, size: Any, albedo: bool = False, normals: bool = False, method: str = "auto", **options: Any):
-        self.width, self.height = (int(n) for n in np.ravel(_to_numpy(size)))
+        try:
+            self.width, self.height = (int(n) for n in np.ravel(_to_numpy(size)))
+        except (TypeError, ValueError):
+            raise NgptError(f"Denoiser: size is {size!r}; it must be (width, height)") from None
         if method not in ("auto", *METHODS):
             raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(METHODS)}")
         self.announced = {"albedo": albedo, "normals": normals}
@@ -73,12 +76,11 @@ class Denoiser:
         for name, value in given.items():
             if value is not None:
                 layers[name] = self._layer(name, value, (1,) if name == "depth" else (3,))
+        stack = GradientStack(layers, path="Denoiser")
         if normals is not None and to_sensor is not None:
-            matrix = _to_numpy(getattr(to_sensor, "matrix", to_sensor)).reshape(-1)
-            rotation = matrix.reshape(4, 4)[:3, :3] if matrix.size == 16 else matrix.reshape(3, 3)
-            layers["normal"] = np.ascontiguousarray(layers["normal"] @ rotation.T.astype(np.float32))
-        result = reconstruct(GradientStack(layers), self.method, **self.options).image
-        return _like(np.concatenate([result, image[..., 3:]], axis=-1), noisy)
+            stack = stack.replace(normal=stack["normal"] @ _rotation(to_sensor).T)
+        result = reconstruct(stack, self.method, **self.options).image
+        return _like(np.concatenate([result, image[..., 3:].astype(np.float32)], axis=-1), noisy)
 
     def _layer(self, name: str, value: Any, channels: tuple[int, ...]) -> np.ndarray:
         layer = _to_numpy(value)
@@ -86,11 +88,22 @@ class Denoiser:
         if layer.ndim != 3 or layer.shape[:2] != (self.height, self.width) or layer.shape[2] not in channels:
             shape = " or ".join(f"({self.height}, {self.width}, {n})" for n in channels)
             raise NgptError(f"Denoiser: {name} has shape {tuple(layer.shape)}; it must be {shape}")
-        return np.ascontiguousarray(layer, np.float32)
+        return layer
+
+
+def _rotation(to_sensor: Any) -> np.ndarray:
+    """The upper left (3, 3) float32 of a matrix, or of a transform that has one."""
+    matrix = _to_numpy(getattr(to_sensor, "matrix", to_sensor))
+    if matrix.size not in (9, 16) or matrix.dtype.kind not in "fiu":
+        raise NgptError(f"Denoiser: to_sensor is {matrix.shape} of {matrix.dtype}; it must be (3, 3) or (4, 4) numbers")
+    side = 3 if matrix.size == 9 else 4
+    return matrix.reshape(side, side)[:3, :3].astype(np.float32)
 
 
 def _to_numpy(value: Any) -> np.ndarray:
     """Arrays of any library, from any device, as NumPy's; shared where that is possible."""
+    if isinstance(value, np.ndarray):
+        return value
     if hasattr(value, "detach"):  # PyTorch
         value = value.detach().cpu()
         value = value.float() if value.is_floating_point() else value

@@ -15,6 +15,7 @@ import OpenEXR
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.exrfile import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.isolated import read_exr_isolated
 from ngpt.layers import LAYERS, RGB, Found, Resolution, resolve
 from ngpt.stack import GradientStack
 
@@ -47,7 +48,7 @@ class StackSource:
     resolution: Resolution
 
 
-def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> GradientStack:
+def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None, isolated: bool = False) -> GradientStack:
     """Reads a gradient stack, or any render with an image in it.
 
     Layers are found by their names in the contract or in other renderers (``ngpt.layers``). ``layers`` maps names of
@@ -55,9 +56,12 @@ def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> Gr
     converted to float32; layers the toolkit does not know stay in ``stack.source`` and come back on writing. In a
     result file primal is the kept input, so that reconstructing a result gives the result again.
 
+    ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
+    for files of strangers (``ngpt.isolated``).
+
     Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place.
     """
-    image = read_exr(path)
+    image = read_exr_isolated(path) if isolated else read_exr(path)
     resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path))
     arrays = {name: _gather(image.parts[found.part], found.channels) for name, found in resolution.items()}
     main = image.parts[resolution["primal"].part]
@@ -73,16 +77,16 @@ def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> Gr
     return stack
 
 
-def read_image(path: str | os.PathLike) -> np.ndarray:
+def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
     """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
     ``read`` takes for the primal.
     """
-    part = read_exr(path).parts[0]
+    part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
     if all(name in part.channels for name in RGB):
         return _gather(part, RGB)
-    return read(path)["primal"]
+    return read(path, isolated=isolated)["primal"]
 
 
 def write(

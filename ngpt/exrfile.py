@@ -17,16 +17,18 @@ import contextlib
 import io
 import math
 import os
+import stat
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
+from ngpt.exrheader import PartHeader, read_headers
 from ngpt.files import atomic_output
 
 _LOSSY = (
@@ -36,7 +38,6 @@ _LOSSY = (
     OpenEXR.DWAA_COMPRESSION,
     OpenEXR.DWAB_COMPRESSION,
 )
-_MAGIC = b"\x76\x2f\x31\x01"
 _PIXEL_TYPES = (np.float16, np.float32, np.uint32)
 _ATTRIBUTE_TYPES = (
     str,
@@ -71,36 +72,32 @@ class ExrImage:
 
 
 def read_exr(path: str | os.PathLike) -> ExrImage:
-    """Reads a file with all that is in it. Raises NgptError if it is not there, damaged, deep or subsampled."""
+    """Reads a file with all that is in it.
+
+    Its size is checked before its pixels are decoded (``ngpt.exrheader``). Raises NgptError if it is not there, no
+    regular file, damaged, too large, deep or subsampled, and if it changes while it is read.
+    """
     path = Path(path)
-    try:
-        with open(path, "rb") as file:
-            magic = file.read(4)
-    except FileNotFoundError:
-        raise NgptError(f"{path}: not found; check the name") from None
-    except IsADirectoryError:
-        raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
-    except OSError as error:
-        raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
-    if not magic:
-        raise NgptError(f"{path}: is empty; render or copy it again")
-    if magic != _MAGIC:
-        raise NgptError(f"{path}: not an OpenEXR file (it starts with {magic!r}); save the image as .exr")
-    headers = _open(path, header_only=True)[0]
-    for index, part in enumerate(headers):
-        label = f"part {index} '{part.name()}'" if part.name() else f"part {index}"
-        if part.header["type"] in (OpenEXR.deepscanline, OpenEXR.deeptile):
-            raise NgptError(f"{path}: {label} is a deep image; flatten it first, or render without deep output")
-        for channel in part.header["channels"]:
-            step = (channel.xSampling, channel.ySampling)
-            if step != (1, 1):
+    with regular_file(path) as file:
+        before = _state(file)
+        headers = read_headers(file, str(path))
+        for header in headers:
+            if header.deep:
                 raise NgptError(
-                    f"{path}: channel '{channel.name}' of {label} is subsampled {step[0]}x{step[1]}; "
-                    "save the image as R G B at full size"
+                    f"{path}: {header.label} is a deep image; flatten it first, or render without deep output"
                 )
-    parts, complaint = _open(path, header_only=False)
-    if len(parts) < len(headers):
-        raise NgptError(f"{path}: damaged or incomplete{complaint}; render or copy it again")
+            for name, (_, step) in header.channels.items():
+                if step != (1, 1):
+                    raise NgptError(
+                        f"{path}: channel '{name}' of {header.label} is subsampled {step[0]}x{step[1]}; "
+                        "save the image as R G B at full size"
+                    )
+        try:
+            parts = _decode(file, path, headers)
+        finally:
+            # Whatever else went wrong is then no wonder.
+            if _state(file) != before:
+                raise NgptError(f"{path}: changed while it was read; wait until its writer is done, and read it again")
     return ExrImage(
         [
             ExrPart(part.name(), dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
@@ -119,27 +116,68 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
     if Path(path).suffix.lower() != ".exr":
         raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
     parts = [_writable(part, str(path)) for part in image.parts]
-    with atomic_output(path, overwrite) as temporary:
+    with atomic_output(path, overwrite) as temporary, open(temporary, "r+b") as file:
+        name = _numbered(file)
         try:
-            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(str(temporary))
+            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
-            reason = str(error).replace(str(temporary), str(path)).splitlines()[0]
+            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
             raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
     return Path(path)
 
 
-def _open(path: Path, header_only: bool) -> tuple[list[Any], str]:
-    """Returns the parts that OpenEXR can read, and what it complains of in the others."""
+@contextlib.contextmanager
+def regular_file(path: Path) -> Iterator[BinaryIO]:
+    """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
+    try:
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except FileNotFoundError:
+        raise NgptError(f"{path}: not found; check the name") from None
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
+        if isinstance(error, IsADirectoryError):
+            raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
+        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
+    with file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise NgptError(f"{path}: is a pipe or a device, no file; save the image to disk first")
+        try:
+            yield file
+        except OSError as error:
+            raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _numbered(file: BinaryIO) -> str:
+    """A name for an open file: its own may belong to another by now, or be one that OpenEXR cannot encode."""
+    return f"/dev/fd/{file.fileno()}"
+
+
+def _state(file: BinaryIO) -> tuple[int, int]:
+    status = os.fstat(file.fileno())
+    return status.st_size, status.st_mtime_ns
+
+
+def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
+    """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` tell."""
+    name = _numbered(file)
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
     try:
         with contextlib.redirect_stdout(printed), _without_native_stderr():
-            parts = OpenEXR.File(str(path), separate_channels=True, header_only=header_only).parts
+            parts = OpenEXR.File(name, separate_channels=True).parts
+    except MemoryError as error:
+        size = sum(header.bytes for header in headers) / 2**20
+        raise NgptError(f"{path}: out of memory: its channels take {size:.0f} MiB; free some, or cut it up") from error
     except Exception as error:
-        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
         raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
-    warning = printed.getvalue().partition("Warning: ")[2].splitlines()
-    return parts, f" ({warning[0]})" if warning else ""
+    # What the two readers of a header disagree on is what the limits do not hold for.
+    expected = [({*header.channels}, {header.size[::-1]}) for header in headers]
+    got = [({*part.channels}, {channel.pixels.shape for channel in part.channels.values()}) for part in parts]
+    if got != expected:
+        warning = printed.getvalue().partition("Warning: ")[2].replace(name, path.name).splitlines()
+        reason = f" ({warning[0]})" if warning else ""
+        raise NgptError(f"{path}: damaged or incomplete{reason}; render or copy it again")
+    return parts
 
 
 @contextlib.contextmanager

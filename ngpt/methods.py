@@ -232,8 +232,9 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         image = entry.run(data, **(entry.options | options)) + data.direct
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
     if lost:
+        file = f" with {options['weights']}" if options.get("weights") else ""
         raise NgptError(
-            f"{stack.path}: method '{name}' gave {lost} non-finite pixels; the largest input value is "
+            f"{stack.path}: method '{name}'{file} gave {lost} non-finite pixels; the largest input value is "
             f"{np.abs(data.image).max():.3g}: scale the stack down, or use another method"
         )
     return Result(

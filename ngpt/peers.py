@@ -89,7 +89,8 @@ def nlm(data: Repaired) -> np.ndarray:
     """Joint non-local means of scikit-image: patches compared in log radiance, albedo and normal, radiance averaged.
 
     [Buades et al. 2005, "A non-local algorithm for image denoising"; features as in Rousselle et al. 2013, "Robust
-    denoising using feature and color information".] The patches are 5x5 in a window of 19x19 pixels.
+    denoising using feature and color information".] The patches are 5x5 in a window of 19x19 pixels. Negative
+    radiance, which logarithms do not take, counts as none.
     """
     _require(nlm_missing(), "nlm")
     from skimage.restoration import denoise_nl_means
@@ -106,8 +107,11 @@ def nlm(data: Repaired) -> np.ndarray:
     bandwidth = max(_NLM_BANDWIDTH * sigma, 1e-6)
     guides = [bandwidth * weight * data.features[name] for name, weight in _NLM_FEATURES.items()]
     stacked = np.concatenate([encoded, *guides, tiny * image], axis=-1)
+    height, width = image.shape[:2]
+    # scikit-image drops axes of length 1.
+    stacked = np.pad(stacked, ((0, int(height == 1)), (0, int(width == 1)), (0, 0)), mode="edge")
     filtered = denoise_nl_means(stacked, patch_size=5, patch_distance=9, h=bandwidth, channel_axis=-1)
-    return (filtered[..., -3:] / tiny).astype(np.float32)
+    return (filtered[:height, :width, -3:] / tiny).astype(np.float32)
 
 
 def _require(lack: str, name: str) -> None:

@@ -19,6 +19,8 @@ from ngpt.exposure import statistics
 
 # MiB that the network may use beside the image's own layers.
 MEMORY = 2048
+# What a network may start from, "" for nothing.
+BASES = ("", "l2", "cv", "wcv")
 DEVICES = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
@@ -60,6 +62,24 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
             ) from error
+        self._check()
+
+    def _check(self) -> None:
+        """Raises NgptError unless the metadata make sense, and are those of the graph beside them."""
+        for name, value, most in (("alignment", self.alignment, 2**12), ("overlap", self.overlap, 2**12)):
+            if not (name == "overlap" or value) or not 0 <= value <= most:
+                raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
+        if self.bytes < 1 or self.base not in BASES:
+            raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
+        own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
+        graph = {given.name for given in self.session.get_inputs()}
+        # Those that a host may leave out have a value in the graph.
+        optional = {given.name for given in self.session.get_overridable_initializers()}
+        if not graph <= own <= graph | optional:
+            raise NgptError(
+                f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, its metadata tell of "
+                f"{', '.join(sorted(own))}; export it anew"
+            )
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -91,7 +111,7 @@ class Network:
         layers = layers if base is None else {**layers, "base": base}
         missing = [name for name in names if name not in layers]
         if missing:
-            raise NgptError(f"network {self.path.name} needs layers {', '.join(missing)}, which are not given")
+            raise NgptError(f"network {self.path} needs layers {', '.join(missing)}, which are not given")
         height, width = layers["primal"].shape[:2]
         tiles, (rows, columns) = self.plan(height, width, memory, batch)
         shared = statistics(layers)
@@ -99,7 +119,7 @@ class Network:
         progress(0, len(tiles))
         for first in range(0, len(tiles), batch):
             if stop():
-                raise Cancelled(f"network {self.path.name}: stopped after {first} of {len(tiles)} tiles")
+                raise Cancelled(f"network {self.path}: stopped after {first} of {len(tiles)} tiles")
             group = tiles[first : first + batch]
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
@@ -127,9 +147,7 @@ class Network:
                     best = work, ys, xs, tall, wide
         if best is None:
             needed = -(-down[-1][1] * across[-1][1] * self.bytes * batch // 2**20)
-            raise NgptError(
-                f"network {self.path.name}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed"
-            )
+            raise NgptError(f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed")
         _, ys, xs, tall, wide = best
         return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
 
@@ -148,11 +166,15 @@ class Network:
 
     def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
         try:
-            return session.run(None, feed)[0]
+            result = session.run(None, feed)[0]
         except Exception as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
-            raise NgptError(f"network {self.path.name}: ONNX Runtime cannot run it: {one_line(error)}") from error
+            raise NgptError(f"network {self.path}: ONNX Runtime cannot run it: {one_line(error)}") from error
+        expected = (len(feed["primal"]), 3, *feed["primal"].shape[2:])
+        if result.shape != expected:
+            raise NgptError(f"network {self.path}: gives {result.shape} where {expected} is due; export it anew")
+        return result
 
     def _session(self, path: Path):
         if not path.is_file():

@@ -24,6 +24,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.files import atomic_output
+from ngpt.records import check, parse_json
 from ngpt.stack import GradientStack
 
 # Tensors of the inputs and their channels.
@@ -103,6 +104,8 @@ class Shard:
         except ModuleNotFoundError as error:
             raise NgptError("training sets need safetensors; `pip install 'ngpt-recon[train]'`") from error
         self.path = path
+        if not path.is_file():
+            raise NgptError(f"{path}: no such shard; make it again: python -m data_gen")
         try:
             self._file = safe_open(path, framework="np")
         except (OSError, SafetensorError) as error:
@@ -110,11 +113,16 @@ class Shard:
         metadata = self._file.metadata() or {}
         if "ngpt" not in metadata:
             raise NgptError(f"{path}: is no shard of a training set (its header has no 'ngpt' record)")
-        self.record: dict[str, Any] = json.loads(metadata["ngpt"])
+        self.record: dict[str, Any] = parse_json(metadata["ngpt"], f"{path}: its record")
+        check(self.record, dict, f"{path}: its record")
         self.names = tuple(self._file.keys())
 
     def shape(self, name: str) -> tuple[int, ...]:
         return tuple(self._file.get_slice(name).get_shape())
+
+    def type(self, name: str) -> str:
+        """As safetensors calls it, "F16"."""
+        return self._file.get_slice(name).get_dtype()
 
     def tensor(self, name: str) -> np.ndarray:
         return self._file.get_tensor(name)

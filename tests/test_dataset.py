@@ -120,10 +120,80 @@ def test_problems_are_named(folder, rng):
     assert "c-000.safetensors: is not in the manifest" in found
 
 
+def tampered(folder, change):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest, manifest["shards"][0])
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m, e: e.update(file="/etc/passwd"), "lists '/etc/passwd', which is not in its folder"),
+        (lambda m, e: e.update(file="shards/../../x"), "which is not in its folder"),
+        (lambda m, e: e.pop("sha256"), r"manifest\.json: 'shards'\[0\]: lacks 'sha256'"),
+        (lambda m, e: e["crops"][0].update(spp="many"), r"'crops'\[0\]: 'spp' is 'many'; it must be a list"),
+        (lambda m, e: e.update(bytes=10**400), r"'bytes' is 1000.*; it must be int"),
+        (lambda m, e: e.update(bytes=True), "'bytes' is True; it must be int"),
+        (lambda m, e: m.update(shards={}), "'shards' is {}; it must be a list"),
+    ],
+)
+def test_manifests_that_cannot_be_used_are_refused(folder, change, message):
+    tampered(folder[0], change)
+    with pytest.raises(NgptError, match=message):
+        Dataset(folder[0])
+
+
+def resealed(path, file):
+    """The manifest's checksum brought up to date with a shard that was changed."""
+    digest = hashlib.sha256((path / file).read_bytes()).hexdigest()
+    tampered(path, lambda m, e: e.update(sha256=digest))
+
+
+def test_changed_shards_are_not_trained_on(folder):
+    path, _ = folder
+    shard = path / "shards" / "a-000.safetensors"
+    whole = shard.read_bytes()
+    for data, message in ((whole[:-1] + b"x", "its sha256 is"), (whole[:500], "its sha256 is"), (None, "is missing")):
+        shard.unlink()
+        if data:
+            shard.write_bytes(data)
+        with pytest.raises(NgptError, match=rf"a-000\.safetensors: {message}"):
+            Dataset(path)[0]
+        assert Dataset(path)[2].stack(0) and any(message in line for line in problems(path))
+        shard.touch()
+
+
+def test_shards_with_other_tensors_are_refused(folder):
+    """Though their checksum is right."""
+    from safetensors.numpy import load_file, save_file
+
+    path, _ = folder
+    shard, record = path / "shards" / "a-000.safetensors", {"ngpt": "{}"}
+    tensors = load_file(shard)
+    for change, message in [
+        ({"dx": tensors["dx"][:, :1]}, r"tensor 'dx' is \(2, 1, 8, 8, 3\), it must be \(2, 2, 8, 8, 3\)"),
+        ({"indirect": tensors["indirect"][0]}, r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
+        ({"albedo": tensors["albedo"].astype("f8")}, "tensor 'albedo' is of type F64"),
+    ]:
+        save_file(tensors | change, shard, record)
+        resealed(path, "shards/a-000.safetensors")
+        with pytest.raises(NgptError, match=message):
+            Dataset(path)[0]
+    save_file({name: tensor for name, tensor in tensors.items() if name != "depth"}, shard, record)
+    resealed(path, "shards/a-000.safetensors")
+    with pytest.raises(NgptError, match="tensors depth are missing"):
+        Dataset(path)[0]
+    save_file(tensors, shard, {"ngpt": "[" * 100_000})
+    with pytest.raises(NgptError, match="its record: cannot be read: brackets within brackets"):
+        Shard(shard)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [
         (None, "no training set"),
+        ("[" * 100_000, "brackets within brackets"),
         ("{", "cannot be read"),
         ("{}", "not the manifest"),
         ('{"format": "ngpt-dataset", "version": 9}', "version 9"),

@@ -256,7 +256,7 @@ def subsampled(path):
         (lambda path: path.write_bytes(b"PF\n4 3\n-1.0\n" + bytes(144)), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"#?RADIANCE\n"), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"\x76\x2f"), "not an OpenEXR file"),
-        (lambda path: path.write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0nonsense"), "cannot be read"),
+        (lambda path: path.write_bytes(b"\x76\x2f\x31\x01\x02\0\0\0nonsense"), "its header ends early"),
         (deep, "part 0 is a deep image; flatten it first"),
         (subsampled, "channel 'RY' of part 0 is subsampled 2x2"),
     ],

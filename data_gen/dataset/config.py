@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from glob import glob
 from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
+from ngpt.records import Shape, check, read_toml
 
 
 @dataclass(frozen=True)
@@ -97,12 +97,22 @@ class Job:
         return f"shards/{self.scene}-{self.batch:03d}.safetensors"
 
 
+_NUMBER = (int, float)
+_SHAPES: dict[str, Shape] = {
+    **{f.name: type(f.default) for f in fields(Config) if isinstance(f.default, int | str)},
+    "roll": _NUMBER,
+    "lens": _NUMBER,
+    "spp": [int],
+    "files": [{"pattern": str, "crops": int}],
+}
+
+
 def read_config(path: Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    try:
-        values = tomllib.loads(path.read_text())
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{path}: cannot be read: {error}") from error
+    values = read_toml(path)
+    for name, value in values.items():
+        if name in _SHAPES:
+            check(value, _SHAPES[name], f"{path}: '{name}'")
     try:
         files = tuple(Files(**table) for table in values.pop("files", []))
         if "spp" in values:

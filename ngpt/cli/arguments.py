@@ -20,6 +20,14 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON on standard output")
 
 
+def add_untrusted(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--untrusted",
+        action="store_true",
+        help="files of strangers: decode them in a process of its own, so that none can crash this one",
+    )
+
+
 def add_layers(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--layer",

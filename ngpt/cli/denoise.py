@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import RESULT_SUFFIX, add_force, add_json, add_layers, print_json, stack_files
+from ngpt.cli.arguments import RESULT_SUFFIX, add_force, add_json, add_layers, add_untrusted, print_json, stack_files
 from ngpt.console import Console
 from ngpt.errors import NgptError
 from ngpt.exr import read, read_image, write
@@ -35,6 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_layers(parser)
+    add_untrusted(parser)
     add_force(parser)
     add_json(parser)
 
@@ -43,7 +44,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     pairs = output_paths(stack_files(args.stacks), args.output)
     for _, target in pairs:
         check_output(target, args.force)
-    reference = read_image(args.ref) if args.ref else None
+    reference = read_image(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def denoise_file(source: Path, target: Path, args, options: dict, reference: np.ndarray | None) -> dict:
     """Reads, reconstructs and writes one stack; returns what there is to report."""
-    stack = read(source, dict(args.layer))
+    stack = read(source, dict(args.layer), args.untrusted)
     result = reconstruct(stack, args.method, **options)
     report = {
         "input": str(source),

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 import ngpt
-from ngpt.cli.arguments import add_json, add_layers, assignment, print_json
+from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
 from ngpt.console import Console
 from ngpt.dataset import summary
 from ngpt.errors import NgptError
@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )
     add_layers(parser)
+    add_untrusted(parser)
     add_json(parser)
 
 
@@ -41,7 +42,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
         show(scene(args.file, dict(args.define)), args.json)
     else:
-        show(stack(read(args.file, dict(args.layer))), args.json)
+        show(stack(read(args.file, dict(args.layer), args.untrusted)), args.json)
     return 0
 
 

@@ -15,6 +15,8 @@ from ngpt.network.unet import DenseUNet, PlainUNet
 NETWORKS = ("dense", "plain")
 # The classical reconstructions a network can start from: those that cost less than itself.
 BASES = ("l2", "cv", "wcv")
+# What a file may ask for: far more than networks have, far less than takes down a machine.
+MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 
 
 @dataclass(frozen=True)
@@ -50,10 +52,16 @@ class ModelConfig:
                 raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
         if "primal" not in self.inputs or len(set(self.inputs)) < len(self.inputs):
             raise NgptError(f"inputs {', '.join(self.inputs)}: each once, and 'primal' among them")
-        if not self.channels or min(self.channels) < 1:
-            raise NgptError(f"channels {list(self.channels)}: give a positive number for each level")
-        if self.network == "dense" and (len(self.units) != len(self.channels) or min(self.units) < 1):
-            raise NgptError(f"units {list(self.units)}: give a positive number for each of {len(self.channels)} levels")
+        levels = len(self.channels)
+        if not 1 <= levels <= MAX_LEVELS or not _whole(self.channels, MAX_CHANNELS):
+            raise NgptError(
+                f"channels {list(self.channels)}: give a positive number for each level, "
+                f"up to {MAX_CHANNELS}, and at most {MAX_LEVELS} levels"
+            )
+        if self.network == "dense" and (len(self.units) != levels or not _whole(self.units, MAX_UNITS)):
+            raise NgptError(
+                f"units {list(self.units)}: give a positive number, up to {MAX_UNITS}, for each of {levels} levels"
+            )
         if self.base and self.base not in BASES:
             raise NgptError(f"base '{self.base}': choose one of: {', '.join(BASES)}")
         if bool(self.base) != ("base" in self.layers):
@@ -94,6 +102,10 @@ class ModelConfig:
     def to_dict(self) -> dict[str, Any]:
         """The fields as TOML and JSON have them."""
         return asdict(self)
+
+
+def _whole(numbers: tuple[Any, ...], most: int) -> bool:
+    return all(type(number) is int and 1 <= number <= most for number in numbers)
 
 
 class Reconstructor(nn.Module):

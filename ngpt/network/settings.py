@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 from ngpt.errors import NgptError
 from ngpt.network.augment import Augmentation
 from ngpt.network.model import ModelConfig
+from ngpt.records import check, read_toml
 
 T = TypeVar("T")
 
@@ -105,10 +106,7 @@ def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # typ
 
     Raises NgptError for a file that cannot be read, and unknown or ill-typed keys.
     """
-    try:
-        values = tomllib.loads(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise NgptError(f"{path}: cannot be read: {error}") from error
+    values = read_toml(path)
     for change in changes:
         _change(values, change)
     return from_dict(values, str(path))
@@ -116,13 +114,13 @@ def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # typ
 
 def from_dict(values: dict[str, Any], path: str) -> Settings:
     """Settings of nested dicts; ``path`` is for messages."""
-    if "model" not in values:
-        raise NgptError(f"{path}: has no table [model]")
+    check(values, {"model": dict}, path)
     known: dict[str, Any] = {}
     for name, value in values.items():
         if name in _TABLES:
             known[name] = _table(_TABLES[name], value, f"{path}: [{name}]")
         elif name in ("loss", "initial"):
+            check(value, dict if name == "loss" else str, f"{path}: '{name}'")
             known[name] = value
         else:
             raise NgptError(f"{path}: unknown '{name}'; there may be: {', '.join([*_TABLES, 'loss', 'initial'])}")
@@ -159,7 +157,7 @@ def _table(kind: type[T], values: Any, where: str) -> T:
     converted = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
         return kind(**converted)
-    except TypeError as error:
+    except (TypeError, NgptError) as error:
         raise NgptError(f"{where}: {error}") from error
 
 

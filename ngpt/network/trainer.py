@@ -28,6 +28,7 @@ from ngpt.network.schedule import learning_rate, update_average
 from ngpt.network.settings import Settings, from_dict
 from ngpt.network.transfer import signed_exp
 from ngpt.network.validation import validate, views
+from ngpt.records import check
 
 Loss = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, dict[str, Tensor]]]
 
@@ -101,16 +102,19 @@ class Trainer:
         tensors, header = weights.read_tensors(self.checkpoint)
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
+        check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
         before = from_dict(header["settings"], str(self.checkpoint))
         if before.model != self.settings.model:
             raise NgptError(f"{self.checkpoint}: was trained with another [model]; give the run another folder")
-        parts: dict[str, dict[str, Tensor]] = {}
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "adam1": {}, "adam2": {}}
         for name, tensor in tensors.items():
             part, _, rest = name.partition("/")
             parts.setdefault(part, {})[rest] = tensor
         weights.fill(self.model, parts["model"], str(self.checkpoint))
         if self.average is not self.model:
             weights.fill(self.average, parts.get("average", parts["model"]), str(self.checkpoint))
+        for moment in ("adam1", "adam2"):
+            weights.check_fit(dict(self.model.named_parameters()), parts[moment], str(self.checkpoint))
         self.step, self.seconds = header["step"], header["seconds"]
         for name, p in self.model.named_parameters():
             first, second = (parts[moment][name].to(self.device) for moment in ("adam1", "adam2"))

@@ -1,6 +1,7 @@
 """Weights on disk: safetensors with the whole configuration in the header. Nothing is ever unpickled."""
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -13,8 +14,10 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.files import atomic_output
 from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.records import parse_json
 
 FORMAT = 1
+_TYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
 
 def write_tensors(
@@ -32,10 +35,12 @@ def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         raise NgptError(f"{path}: no such file")
     try:
         with safe_open(str(path), framework="pt") as file:
-            header = json.loads((file.metadata() or {}).get("ngpt", "null"))
+            header = parse_json((file.metadata() or {}).get("ngpt", "null"), f"{path}: its header")
             tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118 (not a dict)
-    except (SafetensorError, OSError, ValueError) as error:
-        raise NgptError(f"{path}: not a readable safetensors file: {error}") from error
+    except (SafetensorError, OSError, ValueError, TypeError, KeyError) as error:
+        raise (
+            error if isinstance(error, NgptError) else NgptError(f"{path}: not a readable safetensors file: {error}")
+        ) from error
     if not isinstance(header, dict) or "format" not in header:
         raise NgptError(f"{path}: holds no configuration of ngpt in its header; it was written by something else")
     if header["format"] != FORMAT:
@@ -59,16 +64,25 @@ def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
     if header.get("kind") != "weights":
         raise NgptError(f"{path}: holds a {header.get('kind', 'something')}, not weights; pass weights.safetensors")
     try:
-        model = Reconstructor(ModelConfig(**header["model"]))
+        config = ModelConfig(**header["model"])
     except (TypeError, KeyError, ValueError) as error:
         raise NgptError(f"{path}: its configuration cannot be read: {error}") from error
+    # Memory is for what the file holds, not for what its header claims.
+    with torch.device("meta"):
+        check_fit(Reconstructor(config).state_dict(), tensors, str(path))
+    model = Reconstructor(config)
     fill(model, tensors, str(path))
     return model.eval(), header
 
 
 def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None:
     """Sets all of a module's parameters; ``path`` is for messages."""
-    own = module.state_dict()
+    check_fit(module.state_dict(), tensors, path)
+    module.load_state_dict(tensors)
+
+
+def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: str) -> None:
+    """Raises NgptError unless ``tensors`` are those of ``own`` by name and shape, of floats, and finite."""
     missing, extra = own.keys() - tensors.keys(), tensors.keys() - own.keys()
     if missing or extra:
         what = "lacks" if missing else "has an unexpected"
@@ -77,9 +91,12 @@ def fill(module: torch.nn.Module, tensors: dict[str, Tensor], path: str) -> None
     for name, tensor in tensors.items():
         if tensor.shape != own[name].shape:
             raise NgptError(f"{path}: tensor '{name}' is {list(tensor.shape)}, the model's is {list(own[name].shape)}")
+        if tensor.dtype not in _TYPES:
+            raise NgptError(
+                f"{path}: tensor '{name}' is of type {tensor.dtype}; it must be of floats, of 16 to 64 bits"
+            )
         if not torch.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' holds values that are not finite; the file is damaged")
-    module.load_state_dict(tensors)
 
 
 def random_state(seed: int, step: int) -> int:

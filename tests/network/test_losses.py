@@ -1,5 +1,7 @@
 """The losses: distances that are 0 for equal images, with gradients that are finite everywhere."""
 
+import hashlib
+
 import numpy as np
 import pytest
 import torch
@@ -255,9 +257,9 @@ def test_dropout_is_shared_by_both_images():
 def weight_files(folder, kind=backbones.SqueezeNet):
     network = kind()
     # As torchvision's files, with the classifier's tensors beside the features'.
-    torch.save(network.state_dict() | {"classifier.1.weight": torch.zeros(1)}, folder / "backbone.pth")
+    save_file(network.state_dict() | {"classifier.1.weight": torch.zeros(1)}, folder / "backbone.safetensors")
     save_file({f"lin{i}": torch.rand(1, c, 1, 1) for i, c in enumerate(kind.CHANNELS)}, folder / "lin.safetensors")
-    return {"backbone": str(folder / "backbone.pth"), "weights": str(folder / "lin.safetensors")}
+    return {"backbone": str(folder / "backbone.safetensors"), "weights": str(folder / "lin.safetensors")}
 
 
 def test_elpips_trains_when_its_files_are_there(tmp_path):
@@ -271,20 +273,20 @@ def test_elpips_trains_when_its_files_are_there(tmp_path):
 def test_missing_and_damaged_files_are_explained(tmp_path, monkeypatch):
     files = weight_files(tmp_path)
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
-    tensor, numbers, damaged = (str(tmp_path / f"{name}.pth") for name in ("tensor", "numbers", "damaged"))
-    torch.save(torch.zeros(3), tensor)
-    torch.save({"features.0.weight": 3}, numbers)
+    pickled, empty, damaged = str(tmp_path / "a.pth"), *(str(tmp_path / f"{n}.safetensors") for n in ("b", "c"))
+    torch.save(backbones.SqueezeNet().state_dict(), pickled)
+    save_file({"x": torch.zeros(3)}, empty)
     state = backbones.SqueezeNet().state_dict()
     state["features.0.bias"][5] = torch.nan
-    torch.save(state, damaged)
+    save_file(state, damaged)
     cases = [
         ({"backbone": ""}, r"squeezenet1_1-b8a52dc0\.pth: no such file; get .* \"structural\" needs no weights"),
         ({"weights": ""}, "loss.weights is not set"),
         ({"weights": "nowhere"}, "nowhere: no such file"),
-        ({"weights": files["backbone"]}, "not a readable safetensors file"),
-        ({"backbone": __file__}, "cannot be read as PyTorch weights"),
-        ({"backbone": tensor}, "holds a Tensor, not a dictionary"),
-        ({"backbone": numbers}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"weights": pickled}, "not a readable safetensors file"),
+        ({"backbone": __file__}, r"checksum is not b8a52dc0.*convert other weights to \.safetensors"),
+        ({"backbone": pickled}, r"checksum is not b8a52dc0"),
+        ({"backbone": empty}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
         ({"backbone": damaged}, "'features.0.bias' holds values that are not finite"),
         ({"backbone": files["weights"]}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
         ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
@@ -294,7 +296,7 @@ def test_missing_and_damaged_files_are_explained(tmp_path, monkeypatch):
             make_loss({"kind": "elpips-squeeze", **files, **change})
     cache = tmp_path / "cache" / "hub" / "checkpoints"
     cache.mkdir(parents=True)
-    (cache / backbones.SqueezeNet.FILE).write_bytes((tmp_path / "backbone.pth").read_bytes())
+    (cache / backbones.SqueezeNet.FILE).write_bytes((tmp_path / "a.pth").read_bytes())
     with pytest.raises(NgptError, match=r"checksum is not b8a52dc0"):
         make_loss({"kind": "elpips-squeeze", **files, "backbone": ""})
     save_file({f"lin{i}": -torch.ones(c) for i, c in enumerate(backbones.SqueezeNet.CHANNELS)}, files["weights"])
@@ -307,11 +309,28 @@ class Payload:
         return (print, ("code was run",))
 
 
-def test_no_code_is_run_from_weight_files(tmp_path, capsys):
-    files = weight_files(tmp_path)
-    torch.save({"features.0.weight": Payload()}, files["backbone"])
+def pose_as_torchvision(monkeypatch, path):
+    digits = hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+    monkeypatch.setattr(backbones.SqueezeNet, "FILE", f"squeezenet1_1-{digits}.pth")
+
+
+def test_torchvisions_own_file_is_read(tmp_path, monkeypatch):
+    files, path = weight_files(tmp_path), tmp_path / "any.pth"
+    state = backbones.SqueezeNet().state_dict()
+    torch.save(state, path)
+    pose_as_torchvision(monkeypatch, path)
+    network = backbones.load(backbones.SqueezeNet, str(path))
+    assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
+    make_loss({"kind": "elpips-squeeze", **files, "backbone": str(path)})
+
+
+def test_no_code_is_run_from_weight_files(tmp_path, capsys, monkeypatch):
+    """Not even from one that has the checksum."""
+    files, path = weight_files(tmp_path), tmp_path / "any.pth"
+    torch.save({"features.0.weight": Payload()}, path)
+    pose_as_torchvision(monkeypatch, path)
     with pytest.raises(NgptError, match="cannot be read as PyTorch weights"):
-        make_loss({"kind": "elpips-squeeze", **files})
+        make_loss({"kind": "elpips-squeeze", **files, "backbone": str(path)})
     assert "code was run" not in capsys.readouterr().out
 
 

@@ -306,6 +306,23 @@ def test_damaged_weights_are_explained(tmp_path):
     weights.write_tensors(path, tensors, header | {"format": 99}, overwrite=True)
     with pytest.raises(NgptError, match="format 99"):
         weights.load_weights(path)
+    model = header["model"]
+    for change, complaint in [
+        ({"units": [1, 10**6]}, r"units \[1, 1000000\]: give a positive number, up to 32"),
+        ({"channels": [4, 10**9]}, "up to 1024"),
+        ({"channels": [4] * 20, "units": [1] * 20}, "at most 8 levels"),
+        ({"channels": [4.0, True]}, "give a positive number"),
+        # Allowed, and two gigabytes: refused before they are taken.
+        ({"channels": [1024] * 2, "units": [8, 8]}, "is \\[.*the model's is|lacks tensor|unexpected tensor"),
+        ({"network": ["dense"]}, "network"),
+    ]:
+        weights.write_tensors(path, tensors, header | {"model": model | change}, overwrite=True)
+        with pytest.raises(NgptError, match=complaint) as caught:
+            weights.load_weights(path)
+        assert str(path) in str(caught.value)
+    weights.write_tensors(path, tensors | {name: torch.zeros(3, dtype=torch.int32)}, header, overwrite=True)
+    with pytest.raises(NgptError, match=r"is of type torch\.int32"):
+        weights.load_weights(path)
     path.write_bytes(path.read_bytes()[:1000])
     with pytest.raises(NgptError, match="not a readable safetensors file"):
         weights.load_weights(path)
@@ -322,6 +339,25 @@ def test_a_stack_without_what_the_weights_read_is_explained(tmp_path):
     poor = ngpt.GradientStack.from_arrays(primal=stack["primal"], dx=stack["dx"], dy=stack["dy"])
     with pytest.raises(NgptError, match="need layers albedo, normal, depth, which the stack lacks"):
         ngpt.denoise(poor, "ngpt", weights=path)
+
+
+def test_checkpoints_that_do_not_fit_are_explained(tmp_path):
+    trainer(tmp_path, run_steps=1).run()
+    path = tmp_path / "checkpoint.safetensors"
+    tensors, header = weights.read_tensors(path)
+    moment = next(name for name in tensors if name.startswith("adam2/"))
+    for changed, told, complaint in [
+        (tensors | {moment: torch.zeros(7)}, header, r"is \[7\], the model's is"),
+        (tensors | {moment: tensors[moment] * torch.nan}, header, "not finite"),
+        ({n: t for n, t in tensors.items() if n != moment}, header, "lacks tensor"),
+        ({}, header, "lacks tensor"),
+        (tensors, header | {"step": "many"}, "its header: 'step' is 'many'; it must be int"),
+        (tensors, {k: v for k, v in header.items() if k != "settings"}, "its header: lacks 'settings'"),
+    ]:
+        weights.write_tensors(path, changed, told, overwrite=True)
+        with pytest.raises(NgptError, match=complaint) as caught:
+            trainer(tmp_path, run_steps=1).resume()
+        assert str(path) in str(caught.value)
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import torch
+from safetensors.torch import load_file
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d
 
@@ -94,8 +95,9 @@ def _standardised(image: Tensor) -> Tensor:
 def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    Only tensors are read, never code. Raises NgptError where there is no such file, it bears torchvision's name but
-    not the checksum in it, or it has other tensors.
+    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if it has torchvision's checksum,
+    whatever its name, and then by the reader of PyTorch that takes tensors and no code. Raises NgptError where there is
+    no such file, it is another, or it has other tensors.
     """
     file = Path(path or Path(torch.hub.get_dir()) / "checkpoints" / kind.FILE)
     if not file.is_file():
@@ -104,14 +106,20 @@ def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
             'there, or name it in the configuration as loss.backbone; loss.kind = "structural" needs no weights'
         )
     digits = kind.FILE.rpartition("-")[2].removesuffix(".pth")
-    if file.name == kind.FILE and not hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
-        raise NgptError(f"{file}: its checksum is not {digits}...; it is damaged, download it again")
     try:
-        tensors = torch.load(file, map_location="cpu", weights_only=True)
+        if file.suffix == ".safetensors":
+            tensors = load_file(file)
+        elif hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
+            tensors = torch.load(file, map_location="cpu", weights_only=True)
+        else:
+            raise NgptError(
+                f"{file}: its checksum is not {digits}..., that of {kind.FILE}; download it again, or convert other "
+                "weights to .safetensors"
+            )
+    except NgptError:
+        raise
     except Exception as error:  # whatever a damaged archive makes of it
         raise NgptError(f"{file}: cannot be read as PyTorch weights: {' '.join(str(error).split())[:200]}") from error
-    if not isinstance(tensors, dict):
-        raise NgptError(f"{file}: holds a {type(tensors).__name__}, not a dictionary of tensors; see docs/losses.md")
     network = kind()
     own = network.state_dict()
     for name, tensor in own.items():

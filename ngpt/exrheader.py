@@ -1,0 +1,222 @@
+"""Headers of OpenEXR files, read without OpenEXR: how much a file wants decoded is known, and limited, before it is.
+
+A header of some hundred bytes can ask for a terabyte, or for a hundred thousand channels. Limits here are far above
+what renderers write. Layout of the format: https://openexr.com/en/latest/OpenEXRFileLayout.html
+"""
+
+import os
+import resource
+import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import BinaryIO
+
+from ngpt.errors import NgptError
+
+MAX_HEADER = 2**24  # bytes of all headers of a file
+MAX_ATTRIBUTES = 10_000
+MAX_CHANNELS = 4096
+MAX_PIXELS = 2**28  # of one part: 16384 x 16384
+
+_MAGIC = b"\x76\x2f\x31\x01"
+_DEEP, _MULTIPART = 0x800, 0x1000
+_TYPES = {0: 4, 1: 2, 2: 4}  # uint, half, float: bytes
+# By number: lines in a chunk, and the most that a byte of a file can stand for. Deflate ends at 1032 bytes, run lengths
+# at 64; the bounds of others, where blocks without detail take next to nothing, are generous.
+_COMPRESSIONS = {
+    **{0: (1, 1), 1: (1, 64), 2: (1, 1032), 3: (16, 1032), 4: (32, 2**12), 5: (16, 2**11), 6: (32, 12), 7: (32, 12)},
+    **{8: (32, 2**16), 9: (256, 2**16), 10: (256, 2**16), 11: (32, 2**16)},
+}
+
+
+@dataclass(frozen=True)
+class PartHeader:
+    """What of a part's header says how large it is.
+
+    ``name``      "" if it has none
+    ``label``     "part 0 'left'", for messages
+    ``size``      (width, height) of the data window
+    ``channels``  name -> (bytes of a value, x and y step of its subsampling)
+    ``deep``      whether pixels hold lists of samples
+    ``chunks``    pieces that its full-size image is stored in
+    ``ratio``     the most bytes of image that one byte of the file can stand for
+    """
+
+    name: str
+    label: str
+    size: tuple[int, int]
+    channels: dict[str, tuple[int, tuple[int, int]]]
+    deep: bool
+    chunks: int
+    ratio: int
+
+    @property
+    def bytes(self) -> int:
+        """Of the decoded image."""
+        return self.size[0] * self.size[1] * sum(size for size, _ in self.channels.values())
+
+
+def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
+    """The headers of an open file's parts, checked: what follows may be decoded as far as its size is concerned.
+
+    Raises NgptError for files that are no OpenEXR, for headers that are damaged, contradict themselves, the file's
+    length or the limits above, and for more pixels than half of the memory holds.
+    """
+    magic = file.read(4)
+    if not magic:
+        raise NgptError(f"{path}: is empty; render or copy it again")
+    if magic != _MAGIC:
+        raise NgptError(f"{path}: not an OpenEXR file (it starts with {magic!r}); save the image as .exr")
+    try:
+        flags = struct.unpack("<I", file.read(4))[0]
+        if flags & 0xFF != 2:
+            raise NgptError(f"{path}: is of OpenEXR version {flags & 0xFF}, and ngpt reads 2; save it anew")
+        parts = [_part(i, values, flags) for i, values in enumerate(_headers(file, flags))]
+        names = [part.name for part in parts]
+        twice = next((name for i, name in enumerate(names) if name and name in names[:i]), None)
+        if twice:
+            raise _Damage(f"two parts are called '{twice[:40]}'")
+    except _Damage as damage:
+        raise NgptError(f"{path}: damaged or incomplete ({damage}); render or copy it again") from None
+    except (struct.error, IndexError):
+        raise NgptError(f"{path}: damaged or incomplete (its header ends early); render or copy it again") from None
+    except _Excess as excess:
+        raise NgptError(f"{path}: {excess}; if it is no forgery, save it in pieces") from None
+    _check_size(parts, os.fstat(file.fileno()).st_size, path)
+    return parts
+
+
+class _Damage(Exception):
+    """What is wrong with a header."""
+
+
+class _Excess(Exception):
+    """What exceeds which limit."""
+
+
+def _headers(file: BinaryIO, flags: int) -> Iterator[dict[bytes, tuple[bytes, bytes]]]:
+    """The attributes of each part: name -> type, data."""
+    count = 0
+    while True:
+        attributes: dict[bytes, tuple[bytes, bytes]] = {}
+        while name := _string(file):
+            kind, size = _string(file), struct.unpack("<i", file.read(4))[0]
+            if name in attributes:
+                raise _Damage(f"attribute {name!r} comes twice")
+            count += 1
+            if count > MAX_ATTRIBUTES:
+                raise _Excess(f"its header has more than {MAX_ATTRIBUTES} attributes")
+            if size < 0:
+                raise _Damage(f"attribute {name!r} has {size} bytes")
+            if file.tell() + size > MAX_HEADER:
+                raise _Excess(f"its header is longer than {MAX_HEADER >> 20} MiB")
+            data = file.read(size)
+            if len(data) < size:
+                raise _Damage("its header ends early")
+            attributes[name] = kind, data
+        if attributes:
+            yield attributes
+        # Headers of several parts end with an empty one.
+        if not (flags & _MULTIPART and attributes):
+            return
+
+
+def _string(file: BinaryIO) -> bytes:
+    """Up to the next zero; names and types have 255 characters at most."""
+    text = bytearray()
+    while (byte := file.read(1)) != b"\0":
+        if not byte or len(text) == 255:
+            raise _Damage(
+                "its header ends early" if not byte else f"a name begins {bytes(text[:16])!r} and does not end"
+            )
+        text += byte
+    return bytes(text)
+
+
+def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) -> PartHeader:
+    def data(name: str, kind: str) -> bytes:
+        if attributes.get(name.encode(), (b"",))[0] != kind.encode():
+            raise _Damage(f"part {index} has no '{name}' of type {kind}")
+        return attributes[name.encode()][1]
+
+    name = data("name", "string").decode(errors="replace") if b"name" in attributes else ""
+    kind = data("type", "string") if b"type" in attributes else b""
+    label = f"part {index} '{name[:40]}'" if name else f"part {index}"
+    left, top, right, bottom = struct.unpack("<4i", data("dataWindow", "box2i"))
+    width, height = right - left + 1, bottom - top + 1
+    if width < 1 or height < 1:
+        raise _Damage(f"{label} is {width}x{height} pixels")
+    number = data("compression", "compression")[0]
+    if number not in _COMPRESSIONS:
+        raise _Damage(f"{label} has compression {number}, which is none of OpenEXR's")
+    lines, ratio = _COMPRESSIONS[number]
+    chunks = -(-height // lines)
+    if kind in (b"tiledimage", b"deeptile") or (not kind and flags & 0x200):
+        across, down = struct.unpack_from("<2I", data("tiles", "tiledesc"))
+        if not (0 < across < 2**31 and 0 < down < 2**31):
+            raise _Damage(f"{label} has tiles of {across}x{down} pixels")
+        chunks = -(-width // across) * -(-height // down)
+    channels = dict(_channels(data("channels", "chlist"), label))
+    return PartHeader(
+        name, label, (width, height), channels, kind.startswith(b"deep") or bool(flags & _DEEP), chunks, ratio
+    )
+
+
+def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[int, int]]]]:
+    names: set[bytes] = set()
+    position = 0
+    while data[position]:
+        end = data.index(b"\0", position) if b"\0" in data[position : position + 256] else len(data)
+        name, (kind, x, y) = data[position:end], struct.unpack_from("<i4x2i", data, end + 1)
+        position = end + 17
+        if name in names:
+            raise _Damage(f"{label} has two channels {name!r}")
+        if kind not in _TYPES:
+            raise _Damage(f"channel {name!r} of {label} is of type {kind}, which is none of OpenEXR's")
+        names.add(name)
+        if len(names) > MAX_CHANNELS:
+            raise _Excess(f"{label} has more than {MAX_CHANNELS} channels")
+        yield name.decode(errors="replace"), (_TYPES[kind], (x, y))
+    if not names:
+        raise _Damage(f"{label} has no channels")
+
+
+def _check_size(parts: list[PartHeader], length: int, path: str) -> None:
+    if not parts:
+        raise NgptError(f"{path}: damaged or incomplete (it has no parts); render or copy it again")
+    for part in parts:
+        width, height = part.size
+        if width * height > MAX_PIXELS:
+            raise NgptError(
+                f"{path}: {part.label} is {width}x{height} pixels, and {MAX_PIXELS >> 20} million are read at most; "
+                "if it is no forgery, render or save it in pieces"
+            )
+    channels = sum(len(part.channels) for part in parts)
+    if channels > MAX_CHANNELS:
+        raise NgptError(
+            f"{path}: has {channels} channels in {len(parts)} parts, and {MAX_CHANNELS} are read at most; "
+            "keep those that are needed"
+        )
+    if any(part.deep for part in parts):
+        return
+    # Each chunk has an entry in a table and a size before its data, and data of no more bytes than it can stand for.
+    least = sum(16 * part.chunks + (part.bytes // part.ratio) for part in parts)
+    wanted = sum(part.bytes for part in parts)
+    if least > length:
+        sizes = ", ".join("x".join(map(str, part.size)) for part in parts[:4])
+        raise NgptError(
+            f"{path}: damaged or incomplete ({length} bytes cannot hold {channels} channels of {sizes} pixels); "
+            "render or copy it again"
+        )
+    if wanted > memory() // 2:
+        raise NgptError(
+            f"{path}: its {channels} channels take {wanted / 2**30:.1f} GiB, more than half of the "
+            f"{memory() / 2**30:.1f} GiB of memory; keep the channels that are needed, or cut it into pieces"
+        )
+
+
+def memory() -> int:
+    """Bytes that this process may have: the machine's, or what its limits leave it."""
+    physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    return physical if limit == resource.RLIM_INFINITY else min(physical, limit)

@@ -1,0 +1,245 @@
+"""What broken inputs are given to: a function of the input's number and a folder to work in, for each target.
+
+A target returns where the input is accepted and handled, raises NgptError where it is refused, and anything else is a
+failure. Number -1 is a whole input.
+"""
+
+import os
+import random
+import signal
+import time
+import tomllib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from data_mutations import bytes_changed, safetensors_changed, to_json, to_toml, value_changed
+from exr_mutations import mutate, seeds
+from full_stack import full_stack
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.exr import read, write
+from ngpt.methods import WEIGHTS, reconstruct
+
+CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+
+
+def exr(number: int, folder: Path) -> None:
+    """What `ngpt denoise` does with a file: reads, reconstructs, writes; what is written can be read again."""
+    path, result = folder / "stack.exr", folder / "result.exr"
+    path.write_bytes(seeds()[0][1] if number < 0 else mutate(number)[1])
+    stack = read(path)
+    method = "l2" if "dx" in stack and "dy" in stack else "primal"
+    image = reconstruct(stack, method).image
+    assert image.shape == stack["primal"].shape and np.isfinite(image).all()
+    write(result, image, like=stack, overwrite=True)
+    ngpt.read_image(result)
+
+
+@cache
+def _dataset() -> tuple[dict, bytes]:
+    """A manifest and the shard it lists."""
+    import tempfile
+
+    from ngpt.dataset import FORMAT, VERSION, checksum
+    from ngpt.shards import CropData, write_shard
+
+    stack = full_stack(8, 8)
+    stack = stack.replace(direct=np.zeros_like(stack["primal"]))
+    crop = CropData([stack, stack], [2, 9], stack["primal"], stack["direct"])
+    told = {"scene": "a", "crops": [{"spp": [2, 9], "seconds": {"inputs": 1.0}}] * 2, "failures": []}
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "shard"
+        write_shard(path, [crop, crop], told)
+        data, digest = path.read_bytes(), checksum(path)
+    entry = {"file": "shards/a-000.safetensors", "sha256": digest, "bytes": len(data)} | told
+    return {"format": FORMAT, "version": VERSION, "config": {}, "planned": 2, "shards": [entry]}, data
+
+
+def _read_all(folder: Path) -> None:
+    """What training and `ngpt info` do with a dataset."""
+    from ngpt.dataset import Dataset, problems, summary
+
+    data = Dataset(folder)
+    for crop in data:
+        for k in range(crop.inputs):
+            assert reconstruct(crop.stack(k), "primal").image.shape == crop.reference.shape
+    assert problems(folder) == summary(folder)["problems"]
+
+
+def manifest(number: int, folder: Path) -> None:
+    value, shard = _dataset()
+    (folder / "shards").mkdir(exist_ok=True)
+    (folder / "shards" / "a-000.safetensors").write_bytes(shard)
+    data = to_json(value)
+    if number >= 0:
+        rng = random.Random(number)
+        data = to_json(value_changed(rng, value)) if rng.random() < 0.8 else bytes_changed(rng, data)
+    (folder / "manifest.json").write_bytes(data)
+    _read_all(folder)
+
+
+def shard(number: int, folder: Path) -> None:
+    """With the checksum of the broken shard in the manifest, so that it is not refused for that alone."""
+    from ngpt.dataset import checksum
+
+    value, data = _dataset()
+    (folder / "shards").mkdir(exist_ok=True)
+    path = folder / "shards" / "a-000.safetensors"
+    path.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
+    entry = value["shards"][0] | {"sha256": checksum(path), "bytes": path.stat().st_size}
+    (folder / "manifest.json").write_bytes(to_json(value | {"shards": [entry]}))
+    _read_all(folder)
+
+
+@cache
+def _weights() -> tuple[bytes, bytes]:
+    """Of a tiny network, and the checkpoint of its training after one step."""
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        run = _trainer(Path(folder))
+        run.run()
+        return (Path(folder) / "weights.safetensors").read_bytes(), run.checkpoint.read_bytes()
+
+
+SETTINGS = {
+    "model": {"network": "dense", "channels": [2, 3], "units": [1, 1], "inputs": ["primal", "dx", "dy", "albedo"]},
+    "data": {"crop": 16},
+    "run": {"steps": 1, "batch": 1, "log": 1, "save": 1, "validate": 1},
+}  # fmt: skip
+
+
+class _Crop:
+    scene, inputs, spp = "a", 1, (4,)
+
+    def stack(self, k: int) -> ngpt.GradientStack:
+        return full_stack(16, 16)
+
+    reference = property(lambda self: self.stack(0)["primal"])
+    reference_direct = property(lambda self: np.zeros((16, 16, 3), np.float32))
+
+
+def _trainer(folder: Path):
+    import torch
+
+    from ngpt.network.settings import from_dict
+    from ngpt.network.trainer import Trainer
+
+    torch.set_num_threads(1)
+
+    def loss(prediction, target, generator):
+        value = (prediction - target).abs().mean()
+        return value, {"l1": value}
+
+    return Trainer(from_dict(SETTINGS, "test"), [_Crop()], [], loss, folder, say=lambda text: None)
+
+
+def weights(number: int, folder: Path) -> None:
+    path, data = folder / "weights.safetensors", _weights()[0]
+    path.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
+    image = ngpt.denoise(full_stack(9, 7), "ngpt", weights=str(path))
+    assert np.isfinite(image).all()
+
+
+def checkpoint(number: int, folder: Path) -> None:
+    data = _weights()[1]
+    run = _trainer(folder)
+    run.checkpoint.write_bytes(data if number < 0 else safetensors_changed(random.Random(number), data))
+    run.resume()
+
+
+def settings(number: int, folder: Path) -> None:
+    """Of training and of data generation."""
+    from data_gen.dataset.config import read_config
+    from ngpt.network.settings import read_settings
+
+    rng = random.Random(number)
+    name = rng.choice(("fast.toml", "data-cpu.toml", "paper.toml"))
+    data = (CONFIGS / name).read_bytes()
+    if number >= 0:
+        value = tomllib.loads(data.decode())
+        if name == "data-cpu.toml":
+            value["files"] = [{"pattern": str(folder / "*.xml"), "crops": 2, "boxes": {"a": [[0, 0, 0], [1, 1, 1]]}}]
+        changed = value_changed(rng, value)
+        data = (
+            to_toml(changed if isinstance(changed, dict) else {"x": changed})
+            if rng.random() < 0.8
+            else bytes_changed(rng, data)
+        )
+    path = folder / "settings.toml"
+    path.write_bytes(data)
+    if name == "data-cpu.toml":
+        read_config(path)
+    else:
+        read_settings(path)
+
+
+def network(number: int, folder: Path) -> None:
+    """ONNX files that users pass as weights."""
+    path, data = folder / "network.onnx", (WEIGHTS / "ngpt-fast.onnx").read_bytes()
+    path.write_bytes(data if number < 0 else _onnx_changed(random.Random(number), data))
+    image = ngpt.denoise(full_stack(9, 7), "ngpt-fast", weights=str(path))
+    assert np.isfinite(image).all()
+
+
+def _onnx_changed(rng: random.Random, data: bytes) -> bytes:
+    """Its metadata, nodes, inputs and initializers, or its bytes."""
+    import onnx
+
+    if rng.random() < 0.4:
+        # The graph's own bytes stand before and after the numbers.
+        return bytes_changed(rng, data[:40_000]) + data[40_000:] if rng.random() < 0.7 else bytes_changed(rng, data)
+    model = onnx.load_from_string(data)
+    graph = model.graph
+    match rng.randrange(7):
+        case 0:
+            entry = rng.choice(model.metadata_props)
+            entry.value = rng.choice(
+                ("", "0", "-1", "x", "1e9", str(2**70), "primal", "primal, primal", "l3", "primal, base")
+            )
+        case 1:
+            rng.choice(graph.input).name = rng.choice(("x", "", "base"))
+        case 2:
+            del graph.node[rng.randrange(len(graph.node))]
+        case 3:
+            rng.choice(graph.node).op_type = rng.choice(("Loop", "Sub", "Conv", "Nothing", "Sin"))
+        case 4:
+            tensor = rng.choice(graph.initializer)
+            tensor.data_location = onnx.TensorProto.EXTERNAL
+            for key, value in (("location", rng.choice(("/etc/passwd", "../x", "network.onnx"))), ("offset", "0")):
+                tensor.external_data.add(key=key, value=value)
+            tensor.ClearField("raw_data")
+        case 5:
+            tensor = rng.choice(graph.initializer)
+            if tensor.dims:
+                tensor.dims[rng.randrange(len(tensor.dims))] = rng.choice((0, 1, -1, 2**31, 2**62))
+        case 6:
+            del graph.input[rng.randrange(len(graph.input))]
+    return model.SerializeToString()
+
+
+def probe(number: int, folder: Path) -> None:
+    """Does what campaigns are to notice."""
+    match number:
+        case 1:
+            os.kill(os.getpid(), signal.SIGSEGV)
+        case 3:
+            time.sleep(60)
+        case 4:
+            np.ones(600 * 2**17)  # 600 MiB
+        case 5:
+            np.empty(8 * 2**30, np.uint8)
+        case 6:
+            raise KeyError("x")
+        case 7:
+            raise NgptError("something is wrong")
+        case 8:
+            raise NgptError(f"{folder}: is refused")
+
+
+TARGETS: dict[str, Callable[[int, Path], None]] = {
+    target.__name__: target for target in (exr, manifest, shard, weights, checkpoint, settings, network, probe)
+}

@@ -1,0 +1,79 @@
+"""Broken files by the hundred, and by the ten thousand in `make test-slow`: each is refused by name or handled.
+
+A failure names inputs by number: `python tests/fuzz/campaign.py TARGET --replay NUMBER` does it again.
+"""
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from fuzz.campaign import run
+from reliability import record
+
+# Target: what it is to a reader, inputs here, inputs in the slow campaign, what it needs beyond the base.
+TARGETS = {
+    "exr": ("OpenEXR stacks, mutated: read, reconstructed, written", 250, 10_000, ()),
+    "manifest": ("Manifests of training sets, mutated", 150, 5000, ("safetensors",)),
+    "shard": ("Shards of training sets, mutated, with a checksum that fits", 150, 5000, ("safetensors",)),
+    "settings": ("Settings of training and data generation, mutated", 150, 5000, ("torch",)),
+    "weights": ("Weights, mutated", 80, 5000, ("torch", "safetensors")),
+    "checkpoint": ("Checkpoints of training, mutated", 80, 5000, ("torch", "safetensors")),
+    "network": ("ONNX networks given by users, mutated", 40, 1000, ("onnx",)),
+}
+
+
+def campaign(target, first, count):
+    for package in TARGETS[target][3]:
+        pytest.importorskip(package)
+    report = run(target, first, count)
+    assert not report.failures, report.failures
+    assert report.outcomes["named error"] > count / 10 and report.outcomes["accepted"] > count / 100, "does it work?"
+    assert report.outcomes.total() == count
+    return report
+
+
+@pytest.mark.parametrize("target", TARGETS)
+def test_broken_inputs_are_refused_or_handled(target):
+    campaign(target, 0, TARGETS[target][1])
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("target", TARGETS)
+def test_many_broken_inputs_are_refused_or_handled(target):
+    text, _, count, _ = TARGETS[target]
+    report = campaign(target, 1000, count)
+    record(text, count, dict(report.outcomes), worst=report.worst, seconds=round(report.seconds, 1))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("target", ["header", "json", "toml"])
+def test_bytes_that_reach_new_lines(target, tmp_path):
+    """A minute of libFuzzer for each of the parsers in Python."""
+    pytest.importorskip("atheris")
+    program = Path(__file__).with_name("coverage_guided.py")
+    path = os.pathsep.join(map(str, [program.parents[2], program.parents[1]]))
+    command = [sys.executable, str(program), target, "-max_total_time=60"]
+    environment = os.environ | {"PYTHONPATH": path}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    runs = int(re.search(r"Done (\d+) runs", done.stderr)[1])
+    record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)
+
+
+def test_campaigns_notice_what_they_are_for():
+    """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
+    report = run("probe", 0, 10, patience=20)
+    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}, report.failures
+    for number, what in {
+        1: "the process died (-11)",
+        3: "hangs: no end after 0 s of work",
+        4: "took 6",
+        5: "MemoryError",
+        6: "KeyError",
+        7: "names no file",
+    }.items():
+        assert what in report.failures[number]

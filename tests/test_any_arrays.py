@@ -1,0 +1,201 @@
+"""Arrays of any kind through every method: a finite image of all that was given, or an error with a name."""
+
+import os
+import time
+import warnings
+from collections import Counter
+
+import numpy as np
+import pytest
+from full_stack import full_layers
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from reliability import record
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.layers import LAYERS
+from ngpt.methods import METHODS, reconstruct
+
+SIZES = [(1, 1), (1, 2), (2, 1), (2, 2), (1, 17), (15, 1), (15, 17), (17, 16), (0, 2), (2, 0)]
+DTYPES = ["f4", "f4", "f4", "f2", "f8", ">f4", "i4", "u1", "g", "?", "c8", "O"]
+LAYOUTS = {
+    "C": lambda a: a,
+    "Fortran": np.asfortranarray,
+    "upside down": lambda a: np.ascontiguousarray(a[::-1])[::-1],
+    "every other": lambda a: np.repeat(a, 2, axis=0)[::2],
+    "bottom to top, right to left": lambda a: np.ascontiguousarray(a[::-1, ::-1])[::-1, ::-1],
+    "channels reversed": lambda a: np.ascontiguousarray(a[..., ::-1])[..., ::-1],
+}
+VALUES = [
+    np.nan,
+    np.inf,
+    -np.inf,
+    -0.0,
+    0.0,
+    -1.0,
+    -100.0,
+    1e-45,
+    1e-38,
+    65505.0,
+    1e12,
+    1e20,
+    1e30,
+    3.4e38,
+    -3.4e38,
+    1e39,
+]
+TRIED: Counter = Counter()
+
+
+@st.composite
+def stacks(draw):
+    """Layers by name: those of a plausible image, some of them missing, of another type, or with other values."""
+    height, width = draw(st.sampled_from(SIZES))
+    made = full_layers(max(height, 1), max(width, 1), seed=draw(st.integers(0, 3)))
+    made["direct"] = np.zeros_like(made["primal"])
+    made["alpha"] = np.ones_like(made["depth"])
+    for name in draw(st.lists(st.sampled_from(list(LAYERS)), max_size=3)):
+        if name != "primal":
+            made.pop(name, None)
+    for name in list(made):
+        made[name] = made[name][:height, :width]
+    for name in draw(st.lists(st.sampled_from(sorted(made)), max_size=3)):
+        value, where = draw(st.sampled_from(VALUES)), draw(st.sampled_from(["all", "one", "some", "column"]))
+        layer = made[name].astype("f8")
+        if where == "all":
+            layer[:] = value
+        elif layer.size:
+            rng = np.random.default_rng(draw(st.integers(0, 9)))
+            place = {"one": rng.integers(len(layer)), "some": rng.random(layer.shape) < 0.3, "column": np.s_[:, -1]}
+            layer[place[where]] = value
+        made[name] = layer if abs(value) > 3.5e38 and np.isfinite(value) else layer.astype("f4")
+    if draw(st.booleans()):
+        name, dtype = draw(st.sampled_from(sorted(made))), draw(st.sampled_from(DTYPES))
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            finite = dtype in ("i4", "u1", "O")
+            made[name] = (np.nan_to_num(made[name], posinf=9, neginf=0) if finite else made[name]).astype(dtype)
+    for name in made:
+        made[name] = LAYOUTS[draw(st.sampled_from(list(LAYOUTS)))](made[name])
+        made[name].flags.writeable = draw(st.booleans())
+    return made
+
+
+def named(error):
+    text = str(error)
+    assert "\n" not in text and 20 < len(text) <= 1000, text
+    return True
+
+
+def check(layers, method, options):
+    """A finite image, with all repairs counted; or an error. Counts which."""
+    before = {name: array.copy() for name, array in layers.items()}
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", RuntimeWarning)
+            stack = ngpt.GradientStack.from_arrays(path="s.exr", **layers)
+            result = reconstruct(stack, method, **options)
+    except NgptError as error:
+        TRIED["named error"] += named(error)
+        return
+    finally:
+        for name, array in before.items():
+            assert np.array_equal(array, layers[name], equal_nan=array.dtype.kind in "fc"), f"{name} was modified"
+    TRIED["finite image"] += 1
+    image, primal, direct = result.image, stack["primal"], stack.layers.get("direct", np.zeros_like(stack["primal"]))
+    assert image.shape == primal.shape and image.dtype == np.float32 and np.isfinite(image).all()
+    good = np.isfinite(primal).all(axis=-1) & np.isfinite(direct).all(axis=-1)
+    assert result.repaired == np.sum(~good)
+    if result.method == "primal":
+        # Neither the dark nor the bright end is clamped; taking direct emission off and adding it rounds.
+        rounding = 1e-6 * (np.abs(primal[good]) + np.abs(direct[good]))
+        assert (np.abs(image[good] - primal[good]) <= rounding).all()
+
+
+OPTIONS = [{}, {}, {}, {"alpha": "auto"}, {"alpha": 0.2}, {"alpha": 1e-6}, {"alpha": 0.0}, {"alpha": -1.0}]
+OPTIONS += [{"alpha": float("nan")}, {"alpha": float("inf")}, {"alpha": 1e300}, {"alpha": 1e-300}, {"alpha": "x"}]
+
+
+def options_of(method, options):
+    return options if method in METHODS and "alpha" in METHODS[method].options else {}
+
+
+QUICK = settings(
+    max_examples=25, deadline=None, derandomize=True, database=None, suppress_health_check=list(HealthCheck)
+)
+
+
+@pytest.mark.parametrize("method", ["auto", *METHODS])
+@QUICK
+@given(layers=stacks(), options=st.sampled_from(OPTIONS))
+def test_every_method_takes_any_arrays(method, layers, options):
+    check(layers, method, options_of(method, options))
+
+
+@QUICK
+@given(layers=stacks(), method=st.sampled_from(["auto", "l2", "wcv"]), announced=st.booleans())
+def test_the_denoiser_takes_any_arrays(layers, method, announced):
+    layers = {name: array for name, array in layers.items() if name != "alpha"}
+    noisy, normals = layers.pop("primal"), layers.pop("normal", None)
+    height, width = noisy.shape[:2]
+    try:
+        denoiser = ngpt.Denoiser((width, height), announced, announced, method)
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            result = denoiser(noisy, normals=normals, to_sensor=np.eye(4), **layers)
+    except NgptError as error:
+        named(error)
+    else:
+        assert result.shape == noisy.shape and np.isfinite(result).all()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+def test_every_method_takes_many_arrays():
+    """As many as NGPT_EXAMPLES says, 500 if it does not, for each method; each run tries others."""
+    TRIED.clear()
+    begun = time.perf_counter()
+    for method in ("auto", *METHODS):
+
+        @settings(QUICK, max_examples=int(os.environ.get("NGPT_EXAMPLES", "500")), derandomize=False)
+        @given(layers=stacks(), options=st.sampled_from(OPTIONS))
+        def many(method, layers, options):
+            check(layers, method, options_of(method, options))
+
+        many(method)
+    seconds = round(time.perf_counter() - begun, 1)
+    record("Arrays of any kind through every method", TRIED.total(), dict(TRIED), seconds=seconds)
+
+
+# Of OIDN's network nobody promises that.
+@pytest.mark.parametrize("method", [name for name, m in METHODS.items() if not m.missing() and name != "oidn"])
+def test_a_converged_image_of_any_range_keeps_its_range(method):
+    """Negative, tiny and huge: where nothing is noisy, what comes out is not clamped to what displays show."""
+    layers = full_layers(16, 17)
+    layers |= {name: np.zeros_like(layers[name]) for name in ("dx", "dy", "primal_var", "dx_var", "dy_var")}
+    for value in (1e6, 65505.0, 1e-6):
+        layers["primal"] = np.full_like(layers["primal"], value)
+        image = ngpt.denoise(ngpt.GradientStack(dict(layers)), method)
+        assert np.allclose(image, value, rtol=0.05), (method, value, image.min(), image.max())
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda a: ngpt.Denoiser("large"), "size is 'large'; it must be"),
+        (lambda a: ngpt.Denoiser((1, 2, 3)), r"size is \(1, 2, 3\)"),
+        (lambda a: ngpt.Denoiser((4, 3))(a.astype(complex)), "layer 'primal' is of type complex128"),
+        (lambda a: ngpt.Denoiser((4, 3))(a.astype(object)), "layer 'primal' is of type object"),
+        (lambda a: ngpt.Denoiser((4, 3))(a * 1e39), "12 values|36 values that float32 cannot hold"),
+        (lambda a: ngpt.Denoiser((4, 3))(1.0), r"noisy has shape \(\)"),
+        (lambda a: ngpt.Denoiser((4, 3))(None), r"noisy has shape \(\)"),
+        (
+            lambda a: ngpt.Denoiser((4, 3), normals=True)(a, normals=a, to_sensor=np.eye(5)),
+            r"to_sensor is \(5, 5\) of float64",
+        ),
+    ],
+)
+def test_what_the_denoiser_cannot_use_is_named(call, message):
+    with pytest.raises(NgptError, match=message):
+        call(np.ones((3, 4, 3)))
