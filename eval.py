@@ -14,12 +14,15 @@ from evaluation.config import read_config
 from evaluation.run import evaluate
 from evaluation.stacks import write_json
 from ngpt.advice import make_table
-from ngpt.console import Console
-from ngpt.errors import NgptError
+from ngpt.console import Console, run_command
 from ngpt.report_evaluation import write_evaluation_report
 
 
 def main(arguments: list[str] | None = None) -> int:
+    return run_command(lambda: run(arguments), interrupted="interrupted; the same command goes on from here")
+
+
+def run(arguments: list[str] | None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", required=True, metavar="TOML")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR")
@@ -30,19 +33,12 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     console = Console(args.quiet)
     command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
-    try:
-        config = read_config(args.config)
-        config = replace(config, scenes=(*config.scenes, *args.scenes))
-        results = evaluate(config, args.out, console, command, args.cache)
-        write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
-        if args.advice:
-            write_json(args.advice, make_table(results))
-    except NgptError as error:
-        console.error(error)
-        return 2
-    except KeyboardInterrupt:
-        console.error("interrupted; the same command goes on from here")
-        return 130
+    config = read_config(args.config)
+    config = replace(config, scenes=(*config.scenes, *args.scenes))
+    results = evaluate(config, args.out, console, command, args.cache)
+    write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
+    if args.advice:
+        write_json(args.advice, make_table(results))
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
     if absent:
         console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")

@@ -3,27 +3,89 @@
 Everything goes to standard error; standard output is kept for results (JSON, tables).
 """
 
+import os
 import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TextIO
+
+from ngpt.errors import NgptError
 
 # Elsewhere than on a terminal, a line at most this often: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
 
 
-class Console:
-    """Messages and progress for one command. ``quiet`` leaves only errors."""
+def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
+    """The exit status of a command: what ``run`` returns, or that of whatever stopped it, which is told in one line.
 
-    def __init__(self, quiet: bool = False):
-        self.quiet = quiet
+    2 for an error, 130 when interrupted, 1 when nobody reads standard output any more. ``interrupted`` says what an
+    interrupt means for the work.
+    """
+    _open_standard_streams()
+    console = Console(name=name)
+    try:
+        try:
+            return run()
+        finally:
+            # Not when Python ends, which complains in its own way.
+            sys.stdout.flush()
+    except NgptError as error:
+        console.error(error)
+        return 2
+    except MemoryError:
+        console.error("out of memory; use a smaller image or fewer files at once")
+        return 2
+    except KeyboardInterrupt:
+        console.error(interrupted)
+        return 130
+    except BrokenPipeError:
+        _close(sys.stdout)
+        return 1
+    except OSError as error:
+        _close(sys.stdout)
+        console.error(error)
+        return 2
+
+
+def print_line(text: str, stream: TextIO) -> None:
+    """A message, at once. That nobody takes it, as when the disk with the log is full, stops no work."""
+    try:
+        print(text, file=stream, flush=True)
+    except OSError:
+        _close(stream)
+
+
+def _close(stream: TextIO) -> None:
+    """Sends what is still to come to nowhere, with what could not be written so far."""
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, stream.fileno())
+    os.close(null)
+
+
+def _open_standard_streams() -> None:
+    """A file opened while one of them is closed would take its place, and get what is printed."""
+    for number, name in enumerate(("stdin", "stdout", "stderr")):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
+        if getattr(sys, name) is None:
+            setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
+
+
+class Console:
+    """Messages and progress for one command. ``quiet`` leaves only errors; ``name`` is what those begin with."""
+
+    def __init__(self, quiet: bool = False, name: str = "ngpt"):
+        self.quiet, self.name = quiet, name
 
     def say(self, text: str) -> None:
         if not self.quiet:
-            print(text, file=sys.stderr, flush=True)
+            print_line(text, sys.stderr)
 
     def error(self, text: object) -> None:
-        print(f"ngpt: error: {' '.join(str(text).split())}", file=sys.stderr, flush=True)
+        print_line(f"{self.name}: error: {' '.join(str(text).split())}", sys.stderr)
 
     @contextmanager
     def progress(self, label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
