@@ -1,0 +1,194 @@
+"""The commands as processes of their own: small work for each, what it leaves, and ways to end it before its time."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from abc import ABC, abstractmethod
+from pathlib import Path
+
+from full_stack import full_stack
+
+import ngpt
+from ngpt.dataset import read_manifest
+
+ROOT = Path(__file__).parents[1]
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
+
+
+def start(arguments, **options) -> subprocess.Popen:
+    """A process, at the root of the project, with its errors kept for ``errors_of``."""
+    options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT} | options
+    return subprocess.Popen([str(a) for a in arguments], env=ENVIRONMENT, **options)
+
+
+def complete(arguments, **options) -> subprocess.CompletedProcess:
+    options = {"capture_output": True, "text": True, "cwd": ROOT, "timeout": 300} | options
+    return subprocess.run([str(a) for a in arguments], env=ENVIRONMENT, check=False, **options)
+
+
+def temporary_files(folder: Path) -> list[Path]:
+    return [path for path in folder.rglob(".ngpt-*") if path.is_file()]
+
+
+def ended(process: subprocess.Popen, seconds: float, number: int = signal.SIGKILL, writing: Path | None = None) -> int:
+    """Sends a signal after that many seconds, or so long after a file is being written in ``writing``; exit status."""
+    if writing is not None:
+        while process.poll() is None and not temporary_files(writing):
+            time.sleep(0.002)
+    try:
+        return process.wait(seconds)
+    except subprocess.TimeoutExpired:
+        process.send_signal(number)
+        return process.wait(120)
+
+
+def wait_for(condition, seconds: float = 60) -> bool:
+    deadline = time.monotonic() + seconds
+    while not condition() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    return bool(condition())
+
+
+def running(pid: int) -> bool:
+    """Whether there is such a process, zombies aside."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except OSError:
+        return False
+
+
+def children(pid: int) -> list[int]:
+    try:
+        return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    except OSError:
+        return []
+
+
+class Work(ABC):
+    """One command on something small; what it writes goes into ``out``, and running it again continues it."""
+
+    name: str
+
+    def __init__(self, inputs: Path):
+        self.inputs = inputs
+
+    @abstractmethod
+    def arguments(self, out: Path) -> list[object]:
+        """The command line."""
+
+    @abstractmethod
+    def results(self, out: Path) -> dict[str, object]:
+        """What is to be seen in ``out``, as values that are equal if it is; fails for anything half-written."""
+
+    @abstractmethod
+    def is_part(self, seen: dict[str, object], whole: dict[str, object]) -> bool:
+        """Whether what a killed run shows is what one may see on the way to ``whole``."""
+
+
+def visible(folder: Path) -> list[Path]:
+    if not folder.exists():
+        return []
+    return sorted(path for path in folder.rglob("*") if path.is_file() and not path.name.startswith("."))
+
+
+class Denoise(Work):
+    name = "ngpt denoise"
+
+    def __init__(self, inputs: Path, method: str = "auto"):
+        super().__init__(inputs)
+        self.method = method
+        for i in range(4):
+            ngpt.write(inputs / f"{i}.exr", full_stack(48 + 8 * i, 64, seed=i))
+
+    def arguments(self, out):
+        return [sys.executable, "-m", "ngpt", "denoise", self.inputs, "-o", f"{out}/", "-m", self.method, "--force"]
+
+    def results(self, out):
+        for path in visible(out):
+            ngpt.read(path)
+        return {path.name: path.read_bytes() for path in visible(out)}
+
+    def is_part(self, seen, whole):
+        return seen.items() <= whole.items()
+
+
+class DataGen(Work):
+    name = "python -m data_gen"
+
+    def arguments(self, out):
+        return [sys.executable, "-m", "data_gen", "--config", "configs/data-tiny.toml", "--out", out]
+
+    def results(self, out):
+        from ngpt.shards import Shard
+
+        seen: dict[str, object] = {}
+        for path in visible(out):
+            if path.suffix == ".safetensors":
+                shard = Shard(path)
+                seen[path.name] = {name: shard.tensor(name).tobytes() for name in shard.names}
+            elif path.name == "manifest.json":
+                listed = {entry["file"] for entry in read_manifest(out)["shards"]}
+                assert listed <= {f"shards/{p.name}" for p in (out / "shards").iterdir()}
+            else:
+                assert path.name in ("README.md", "contact.png"), path
+                seen[path.name] = path.read_bytes() if path.suffix == ".png" else path.read_text().endswith("\n")
+        return seen
+
+    def is_part(self, seen, whole):
+        return all(whole[name] == value for name, value in seen.items())
+
+
+class Train(Work):
+    name = "train.py"
+
+    def __init__(self, inputs: Path):
+        super().__init__(inputs)
+        for i in range(2):
+            view = inputs / f"view{i}"
+            view.mkdir(parents=True)
+            ngpt.write(view / "reference.exr", full_stack(40, 40, seed=i)["primal"])
+            ngpt.write(view / "few.exr", full_stack(40, 40, seed=10 + i))
+
+    def arguments(self, out, **changes):
+        changes = {
+            "data.folders": [str(self.inputs)],
+            "data.validation": ["view1"],
+            "data.crop": 32,
+            "model.channels": [4, 4],
+            "model.units": [1, 1],
+            "run.steps": 20,
+            "run.batch": 1,
+            "run.log": 5,
+            "run.save": 2,
+            "run.validate": 10,
+        } | changes
+        words = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+        return [sys.executable, "train.py", "--config", "configs/tiny.toml", "--out", out, *words]
+
+    def results(self, out):
+        from ngpt.network import weights
+
+        seen: dict[str, object] = {}
+        for path in visible(out):
+            if path.suffix == ".safetensors":
+                tensors, header = weights.read_tensors(path)
+                seen[path.name] = {name: tensor.numpy().tobytes() for name, tensor in tensors.items()}
+                seen[f"{path.name} step"] = header.get("step") or header["training"]["step"]
+            elif path.suffix == ".png":
+                seen[path.name] = path.read_bytes()
+            elif path.name == "settings.json":
+                seen[path.name] = json.loads(path.read_text())
+            elif path.name == "log.jsonl":
+                entries = [json.loads(line) for line in path.read_text().splitlines()]
+                seen[path.name] = [entry | {"seconds": 0} for entry in entries]
+            else:
+                assert path.parent.name == "tensorboard", path
+        return seen
+
+    def is_part(self, seen, whole):
+        steps = [seen.get(f"{name}.safetensors step", 0) for name in ("checkpoint", "weights")]
+        # The checkpoint comes first: whatever weights one finds, training continues from there or later.
+        return steps[1] <= steps[0] <= whole["checkpoint.safetensors step"]
