@@ -34,6 +34,10 @@ class Cancelled(NgptError):
     """A reconstruction was ended by the caller's ``stop``."""
 
 
+class _OutOfMemory(NgptError):
+    """ONNX Runtime could not get the memory for a run."""
+
+
 class Network:
     """A network's file, loaded; thread-safe.
 
@@ -79,13 +83,39 @@ class Network:
 
         ``layers``    (H, W, C) float32, all of ``needs``; ``primal`` without direct emission
         ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
-        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5
+        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5. Where the
+                      machine has less to give, they shrink by themselves
         ``batch``     tiles in one run, which fills GPUs
         ``progress``  called with (tiles done, tiles)
         ``stop``      asked before each run whether to end, which raises ``Cancelled``
 
-        Raises NgptError where ``memory`` does not hold the smallest tile.
+        Raises NgptError where ``memory``, or what the machine has of it, does not hold the smallest tile.
         """
+        while True:
+            try:
+                return self._reconstruct(layers, base, memory, batch, progress, stop)
+            except _OutOfMemory as error:
+                memory = self._less(layers["primal"].shape[:2], memory, batch, error)
+
+    def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
+        """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
+        _, (rows, columns) = self.plan(*size, memory, batch)
+        used = rows * columns * self.bytes * batch // 2**20
+        try:
+            self.plan(*size, used // 2, batch)
+        except NgptError:
+            raise error from None
+        return used // 2
+
+    def _reconstruct(
+        self,
+        layers: Mapping[str, np.ndarray],
+        base: np.ndarray | None,
+        memory: int,
+        batch: int,
+        progress: Progress,
+        stop: Callable[[], bool],
+    ) -> np.ndarray:
         names = (*self.inputs, "base") if self.base else self.inputs
         layers = layers if base is None else {**layers, "base": base}
         missing = [name for name in names if name not in layers]
@@ -149,8 +179,10 @@ class Network:
         try:
             return session.run(None, feed)[0]
         except Exception as error:
-            if isinstance(error, KeyboardInterrupt):
-                raise
+            if isinstance(error, MemoryError) or "allocate memory" in str(error) or "bad_alloc" in str(error):
+                raise _OutOfMemory(
+                    f"network {self.path.name}: out of memory with the smallest tiles; free some, or give it more"
+                ) from error
             raise NgptError(f"network {self.path.name}: ONNX Runtime cannot run it: {one_line(error)}") from error
 
     def _session(self, path: Path):
@@ -174,7 +206,8 @@ def _session(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
-    options.log_severity_level = 3
+    # What goes wrong comes as an exception; in the log it would stand a second time.
+    options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])
     except Exception as error:
