@@ -4,6 +4,7 @@ Everything goes to standard error; standard output is kept for results (JSON, ta
 """
 
 import os
+import resource
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -15,6 +16,9 @@ from ngpt.errors import NgptError
 # Elsewhere than on a terminal, a line at most this often: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
 
+# MiB of address space.
+FEWEST_MIB = 512
+
 
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
     """The exit status of a command: what ``run`` returns, or that of whatever stopped it, which is told in one line.
@@ -25,6 +29,7 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
     _open_standard_streams()
     console = Console(name=name)
     try:
+        _check_address_space()
         try:
             return run()
         finally:
@@ -36,6 +41,9 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
     except MemoryError:
         console.error("out of memory; use a smaller image or fewer files at once")
         return 2
+    except ImportError as error:
+        console.error(f"a library cannot be loaded, for want of memory or since the installation is broken: {error}")
+        return 2
     except KeyboardInterrupt:
         console.error(interrupted)
         return 130
@@ -46,6 +54,15 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
         _close(sys.stdout)
         console.error(error)
         return 2
+
+
+def _check_address_space() -> None:
+    """Raises NgptError for a limit (``ulimit -v``) at which the libraries we load hang or abort, OpenBLAS first."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if limit != resource.RLIM_INFINITY and limit < FEWEST_MIB << 20:
+        raise NgptError(
+            f"the address space is limited to {limit >> 20} MiB (ulimit -v); {FEWEST_MIB} are the least that works"
+        )
 
 
 def print_line(text: str, stream: TextIO) -> None:

@@ -6,6 +6,7 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 from __future__ import annotations
 
 import os
+import resource
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import product
@@ -91,6 +92,7 @@ class Network:
 
         Raises NgptError where ``memory``, or what the machine has of it, does not hold the smallest tile.
         """
+        memory = min(memory, free_address_space() // 2)
         while True:
             try:
                 return self._reconstruct(layers, base, memory, batch, progress, stop)
@@ -157,7 +159,8 @@ class Network:
         if best is None:
             needed = -(-down[-1][1] * across[-1][1] * self.bytes * batch // 2**20)
             raise NgptError(
-                f"network {self.path.name}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed"
+                f"network {self.path.name}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed; "
+                "allow more (--memory, ulimit -v)"
             )
         _, ys, xs, tall, wide = best
         return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
@@ -215,6 +218,16 @@ def _session(path: str, _modified: int, device: str, threads: int):
     if session.get_providers()[0] != provider:
         raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
     return session
+
+
+def free_address_space() -> int:
+    """MiB that this process may still map, far more than any machine has where no limit (``ulimit -v``) is set."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    try:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except OSError:  # not Linux
+        used = 0
+    return 2**40 if limit == resource.RLIM_INFINITY else max(0, limit - used) // 2**20
 
 
 def planes(layer: np.ndarray) -> np.ndarray:

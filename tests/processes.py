@@ -6,9 +6,9 @@ import signal
 import subprocess
 import sys
 import time
-from abc import ABC, abstractmethod
 from pathlib import Path
 
+import pytest
 from full_stack import full_stack
 
 import ngpt
@@ -67,7 +67,7 @@ def children(pid: int) -> list[int]:
         return []
 
 
-class Work(ABC):
+class Work:
     """One command on something small; what it writes goes into ``out``, and running it again continues it."""
 
     name: str
@@ -75,17 +75,17 @@ class Work(ABC):
     def __init__(self, inputs: Path):
         self.inputs = inputs
 
-    @abstractmethod
-    def arguments(self, out: Path) -> list[object]:
+    def arguments(self, out: Path) -> list:
         """The command line."""
+        raise NotImplementedError
 
-    @abstractmethod
     def results(self, out: Path) -> dict[str, object]:
         """What is to be seen in ``out``, as values that are equal if it is; fails for anything half-written."""
+        raise NotImplementedError
 
-    @abstractmethod
     def is_part(self, seen: dict[str, object], whole: dict[str, object]) -> bool:
         """Whether what a killed run shows is what one may see on the way to ``whole``."""
+        raise NotImplementedError
 
 
 def visible(folder: Path) -> list[Path]:
@@ -192,3 +192,117 @@ class Train(Work):
         steps = [seen.get(f"{name}.safetensors step", 0) for name in ("checkpoint", "weights")]
         # The checkpoint comes first: whatever weights one finds, training continues from there or later.
         return steps[1] <= steps[0] <= whole["checkpoint.safetensors step"]
+
+
+class Merge(Work):
+    name = "ngpt merge"
+
+    def arguments(self, out):
+        for seed in (1, 2):
+            stack = full_stack(40, 60, seed=seed)
+            stack.attributes |= {"ngpt:spp": 4, "ngpt:seed": seed}
+            ngpt.write(self.inputs / f"{seed}.exr", stack, overwrite=True)
+        out.mkdir(exist_ok=True)
+        stacks = [self.inputs / "1.exr", self.inputs / "2.exr"]
+        return [sys.executable, "-m", "ngpt", "merge", *stacks, "-o", out / "merged.exr", "--force"]
+
+
+class Render(Work):
+    name = "ngpt render"
+
+    def arguments(self, out):
+        out.mkdir(exist_ok=True)
+        words = ["diffuse", "-o", out / "s.exr", "--spp", 4, "--size", "48x32", "--force"]
+        return [sys.executable, "-m", "ngpt", "render", *words]
+
+
+class Demo(Work):
+    name = "ngpt demo"
+
+    def arguments(self, out):
+        words = ["-o", out, "--scene", "diffuse", "--spp", 4, "--reference-spp", 8, "--size", "48x32", "--force"]
+        return [sys.executable, "-m", "ngpt", "demo", *words]
+
+
+class Export(Work):
+    name = "python -m export"
+
+    def arguments(self, out):
+        out.mkdir(exist_ok=True)
+        return [sys.executable, "-m", "export", "--method", "l2", "-o", out / "l2.onnx", "--force"]
+
+
+class Evaluation(Work):
+    name = "eval.py"
+
+    def arguments(self, out):
+        folder = self.inputs / "scene"
+        if not folder.exists():
+            folder.mkdir()
+            ngpt.write(folder / "reference.exr", full_stack(24, 32)["primal"])
+            ngpt.write(folder / "gradients-4-0.exr", full_stack(24, 32, seed=1))
+            settings = 'spp = [4]\nmethods = ["primal", "l2"]\nmetrics = ["relMSE"]\nprimary = "relMSE"\n'
+            (self.inputs / "e.toml").write_text(f'scenes = ["{folder}"]\n{settings}')
+        return [sys.executable, "eval.py", "--config", self.inputs / "e.toml", "--out", out]
+
+
+COMMANDS = {
+    "denoise": Denoise,
+    "merge": Merge,
+    "render": Render,
+    "demo": Demo,
+    "export": Export,
+    "train": Train,
+    "data_gen": DataGen,
+    "eval": Evaluation,
+}
+NEEDS = {"render": "mitsuba", "demo": "mitsuba", "data_gen": "mitsuba", "train": "torch", "export": "onnx"}
+
+
+def make_work(kind: str, folder: Path) -> Work:
+    """One of ``COMMANDS``, with its inputs in ``folder``; skips the test where what it needs is not installed."""
+    if kind in NEEDS:
+        pytest.importorskip(NEEDS[kind])
+    (folder / "inputs").mkdir()
+    return COMMANDS[kind](folder / "inputs")
+
+
+def half_written(folder: Path) -> list[Path]:
+    """Files under a final name that cannot be read as what they are called."""
+    return [path for path in visible(folder) if not _whole(path)]
+
+
+def _whole(path: Path) -> bool:
+    data = path.read_bytes()
+    try:
+        match path.suffix:
+            case ".exr":
+                ngpt.read_image(path)
+            case ".safetensors":
+                from safetensors import safe_open
+
+                safe_open(path, framework="np")
+            case ".json":
+                json.loads(data)
+            case ".onnx":
+                import onnx
+
+                onnx.load(path)
+            case ".png":
+                return data.endswith(b"IEND\xaeB`\x82")
+            case ".svg" | ".html":
+                return data.rstrip().endswith((b"</svg>", b"</html>"))
+            case ".md" | ".csv":
+                return data.endswith(b"\n")
+            case _:
+                # Logs: they grow.
+                return path.name == "log.jsonl" or path.parent.name == "tensorboard"
+    except Exception:
+        return False
+    return True
+
+
+def one_error(stderr: str) -> bool:
+    """Whether it ends in one line that names the error, with nothing but progress before it."""
+    lines = stderr.strip().splitlines() or [""]
+    return ": error: " in lines[-1] and "Traceback" not in stderr and "Exception ignored" not in stderr
