@@ -10,12 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from evaluation.config import read_config
-from evaluation.run import evaluate
-from evaluation.stacks import write_json
-from ngpt.advice import make_table
 from ngpt.console import Console, run_command
-from ngpt.report_evaluation import write_evaluation_report
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -33,6 +28,13 @@ def run(arguments: list[str] | None) -> int:
     args = parser.parse_args(arguments)
     console = Console(args.quiet)
     command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
+    # Here and not above: a mistyped option is said at once.
+    from evaluation.config import read_config
+    from evaluation.run import evaluate
+    from evaluation.stacks import write_json
+    from ngpt.advice import make_table
+    from ngpt.report_evaluation import write_evaluation_report
+
     config = read_config(args.config)
     config = replace(config, scenes=(*config.scenes, *args.scenes))
     results = evaluate(config, args.out, console, command, args.cache)

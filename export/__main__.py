@@ -7,7 +7,6 @@ from pathlib import Path
 from ngpt.console import Console, run_command
 from ngpt.errors import NgptError
 from ngpt.files import atomic_output, check_output
-from ngpt.poisson import DEFAULT_ALPHA
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -15,6 +14,8 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(arguments: list[str] | None) -> int:
+    from ngpt.poisson import DEFAULT_ALPHA
+
     parser = argparse.ArgumentParser(prog="python -m export", description="Write a reconstruction as an ONNX file.")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as train.py makes them")

@@ -5,6 +5,7 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 
 from __future__ import annotations
 
+import math
 import os
 import resource
 from collections.abc import Callable, Mapping
@@ -102,12 +103,12 @@ class Network:
     def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
         """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
         _, (rows, columns) = self.plan(*size, memory, batch)
-        used = rows * columns * self.bytes * batch // 2**20
-        try:
-            self.plan(*size, used // 2, batch)
-        except NgptError:
-            raise error from None
-        return used // 2
+        (*_, (_, low)), (*_, (_, narrow)) = (self._cuts(n) for n in size)
+        used, least = (area * self.bytes * batch / 2**20 for area in (rows * columns, low * narrow))
+        less = max(int(used / 2), math.ceil(least))
+        if less >= used:
+            raise error
+        return less
 
     def _reconstruct(
         self,
