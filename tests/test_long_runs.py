@@ -43,7 +43,7 @@ from pathlib import Path
 from data_gen.dataset import jobs
 from data_gen.dataset.config import read_config
 config = replace(
-    read_config("configs/data-tiny.toml"), size=16, spp=(2, 2), inputs=1, reference_spp=2, crops_per_shard=8,
+    read_config(Path("configs/data-tiny.toml")), size=16, spp=(2, 2), inputs=1, reference_spp=2, crops_per_shard=8,
     scenes=int(sys.argv[2]), crops=int(sys.argv[3]),
 )
 from data_gen.dataset import crops
@@ -112,7 +112,7 @@ def test_many_stacks_in_one_call(tmp_path, count):
 def test_many_small_crops(tmp_path):
     """A day's generation in small: what a process hoards, it hoards by scenes and crops, not by pixels."""
     pytest.importorskip("mitsuba")
-    scenes, crops = 30, 40
+    scenes, crops = 10, 40
     notes = notes_of(GENERATE, tmp_path / "out", scenes, crops)
     assert len(notes) >= 0.9 * scenes * crops, "views that show nothing may fail"
     judge("Small crops in one process of data_gen", notes)
