@@ -19,9 +19,14 @@ ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PY
 
 
 def start(arguments, **options) -> subprocess.Popen:
-    """A process, at the root of the project, with its errors kept for ``errors_of``."""
+    """A process at the root of the project, its errors in a pipe; it hears Ctrl-C even if we run where nobody does."""
     options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT} | options
+    options["preexec_fn"] = _hear_interrupts
     return subprocess.Popen([str(a) for a in arguments], env=ENVIRONMENT, **options)
+
+
+def _hear_interrupts() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
 
 
 def complete(arguments, **options) -> subprocess.CompletedProcess:

@@ -36,6 +36,7 @@ def interrupt_campaign(kind, folder, interrupts):
         else:
             assert status in (0, -signal.SIGINT) and "run_command" not in errors, (status, errors)
         outcomes[{0: DONE, 130: INTERRUPTED}.get(status, EARLY)] += 1
+    assert outcomes[INTERRUPTED]
     record(f"Ctrl-C at random moments of {job.name}", interrupts, outcomes, seconds=round(time.monotonic() - clock))
 
 
