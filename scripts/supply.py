@@ -35,6 +35,9 @@ PERMISSIVE = (
 # Where the metadata say too little: the licence, and how we know.
 KNOWN = {"openexr": "BSD-3-Clause: by LICENSE.md in its wheel"}
 
+# Come with CUDA builds of torch only, which we do not ask for: NVIDIA's own terms hold for them.
+_OF_CUDA = re.compile(r"(nvidia|cuda|triton)\b.*")
+
 HEADER = """\
 # The files that constraints.txt stands for, by their hashes: Linux x86-64, Python 3.11.
 # Made by `python scripts/supply.py lock`.
@@ -60,7 +63,7 @@ def closure(extras: set[str]) -> dict[str, Distribution]:
         name, key = canonicalize_name(wanted.name), (canonicalize_name(wanted.name), frozenset(wanted.extras))
         if name == project["name"]:
             todo += [Requirement(line) for extra in wanted.extras for line in optional[extra]]
-        elif key not in seen:
+        elif key not in seen and not _OF_CUDA.fullmatch(name):
             seen.add(key)
             try:
                 found[name] = distribution(name)

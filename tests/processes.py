@@ -308,6 +308,7 @@ def _whole(path: Path) -> bool:
 
 
 def one_error(stderr: str) -> bool:
-    """Whether it ends in one line that names the error, with nothing but progress before it."""
-    lines = stderr.strip().splitlines() or [""]
-    return ": error: " in lines[-1] and "Traceback" not in stderr and "Exception ignored" not in stderr
+    """Whether one line names the error, and there is nothing but progress beside it."""
+    lines = stderr.strip().splitlines()
+    errors = [line for line in lines if ": error: " in line]
+    return len(errors) == 1 and "Traceback" not in stderr and "Exception ignored" not in stderr
