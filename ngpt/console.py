@@ -5,7 +5,9 @@ Everything goes to standard error; standard output is kept for results (JSON, ta
 
 import os
 import resource
+import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -28,32 +30,62 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
     """
     _open_standard_streams()
     console = Console(name=name)
-    try:
-        _check_address_space()
+    with _noted_interrupts() as pressed:
         try:
-            return run()
-        finally:
-            # Not when Python ends, which complains in its own way.
-            sys.stdout.flush()
-    except NgptError as error:
-        console.error(error)
-        return 2
-    except MemoryError:
-        console.error("out of memory; use a smaller image or fewer files at once")
-        return 2
-    except ImportError as error:
-        console.error(f"a library cannot be loaded, for want of memory or since the installation is broken: {error}")
-        return 2
-    except KeyboardInterrupt:
-        console.error(interrupted)
-        return 130
-    except BrokenPipeError:
-        _close(sys.stdout)
-        return 1
-    except OSError as error:
-        _close(sys.stdout)
-        console.error(error)
-        return 2
+            _check_address_space()
+            try:
+                return run()
+            finally:
+                # Not when Python ends, which complains in its own way.
+                sys.stdout.flush()
+        except SystemExit:
+            raise
+        except BaseException as error:
+            if isinstance(error, OSError):
+                _close(sys.stdout)
+            # Libraries that are interrupted, while they are imported above all, raise what they like.
+            if pressed or isinstance(error, KeyboardInterrupt):
+                console.error(interrupted)
+                return 130
+            if isinstance(error, BrokenPipeError):
+                return 1
+            console.error(_explanation(error))
+            return 2
+
+
+def _explanation(error: BaseException) -> str:
+    """What to tell of an error that users can act on; raises it again if it is none."""
+    match error:
+        case NgptError() | OSError():
+            return str(error)
+        case MemoryError():
+            return "out of memory; use a smaller image or fewer files at once"
+        case ImportError():
+            return f"a library cannot be loaded, for want of memory or since the installation is broken: {error}"
+    raise error
+
+
+@contextmanager
+def _noted_interrupts() -> Iterator[list[int]]:
+    """Yields a list that is empty until Ctrl-C is pressed."""
+    pressed: list[int] = []
+
+    def note(number, frame):
+        pressed.append(number)
+        raise KeyboardInterrupt
+
+    # Neither where nobody is to hear it, in the background of a script, nor where signals do not arrive, in a thread.
+    if (
+        signal.getsignal(signal.SIGINT) is not signal.default_int_handler
+        or threading.current_thread() is not threading.main_thread()
+    ):
+        yield pressed
+        return
+    signal.signal(signal.SIGINT, note)
+    try:
+        yield pressed
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def _check_address_space() -> None:
