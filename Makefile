@@ -2,7 +2,7 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo test test-slow check bench setup-demo setup-dev
+.PHONY: demo test test-slow reliability check bench setup-demo setup-dev
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
@@ -13,10 +13,15 @@ test: setup-dev
 test-slow: setup-dev
 	$(PY) -m pytest -q -m slow
 
+# The campaigns against bad inputs, kills and long runs, and the page of what came out (an hour or several).
+reliability: setup-dev
+	$(PY) scripts/reliability.py
+
 check: setup-dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+	$(PY) scripts/supply.py check
 
 bench: setup-dev
 	$(PY) -m bench.sampler -o bench/results/sampler.json

@@ -10,16 +10,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from evaluation.config import read_config
-from evaluation.run import evaluate
-from evaluation.stacks import write_json
-from ngpt.advice import make_table
-from ngpt.console import Console
-from ngpt.errors import NgptError
-from ngpt.report_evaluation import write_evaluation_report
+from ngpt.console import Console, run_command
 
 
 def main(arguments: list[str] | None = None) -> int:
+    return run_command(lambda: run(arguments), interrupted="interrupted; the same command goes on from here")
+
+
+def run(arguments: list[str] | None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", required=True, metavar="TOML")
     parser.add_argument("--out", required=True, type=Path, metavar="DIR")
@@ -30,19 +28,19 @@ def main(arguments: list[str] | None = None) -> int:
     args = parser.parse_args(arguments)
     console = Console(args.quiet)
     command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
-    try:
-        config = read_config(args.config)
-        config = replace(config, scenes=(*config.scenes, *args.scenes))
-        results = evaluate(config, args.out, console, command, args.cache)
-        write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
-        if args.advice:
-            write_json(args.advice, make_table(results))
-    except NgptError as error:
-        console.error(error)
-        return 2
-    except KeyboardInterrupt:
-        console.error("interrupted; the same command goes on from here")
-        return 130
+    # Here and not above: a mistyped option is said at once.
+    from evaluation.config import read_config
+    from evaluation.run import evaluate
+    from evaluation.stacks import write_json
+    from ngpt.advice import make_table
+    from ngpt.report_evaluation import write_evaluation_report
+
+    config = read_config(args.config)
+    config = replace(config, scenes=(*config.scenes, *args.scenes))
+    results = evaluate(config, args.out, console, command, args.cache)
+    write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
+    if args.advice:
+        write_json(args.advice, make_table(results))
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
     if absent:
         console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")

@@ -9,11 +9,16 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
+from ngpt.console import run_command
 from ngpt.errors import NgptError
-from ngpt.files import exclusive
+from ngpt.files import atomic_output, exclusive
 
 
 def main(arguments: list[str] | None = None) -> int:
+    return run_command(lambda: run(arguments), "train.py", "interrupted; run the same command to continue")
+
+
+def run(arguments: list[str] | None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--config", required=True, help="settings, a TOML file: configs/*.toml")
     parser.add_argument("--out", help="folder of the run: checkpoint, weights, log; made if it is not there")
@@ -22,21 +27,13 @@ def main(arguments: list[str] | None = None) -> int:
     )
     parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
     options = parser.parse_args(arguments)
-    try:
-        return run(options)
-    except NgptError as error:
-        print(f"train.py: error: {error}", file=sys.stderr)
-        return 1
-
-
-def run(options: argparse.Namespace) -> int:
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
     from ngpt.network.cost import cost
     from ngpt.network.data import Mixture, open_crops, split
     from ngpt.network.distributed import Processes
     from ngpt.network.losses import make_loss
     from ngpt.network.settings import read_settings
-    from ngpt.network.trainer import Trainer
+    from ngpt.network.trainer import Trainer, show
 
     settings = read_settings(options.config, options.set)
     if options.dry_run:
@@ -45,7 +42,10 @@ def run(options: argparse.Namespace) -> int:
     if not options.out:
         raise NgptError("--out is missing: the folder for checkpoint, weights and log")
     out = Path(options.out)
-    out.mkdir(parents=True, exist_ok=True)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{out}: cannot be made: {error.strerror}; name another folder with --out") from error
     loss = make_loss(settings.loss)
     processes = Processes()
     with ExitStack() as stack:
@@ -59,12 +59,14 @@ def run(options: argparse.Namespace) -> int:
         trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams)
         if trainer.checkpoint.exists():
             trainer.resume()
-            print(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
-        (out / "settings.json").write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+            show(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
+        if processes.rank == 0:
+            with atomic_output(out / "settings.json", overwrite=True) as temporary:
+                temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
         finished = trainer.run()
     processes.close()
-    print(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
-    return 0
+    show(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
+    return 0 if finished or not trainer.signal else 128 + trainer.signal
 
 
 def stream(config: str):

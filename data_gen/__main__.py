@@ -5,8 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-from ngpt.console import Console
-from ngpt.errors import NgptError
+from ngpt.console import Console, run_command
 
 
 def part(text: str) -> tuple[int, int]:
@@ -17,6 +16,10 @@ def part(text: str) -> tuple[int, int]:
 
 
 def main() -> int:
+    return run_command(run, interrupted="interrupted; run the same command to continue")
+
+
+def run() -> int:
     parser = argparse.ArgumentParser(prog="python -m data_gen", description="Makes a training set, or continues one.")
     parser.add_argument("--config", type=Path, required=True, metavar="FILE", help="such as configs/data-cpu.toml")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the training set")
@@ -27,23 +30,15 @@ def main() -> int:
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
     args = parser.parse_args()
-    console = Console()
     from data_gen.dataset.card import write_card
     from data_gen.dataset.config import read_config
     from data_gen.dataset.jobs import cluster, generate, processes
 
-    try:
-        config = read_config(args.config)
-        executor = cluster(args.cluster) if args.cluster else processes(args.workers)
-        with executor as workers, console.progress(str(args.out), "crops") as progress:
-            generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
-        write_card(args.out)
-    except NgptError as error:
-        console.error(error)
-        return 1
-    except KeyboardInterrupt:
-        console.error(f"{args.out}: interrupted; run the same command to continue")
-        return 130
+    config = read_config(args.config)
+    executor = cluster(args.cluster) if args.cluster else processes(args.workers)
+    with executor as workers, Console().progress(str(args.out), "crops") as progress:
+        generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
+    write_card(args.out)
     return 0
 
 

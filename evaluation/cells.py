@@ -27,6 +27,7 @@ _PRESENTATION = {
     "display.py",
     "png.py",
     "console.py",
+    "files.py",
     "advice.py",
     "report_evaluation.py",
     "pixelcodec.py",

@@ -4,13 +4,18 @@ import argparse
 import sys
 from pathlib import Path
 
-from ngpt.console import Console
+from ngpt.console import Console, run_command
 from ngpt.errors import NgptError
 from ngpt.files import atomic_output, check_output
-from ngpt.poisson import DEFAULT_ALPHA
 
 
 def main(arguments: list[str] | None = None) -> int:
+    return run_command(lambda: run(arguments))
+
+
+def run(arguments: list[str] | None) -> int:
+    from ngpt.poisson import DEFAULT_ALPHA
+
     parser = argparse.ArgumentParser(prog="python -m export", description="Write a reconstruction as an ONNX file.")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as train.py makes them")
@@ -22,22 +27,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.onnx")
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
     args = parser.parse_args(arguments)
-    console = Console()
+    for path in (args.output, args.statistics):
+        if path is not None:
+            check_output(path, args.force)
+    if not args.weights and (args.statistics or args.vector):
+        raise NgptError("--statistics and --vector belong to networks; leave them out for a classical method")
     try:
-        for path in (args.output, args.statistics):
-            if path is not None:
-                check_output(path, args.force)
-        if not args.weights and (args.statistics or args.vector):
-            raise NgptError("--statistics and --vector belong to networks; leave them out for a classical method")
-        try:
-            written = write(args)
-        except ModuleNotFoundError as error:
-            raise NgptError(f"export needs the package '{error.name}'; `pip install 'ngpt-recon[export]'`") from error
-    except NgptError as error:
-        console.error(error)
-        return 2
+        written = write(args)
+    except ModuleNotFoundError as error:
+        raise NgptError(f"export needs the package '{error.name}'; `pip install 'ngpt-recon[export]'`") from error
     for path in written:
-        console.say(f"{path}: {path.stat().st_size} bytes")
+        Console().say(f"{path}: {path.stat().st_size} bytes")
     return 0
 
 

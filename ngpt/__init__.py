@@ -5,14 +5,18 @@ image = ngpt.denoise(stack, method="l1")       # (H, W, 3) float32
 ngpt.write("out.exr", image, like=stack)
 """
 
+from importlib import import_module
+from typing import TYPE_CHECKING
+
 __version__ = "0.1.0"
 
-from ngpt.denoiser import Denoiser
-from ngpt.errors import NgptError
-from ngpt.exr import read, read_image, write
-from ngpt.merging import merge
-from ngpt.methods import METHODS, Result, denoise, reconstruct
-from ngpt.stack import GradientStack
+if TYPE_CHECKING:
+    from ngpt.denoiser import Denoiser
+    from ngpt.errors import NgptError
+    from ngpt.exr import read, read_image, write
+    from ngpt.merging import merge
+    from ngpt.methods import METHODS, Result, denoise, reconstruct
+    from ngpt.stack import GradientStack
 
 __all__ = [
     "METHODS",
@@ -27,3 +31,16 @@ __all__ = [
     "reconstruct",
     "write",
 ]
+
+# Imported when they are asked for. So the commands are at work, and handle what interrupts them, before NumPy and SciPy
+# have been loaded, which comes with this package otherwise.
+_HOMES = {"Denoiser": "denoiser", "GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
+_HOMES |= dict.fromkeys(("read", "read_image", "write"), "exr")
+_HOMES |= dict.fromkeys(("METHODS", "Result", "denoise", "reconstruct"), "methods")
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'ngpt' has no attribute '{name}'")
+    value = globals()[name] = getattr(import_module(f"ngpt.{_HOMES[name]}"), name)
+    return value

@@ -95,8 +95,8 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
 def _neural(name: str, also_missing: Callable[[], str] = lambda: "") -> dict[str, Any]:
     """What the entries of all networks share; they take the network of that name in the package, or a file.
 
-    A .onnx runs in ONNX Runtime, .safetensors in PyTorch, each on the devices it has. ``also_missing`` is asked for what
-    else the method cannot do without.
+    A .onnx runs in ONNX Runtime, .safetensors in PyTorch, each on the devices it has. ``also_missing`` is asked for
+    what else the method cannot do without.
     """
     shipped = WEIGHTS / f"{name}.onnx"
 

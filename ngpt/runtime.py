@@ -5,7 +5,9 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 
 from __future__ import annotations
 
+import math
 import os
+import resource
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import product
@@ -35,6 +37,10 @@ Progress = Callable[[int, int], None]
 
 class Cancelled(NgptError):
     """A reconstruction was ended by the caller's ``stop``."""
+
+
+class _OutOfMemory(NgptError):
+    """ONNX Runtime could not get the memory for a run."""
 
 
 class Network:
@@ -100,13 +106,40 @@ class Network:
 
         ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
         ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
-        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5
+        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5. Where the
+                      machine has less to give, they shrink by themselves
         ``batch``     tiles in one run, which fills GPUs
         ``progress``  called with (tiles done, tiles)
         ``stop``      asked before each run whether to end, which raises ``Cancelled``
 
-        Raises NgptError where ``memory`` does not hold the smallest tile.
+        Raises NgptError where ``memory``, or what the machine has of it, does not hold the smallest tile.
         """
+        memory = min(memory, free_address_space() // 2)
+        while True:
+            try:
+                return self._reconstruct(layers, base, memory, batch, progress, stop)
+            except _OutOfMemory as error:
+                memory = self._less(layers["primal"].shape[:2], memory, batch, error)
+
+    def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
+        """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
+        _, (rows, columns) = self.plan(*size, memory, batch)
+        (*_, (_, low)), (*_, (_, narrow)) = (self._cuts(n) for n in size)
+        used, least = (area * self.bytes * batch / 2**20 for area in (rows * columns, low * narrow))
+        less = max(int(used / 2), math.ceil(least))
+        if less >= used:
+            raise error
+        return less
+
+    def _reconstruct(
+        self,
+        layers: Mapping[str, np.ndarray],
+        base: np.ndarray | None,
+        memory: int,
+        batch: int,
+        progress: Progress,
+        stop: Callable[[], bool],
+    ) -> np.ndarray:
         names = (*self.inputs, "base") if self.base else self.inputs
         layers = layers if base is None else {**layers, "base": base}
         missing = [name for name in names if name not in layers]
@@ -147,7 +180,10 @@ class Network:
                     best = work, ys, xs, tall, wide
         if best is None:
             needed = -(-down[-1][1] * across[-1][1] * self.bytes * batch // 2**20)
-            raise NgptError(f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed")
+            raise NgptError(
+                f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed; "
+                "allow more (--memory, ulimit -v)"
+            )
         _, ys, xs, tall, wide = best
         return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
 
@@ -168,8 +204,10 @@ class Network:
         try:
             result = session.run(None, feed)[0]
         except Exception as error:
-            if isinstance(error, KeyboardInterrupt):
-                raise
+            if isinstance(error, MemoryError) or "allocate memory" in str(error) or "bad_alloc" in str(error):
+                raise _OutOfMemory(
+                    f"network {self.path}: out of memory with the smallest tiles; free some, or give it more"
+                ) from error
             raise NgptError(f"network {self.path}: ONNX Runtime cannot run it: {one_line(error)}") from error
         expected = (len(feed["primal"]), 3, *feed["primal"].shape[2:])
         if result.shape != expected:
@@ -197,7 +235,8 @@ def _session(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
-    options.log_severity_level = 3
+    # What goes wrong comes as an exception; in the log it would stand a second time.
+    options.log_severity_level = 4
     try:
         session = onnxruntime.InferenceSession(path, options, providers=[provider])
     except Exception as error:
@@ -205,6 +244,16 @@ def _session(path: str, _modified: int, device: str, threads: int):
     if session.get_providers()[0] != provider:
         raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
     return session
+
+
+def free_address_space() -> int:
+    """MiB that this process may still map, far more than any machine has where no limit (``ulimit -v``) is set."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    try:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except OSError:  # not Linux
+        used = 0
+    return 2**40 if limit == resource.RLIM_INFINITY else max(0, limit - used) // 2**20
 
 
 def planes(layer: np.ndarray) -> np.ndarray:

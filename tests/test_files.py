@@ -1,6 +1,8 @@
 """Files appear complete or not at all, and nothing is overwritten by accident."""
 
 import os
+import subprocess
+import sys
 
 import pytest
 
@@ -60,4 +62,27 @@ def test_a_folder_belongs_to_one_writer_at_a_time(tmp_path):
     with exclusive(tmp_path), pytest.raises(NgptError, match="another process is writing there"), exclusive(tmp_path):
         pass
     with exclusive(tmp_path):
+        pass
+
+
+def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path):
+    (tmp_path / ".ngpt-abcd0123.exr").write_text("half")
+    (tmp_path / ".ngpt-mine.exr").write_text("a user's own")
+    (tmp_path / ".hidden").write_text("too")
+    code = (
+        "import sys; from ngpt.files import atomic_output\n"
+        "with atomic_output(sys.argv[1]) as temporary: print(temporary.name, flush=True); input()"
+    )
+    command = [sys.executable, "-c", code, tmp_path / "theirs.txt"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as living:
+        name = living.stdout.readline().strip()
+        with atomic_output(tmp_path / "ours.txt") as temporary:
+            temporary.write_text("done")
+        assert sorted(os.listdir(tmp_path)) == sorted([".hidden", ".ngpt-mine.exr", name, "ours.txt"])
+        living.communicate("\n")
+    assert sorted(os.listdir(tmp_path)) == [".hidden", ".ngpt-mine.exr", "ours.txt", "theirs.txt"]
+
+
+def test_a_folder_that_cannot_be_locked_is_named(tmp_path):
+    with pytest.raises(NgptError, match="nowhere: cannot be written: No such file"), exclusive(tmp_path / "nowhere"):
         pass

@@ -40,7 +40,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
     record["versions"] = {"ngpt": ngpt.__version__, "mitsuba": mi.__version__, "variant": variant}
     start = time.perf_counter()
     try:
-        with tempfile.TemporaryDirectory() as temporary:
+        with tempfile.TemporaryDirectory(prefix="ngpt-scene-") as temporary:
             path = job.path or str(made_scene(config, job.scene, Path(temporary)))
             scene = load_scene(path, None, job.parameters)
         around = Surroundings(scene, job.box)

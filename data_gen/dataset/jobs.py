@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-import fcntl
 import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import partial
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 
 from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output
+from ngpt.files import atomic_output, exclusive
 from ngpt.shards import Shard
+from ngpt.workers import end_with_parent
 
 
 class Serial(Executor):
@@ -32,9 +32,24 @@ class Serial(Executor):
         return future
 
 
+class Pool(ProcessPoolExecutor):
+    """``count`` worker processes that end with this one, however it ends, and at once when it is interrupted."""
+
+    def __init__(self, count: int):
+        # Spawned, since LLVM does not survive a fork.
+        super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent)
+
+    def __exit__(self, kind, *rest):
+        if kind is KeyboardInterrupt:
+            # What they are at is made again; waiting for it takes minutes.
+            for process in active_children():
+                process.terminate()
+        return super().__exit__(kind, *rest)
+
+
 def processes(count: int) -> Executor:
-    """``count`` processes, or this one alone; spawned, since LLVM does not survive a fork."""
-    return Serial() if count == 1 else ProcessPoolExecutor(count, mp_context=get_context("spawn"))
+    """``count`` processes, or this one alone."""
+    return Serial() if count == 1 else Pool(count)
 
 
 @contextmanager
@@ -108,7 +123,7 @@ def finished(executor: Executor, make: Callable[[Job], str], jobs: list[Job], ah
 def start(config: Config, folder: Path, planned: int) -> None:
     """Makes ``folder`` the home of this configuration's training set; raises NgptError if it is that of another."""
     (folder / "shards").mkdir(parents=True, exist_ok=True)
-    with locked(folder):
+    with exclusive(folder, wait=True):
         if not (folder / MANIFEST).exists():
             empty = {"format": FORMAT, "version": VERSION, "config": as_json(config), "planned": planned, "shards": []}
             write_json(folder / MANIFEST, empty)
@@ -123,7 +138,7 @@ def start(config: Config, folder: Path, planned: int) -> None:
 
 def update_manifest(folder: Path) -> None:
     """Lists the shards that are on disk. Jobs on other machines may do the same: the folder is locked meanwhile."""
-    with locked(folder):
+    with exclusive(folder, wait=True):
         manifest = read_manifest(folder)
         known = {entry["file"]: entry for entry in manifest["shards"]}
         entries = []
@@ -141,11 +156,3 @@ def update_manifest(folder: Path) -> None:
 def write_json(path: Path, value: dict) -> None:
     with atomic_output(path, overwrite=True) as temporary:
         temporary.write_text(json.dumps(value, indent=1) + "\n")
-
-
-@contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Only one process at a time is inside, on all machines that share the folder's file system."""
-    with open(folder / ".lock", "w") as file:
-        fcntl.flock(file, fcntl.LOCK_EX)
-        yield

@@ -5,14 +5,12 @@ stopped the command, 130 when interrupted.
 """
 
 import argparse
-import os
 import sys
 from importlib import import_module
 from typing import NoReturn
 
 import ngpt
-from ngpt.console import Console
-from ngpt.errors import NgptError
+from ngpt.console import Console, run_command
 
 VERBS = {
     "demo": "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
@@ -35,6 +33,10 @@ class _Parser(argparse.ArgumentParser):
 
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
+    return run_command(lambda: _run(arguments))
+
+
+def _run(arguments: list[str] | None) -> int:
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.add_argument("--version", action="version", version=f"ngpt {ngpt.__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_Parser)
@@ -43,19 +45,4 @@ def main(arguments: list[str] | None = None) -> int:
         subparser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
         import_module(f"ngpt.cli.{verb}").add_arguments(subparser)
     args = parser.parse_args(arguments)
-    console = Console(args.quiet)
-    try:
-        return import_module(f"ngpt.cli.{args.verb}").run(args, console)
-    except NgptError as error:
-        console.error(error)
-        return 2
-    except MemoryError:
-        console.error("out of memory; use a smaller image or fewer files at once")
-        return 2
-    except KeyboardInterrupt:
-        console.error("interrupted")
-        return 130
-    except BrokenPipeError:
-        # The reader of our output is gone; keep Python from complaining again while it flushes at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+    return import_module(f"ngpt.cli.{args.verb}").run(args, Console(args.quiet))

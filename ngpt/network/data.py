@@ -73,7 +73,7 @@ class StackFolder(Sequence[StackCrop]):
     def __init__(self, folder: str | Path):
         self._crops = []
         for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
-            stacks = sorted(path for path in view.glob("*.exr") if path.name != "reference.exr")
+            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
             reference = view / "reference.exr"
             if not stacks:
                 continue

@@ -9,6 +9,7 @@ import copy
 import json
 import math
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,7 +20,9 @@ from torch import Tensor
 from torch.utils.data import DataLoader
 
 import ngpt
+from ngpt.console import print_line
 from ngpt.errors import NgptError
+from ngpt.files import atomic_output
 from ngpt.network import padding, weights
 from ngpt.network.data import JITTER, Examples
 from ngpt.network.distributed import Processes
@@ -38,7 +41,7 @@ LIMIT = 20.0
 
 def show(text: str) -> None:
     """Prints a line at once: logs are looked at while they grow."""
-    print(text, flush=True)
+    print_line(text, sys.stdout)
 
 
 class Trainer:
@@ -92,6 +95,8 @@ class Trainer:
                 f"run.batch = {settings.run.batch}: must be a multiple of the {self.processes.count} processes"
             )
         self._stop = False
+        # The number of the signal that ended it, if one did.
+        self.signal: int | None = None
 
     @property
     def checkpoint(self) -> Path:
@@ -242,17 +247,23 @@ class Trainer:
             raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
         self.model.load_state_dict(model.state_dict())
 
-    def _interrupt(self, *_: Any) -> None:
+    def _interrupt(self, number: int = signal.SIGINT, *_: Any) -> None:
         self.say("stopping after this step; run the same command again to continue")
-        self._stop = True
+        self._stop, self.signal = True, int(number)
 
     def _log(self, values: dict[str, float]) -> None:
         if self.processes.rank:
             return
         # NaN is not JSON; what is not there is left out.
         values = {"step": self.step} | {k: v for k, v in values.items() if not math.isnan(v)}
-        with open(self.out / "log.jsonl", "a") as file:
-            file.write(json.dumps(values) + "\n")
+        path = self.out / "log.jsonl"
+        try:
+            with open(path, "a") as file:
+                file.write(json.dumps(values) + "\n")
+        except OSError as error:
+            raise NgptError(
+                f"{path}: cannot be written: {error.strerror}; the same command continues from the last checkpoint"
+            ) from error
         self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
         self._board(values)
 
@@ -291,4 +302,5 @@ def _keep_lines(path: Path, step: int) -> None:
                 lines.append(line)
         except ValueError:
             continue
-    path.write_text("".join(f"{line}\n" for line in lines))
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines))

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 from torch import Tensor
 
 from ngpt.errors import NgptError
@@ -26,7 +26,8 @@ def write_tensors(
     """Tensors and ``header`` (anything JSON can hold) in one file, complete or not there at all."""
     tensors = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     with atomic_output(path, overwrite) as temporary:
-        save_file(tensors, str(temporary), metadata={"ngpt": json.dumps({"format": FORMAT} | header)})
+        # Not save_file, which makes a temporary file of its own: killed, it would leave that behind.
+        temporary.write_bytes(save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}))
 
 
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:

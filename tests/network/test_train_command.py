@@ -58,7 +58,7 @@ def test_a_dry_run_says_what_it_would_cost(train):
 )
 def test_mistakes_end_in_one_line(train, tmp_path, arguments, complaint):
     status, _, errors = train(*[str(tmp_path) if a == "OUT" else a for a in arguments])
-    assert status == 1
+    assert status == 2
     assert complaint in errors and errors.count("\n") == 1
 
 

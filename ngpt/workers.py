@@ -1,0 +1,24 @@
+"""Worker processes that do not outlive the process they work for."""
+
+import os
+import signal
+import threading
+from multiprocessing import parent_process
+
+
+def end_with_parent() -> None:
+    """To be called in a worker of multiprocessing: it ends when its parent does, even if that is killed.
+
+    Left alone, a worker of a pool waits for its next task for ever. Not by Linux' PR_SET_PDEATHSIG, which takes the end
+    of the thread that started the worker for the end of the process. Ctrl-C, which all processes of a terminal receive,
+    ends a worker without a word: what there is to say, the parent says.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_DFL)
+    threading.Thread(target=_wait, daemon=True).start()
+
+
+def _wait() -> None:
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)

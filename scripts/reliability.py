@@ -1,0 +1,102 @@
+"""docs/RELIABILITY.md: runs the campaigns, which leave a JSON file each, and writes the page of what came out.
+
+python scripts/reliability.py                 what `make reliability` runs: all campaigns, then the page
+python scripts/reliability.py --from DIR      only the page, of the files in DIR
+python scripts/reliability.py -k "kill or disk"    some of the campaigns, as pytest chooses them, then the page of them
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+PAGE = ROOT / "docs" / "RELIABILITY.md"
+
+HEAD = """\
+# Reliability
+
+What was tried against ngpt, how many times, and what came out: {tried} trials in {campaigns} campaigns, {date}, by
+`make reliability`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
+crash, a hang, a traceback, a file half-written under its final name, memory that grows) fails its test, and has no row.
+{failure}
+| campaign | tried | what came out | worst | seconds |
+|---|---|---|---|---|
+"""
+
+TAIL = """
+What a killed process leaves: at most one hidden file for each that it was writing, named `.ngpt-XXXXXXXX.SUFFIX`.
+Nothing reads it, and the next process that writes into the folder removes it, once the lock on it shows that its writer
+is dead. In the system's folder for temporary files a killed `data_gen` may leave `ngpt-scene-*`, and a `train.py` that
+renders its own crops `ngpt-stream-*`: nothing reads them, and the system clears them away. The empty file `.lock`
+stays in folders of training sets, runs and evaluations; the lock itself ends with its process.
+
+Versions: {versions}.
+"""
+
+
+def run_campaigns(folder: Path, chosen: str | None) -> int:
+    """Runs the slow tests, of which the campaigns are part; the exit status of pytest."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow"] + (["-k", chosen] if chosen else [])
+    return subprocess.run(command, cwd=ROOT, env=os.environ | {"NGPT_RELIABILITY": str(folder)}, check=False).returncode
+
+
+def page(reports: list[dict], date: str, failed: bool) -> str:
+    """The page, of what ``tests/reliability.py`` recorded."""
+    versions: dict[str, set[str]] = {}
+    for report in reports:
+        for name, version in report["versions"].items():
+            versions.setdefault(name, set()).add(version)
+    head = HEAD.format(
+        tried=f"{sum(report['tried'] for report in reports):,}",
+        campaigns=len(reports),
+        date=date,
+        failure="\n**Of this run, some campaigns failed, and are missing here.**\n" if failed else "",
+    )
+    told = ", ".join(f"{name} {' and '.join(sorted(found))}" for name, found in sorted(versions.items()))
+    return head + "".join(row(report) for report in reports) + TAIL.format(versions=told)
+
+
+def row(report: dict) -> str:
+    outcomes = [f"{count:,} {what}" for what, count in report["outcomes"].items() if count]
+    worst = [f"{what}: {value}" for what, value in report["worst"].items()]
+    known = {"campaign", "tried", "outcomes", "worst", "seconds", "versions"}
+    worst += [f"{what}: {value}" for what, value in report.items() if what not in known]
+    seconds = "" if report["seconds"] is None else f"{report['seconds']:.0f}"
+    cells = [report["campaign"], f"{report['tried']:,}", "; ".join(outcomes), "; ".join(worst), seconds]
+    return f"| {' | '.join(cell.replace('|', '/') for cell in cells)} |\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--from", dest="folder", type=Path, metavar="DIR", help="use these files, and run nothing")
+    parser.add_argument("-k", dest="chosen", metavar="EXPRESSION", help="run only these")
+    parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help="default: docs/RELIABILITY.md")
+    args = parser.parse_args()
+    from ngpt.files import atomic_output
+
+    with tempfile.TemporaryDirectory(prefix="ngpt-reliability-") as fresh:
+        folder = args.folder or Path(fresh)
+        status = 0 if args.folder else run_campaigns(folder, args.chosen)
+        files = sorted(folder.glob("*.json"))
+        reports = [json.loads(path.read_text()) for path in files]
+        newest = max((path.stat().st_mtime for path in files), default=time.time())
+    if not reports:
+        print("reliability: no campaign left a record")
+        return 1
+    reports.sort(key=lambda report: report["campaign"])
+    with atomic_output(args.output, overwrite=True) as temporary:
+        temporary.write_text(page(reports, time.strftime("%Y-%m-%d", time.gmtime(newest)), status != 0))
+    print(f"reliability: {args.output}: {len(reports)} campaigns")
+    return status
+
+
+if __name__ == "__main__":
+    sys.exit(main())
