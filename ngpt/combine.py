@@ -3,8 +3,8 @@
 OIDN sees no gradients, and removes what it takes for noise; control variates keep every gradient, and their noise.
 OIDN's image of the control variates has less noise to remove, so that it errs elsewhere than its image of the primal. A
 network that sees all three, and the gradients, tells in each pixel whom to believe [after Back et al. 2020, "Deep
-Combiner for Independent and Correlated Pixel Estimates", with the denoiser's image of the correlated estimate in place of
-a kernel].
+Combiner for Independent and Correlated Pixel Estimates", with a denoiser's image of the correlated estimate for a
+kernel].
 """
 
 from collections.abc import Collection
