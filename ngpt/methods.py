@@ -3,6 +3,7 @@
 A new method is one more entry in ``METHODS``; the command line, the reports and the tables find it there.
 """
 
+import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -123,11 +124,9 @@ def _neural(name: str, also_missing: Callable[[], str] = lambda: "") -> dict[str
 
 def _by_onnx(data: Repaired, path: Path, device: str, memory: int) -> np.ndarray:
     network = runtime.Network(path, device)
-    layers = {"primal": data.image, **data.features}
+    layers = {"primal": data.image, **data.features, **data.known_variances()}
     if data.dx is not None:
         layers |= {"dx": data.dx, "dy": data.dy}
-    if data.variances is not None:
-        layers |= dict(zip(_VARIANCES, data.variances, strict=True))
     if lacking := [name for name in network.needs if name not in layers]:
         raise NgptError(f"weights {path} need layers {', '.join(lacking)}, which the stack lacks")
     # NumPy does these sweeps several times faster than the graph would.
@@ -184,23 +183,26 @@ METHODS = {
 }
 
 
-# Samples per pixel that ngpt-fast was trained for; it does not know when to leave a converged image alone.
-MOST_SAMPLES = 64
+# Samples per pixel up to which a network was measured to be worth it. Beyond what it was trained for, it does not know
+# when to leave a converged image alone.
+MOST_SAMPLES = {"ngpt-combine": 256, "ngpt-fast": 64}
 
 
 def choose(stack: GradientStack) -> str:
-    """The method that ``auto`` stands for: the best of those the stack has the layers for, ngpt-fast up to 64 spp.
+    """The method that ``auto`` stands for: the best of those that the stack's layers and this machine's packages allow.
 
-    Geometric mean of the trimmed relMSE over the four built-in scenes at 4, 16 and 64 spp, in thousandths: primal 53,
-    l2 4.7 (5.3 at alpha 0.2), cv 5.2, l1 3.8, wl2 3.0, wcv 2.9. The same over these and six real scenes: primal 60,
-    l2 10 (23), cv 22, l1 6.9, wl2 6.0, wcv 5.9. ngpt-fast against wcv, twelve scenes, at 4, 16 and 64 spp: 7.5 to
-    12.5, 3.5 to 4.8, 2.0 to 2.2; at 64 spp it is the worse of the two in five of the twelve.
+    Geometric means of the trimmed relMSE over thirteen scenes at 4, 16, 64 and 256 spp, in thousandths, of
+    docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.9, 6.0, 3.0, 1.7; ngpt-fast 21.1, 9.0, 4.4, 2.7; wcv 42.8,
+    14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5.
     """
     spp = stack.attributes.get("ngpt:spp", 0)
-    few = not isinstance(spp, int | float) or spp <= MOST_SAMPLES
-    names = ("ngpt-fast", "wcv", "l1") if few else ("wcv", "l1")
-    usable = (name for name in names if all(n in stack for n in METHODS[name].needs) and not METHODS[name].missing())
-    return next(usable, "primal")
+    spp = spp if isinstance(spp, int | float) else 0
+    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1"):
+        entry = METHODS[name]
+        usable = all(layer in stack for layer in entry.needs) and not entry.missing()
+        if usable and spp <= MOST_SAMPLES.get(name, math.inf):
+            return name
+    return "primal"
 
 
 def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result:

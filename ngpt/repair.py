@@ -36,6 +36,12 @@ class Repaired:
     features: dict[str, np.ndarray] = field(default_factory=dict)
     noise: np.ndarray | None = None
 
+    def known_variances(self) -> dict[str, np.ndarray]:
+        """Those of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
+        if self.variances is not None:
+            return dict(zip(("primal_var", "dx_var", "dy_var"), self.variances, strict=True))
+        return {} if self.noise is None else {"primal_var": self.noise}
+
 
 def repair(stack: GradientStack) -> Repaired:
     """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.

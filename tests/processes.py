@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -308,7 +309,12 @@ def _whole(path: Path) -> bool:
 
 
 def one_error(stderr: str) -> bool:
-    """Whether one line names the error, and there is nothing but progress beside it."""
+    """Whether one line names the error, and there is nothing but progress beside it.
+
+    Of several stacks each that fails has its line, and then they are counted.
+    """
     lines = stderr.strip().splitlines()
     errors = [line for line in lines if ": error: " in line]
-    return len(errors) == 1 and "Traceback" not in stderr and "Exception ignored" not in stderr
+    failed = re.search(r"error: (\d+) of \d+ stacks were not reconstructed", stderr)
+    expected = int(failed[1]) + 1 if failed else 1
+    return len(errors) == expected and "Traceback" not in stderr and "Exception ignored" not in stderr

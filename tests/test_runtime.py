@@ -3,13 +3,14 @@
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
 
 from ngpt.errors import NgptError
-from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.methods import METHODS, WEIGHTS, reconstruct
 from ngpt.runtime import Cancelled, Network
 from ngpt.stack import GradientStack
 
@@ -81,6 +82,7 @@ def test_memory_stays_within_the_bound(bound):
     """In a process of its own, by the largest size it ever had."""
     code = f"""
 import sys
+from dataclasses import replace
 sys.path.insert(0, "tests")
 from full_stack import full_layers
 from ngpt.runtime import Network
@@ -106,6 +108,7 @@ def test_8192x4320_pixels_in_4_gib():
     """Beside the stack itself, which takes 3.4 GiB: repair, base, tiles and the result."""
     code = """
 import sys
+from dataclasses import replace
 sys.path.insert(0, "tests")
 import numpy as np
 from full_stack import full_layers
@@ -166,9 +169,16 @@ def test_the_method_takes_files_of_both_kinds():
     assert np.allclose(*images, rtol=1e-4, atol=1e-5)
 
 
-def test_auto_takes_the_network_where_it_was_trained():
+@pytest.mark.parametrize("oidn", [True, False])
+def test_auto_takes_the_best_network_where_it_was_measured(monkeypatch, oidn):
+    entry = METHODS["ngpt-combine"]
+    if oidn and entry.missing():
+        pytest.skip(entry.missing())
+    if not oidn:
+        monkeypatch.setitem(METHODS, "ngpt-combine", replace(entry, missing=lambda: "OIDN is not installed"))
     stack = full_stack(20, 30)
-    assert reconstruct(stack).method == "ngpt-fast"
-    for spp, method in ((64, "ngpt-fast"), (65, "wcv"), (2048, "wcv")):
+    first = "ngpt-combine" if oidn else "ngpt-fast"
+    assert reconstruct(stack).method == first
+    for spp, method in ((64, first), (65, first if oidn else "wcv"), (257, "wcv")):
         rendered = GradientStack(stack.layers, attributes={"ngpt:spp": spp})
         assert reconstruct(rendered, memory=100).method == method

@@ -113,10 +113,9 @@ def layers_of(data: Repaired, config: ModelConfig) -> Layers:
     arrays: dict[str, np.ndarray] = {"primal": data.image, **data.features}
     if data.dx is not None:
         arrays |= {"dx": data.dx, "dy": data.dy}
-    if data.variances is not None:
+    for name, variance in data.known_variances().items():
         # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
-        errors = (np.sqrt(np.nan_to_num(np.maximum(v, 0), nan=0, posinf=0)) for v in data.variances)
-        arrays |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
+        arrays[name.replace("_var", "_se")] = np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))
     if config.base:
         arrays["base"] = base_image(data, config)
     arrays |= combine.images(data, arrays.get("base"), config.layers)

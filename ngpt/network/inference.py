@@ -30,7 +30,7 @@ def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE
     model = _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
     held = {"primal", *data.features}
     held |= {"dx", "dy"} if data.dx is not None else set()
-    held |= {"primal_var", "dx_var", "dy_var"} if data.variances is not None else set()
+    held |= data.known_variances().keys()
     missing = [name for name in model.config.needs if name not in held]
     if missing:
         raise NgptError(f"weights {path} need layers {', '.join(missing)}, which the stack lacks")

@@ -10,7 +10,11 @@ from ngpt.methods import METHODS, WEIGHTS
 from ngpt.metrics import relmse_trimmed
 from ngpt.network.weights import load_weights
 
-SHIPPED = [name for name in ("ngpt-fast", "ngpt") if (WEIGHTS / f"{name}.safetensors").is_file()]
+SHIPPED = [
+    pytest.param(name, marks=pytest.mark.skipif(bool(METHODS[name].missing()), reason=METHODS[name].missing()))
+    for name in ("ngpt-fast", "ngpt-combine", "ngpt")
+    if (WEIGHTS / f"{name}.safetensors").is_file()
+]
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +29,8 @@ def views(renderer):
     return result
 
 
-def test_ngpt_fast_is_shipped():
-    assert "ngpt-fast" in SHIPPED
+def test_networks_are_shipped():
+    assert [param.values[0] for param in SHIPPED][:2] == ["ngpt-fast", "ngpt-combine"]
 
 
 @pytest.mark.parametrize("name", SHIPPED)
