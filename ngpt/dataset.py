@@ -10,6 +10,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -156,7 +157,8 @@ def problems(folder: Path) -> list[str]:
 
 def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     """The shard of a manifest's entry; raises NgptError unless it is that one, and has the tensors that crops need."""
-    if not path.is_file():
+    # Not Path.is_file, which raises where a name is longer than names may be.
+    if not os.path.isfile(path):
         raise NgptError(f"{path}: is missing; remove it from the manifest by running python -m data_gen again")
     if (digest := checksum(path)) != entry["sha256"]:
         told = entry["sha256"][:12]

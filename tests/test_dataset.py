@@ -120,6 +120,17 @@ def test_problems_are_named(folder, rng):
     assert "c-000.safetensors: is not in the manifest" in found
 
 
+def test_a_name_longer_than_names_may_be_is_a_missing_file(folder):
+    """Found by fuzzing."""
+    path, _ = folder
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["shards"][0]["file"] = "shards/" + 300 * "x"
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    assert any("is missing" in line for line in problems(path))
+    with pytest.raises(NgptError, match="is missing"):
+        Dataset(path)[0]
+
+
 def tampered(folder, change):
     manifest = json.loads((folder / "manifest.json").read_text())
     change(manifest, manifest["shards"][0])
