@@ -80,7 +80,8 @@ def smallest_float(tensor: np.ndarray) -> np.ndarray:
 def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
     """Writes a shard, and the record of how it came about; it may hold no crop at all, when all have failed.
 
-    A shard that is there already is replaced: it is the same one, made by a worker that was lost before it said so.
+    A shard that is there already is kept: it is the same one but for the times in its record, made by a worker that was
+    faster, or was lost before it said so; and its checksum may be in the manifest by now.
     Raises NgptError for numbers that are not finite, naming the tensor, and when the file cannot be written.
     """
     from safetensors.numpy import save
@@ -91,8 +92,12 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
     data = save(tensors, {"ngpt": json.dumps(record)})
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_bytes(data)
+    try:
+        with atomic_output(path) as temporary:
+            temporary.write_bytes(data)
+    except NgptError:
+        if not path.is_file():
+            raise
 
 
 class Shard:

@@ -311,10 +311,10 @@ def _whole(path: Path) -> bool:
 def one_error(stderr: str) -> bool:
     """Whether one line names the error, and there is nothing but progress beside it.
 
-    Of several stacks each that fails has its line, and then they are counted.
+    Of several stacks each that fails has its line, and then they are counted; of an evaluation each scene that fails.
     """
     lines = stderr.strip().splitlines()
-    errors = [line for line in lines if ": error: " in line]
+    errors = [line for line in lines if ": error: " in line and ": error: scene: " not in line]
     failed = re.search(r"error: (\d+) of \d+ stacks were not reconstructed", stderr)
     expected = int(failed[1]) + 1 if failed else 1
     return len(errors) == expected and "Traceback" not in stderr and "Exception ignored" not in stderr

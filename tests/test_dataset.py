@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import os
 import pickle
 
 import numpy as np
@@ -118,6 +119,17 @@ def test_problems_are_named(folder, rng):
     found = "\n".join(problems(path))
     assert "b-000.safetensors: is missing" in found
     assert "c-000.safetensors: is not in the manifest" in found
+
+
+def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, rng):
+    """The records differ by the times in them, and the manifest may have the first one's checksum."""
+    path, crop = tmp_path / "a.safetensors", crop_data(rng)
+    write_shard(path, [crop], {"seconds": 1})
+    first = path.read_bytes()
+    write_shard(path, [crop], {"seconds": 2})
+    assert path.read_bytes() == first and os.listdir(tmp_path) == ["a.safetensors"]
+    with pytest.raises(NgptError, match="does not exist"):
+        write_shard(tmp_path / "nowhere" / "a.safetensors", [crop], {})
 
 
 def test_a_name_longer_than_names_may_be_is_a_missing_file(folder):
