@@ -17,6 +17,7 @@ MAX_HEADER = 2**24  # bytes of all headers of a file
 MAX_ATTRIBUTES = 10_000
 MAX_CHANNELS = 4096
 MAX_PIXELS = 2**28  # of one part: 16384 x 16384
+MAX_TILE = 2**20  # pixels of a tile that is larger than its image
 
 _MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
@@ -155,6 +156,9 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
         across, down = struct.unpack_from("<2I", data("tiles", "tiledesc"))
         if not (0 < across < 2**31 and 0 < down < 2**31):
             raise _Damage(f"{label} has tiles of {across}x{down} pixels")
+        # OpenEXR takes memory for whole tiles, of which the image may be a corner.
+        if across * down > max(MAX_TILE, 4 * width * height):
+            raise _Excess(f"{label} is {width}x{height} pixels in tiles of {across}x{down}")
         chunks = -(-width // across) * -(-height // down)
     channels = dict(_channels(data("channels", "chlist"), label))
     return PartHeader(

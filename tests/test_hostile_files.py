@@ -57,6 +57,15 @@ def chlist(*names, kind=2, step=1):
     return b"".join(n + b"\0" + struct.pack("<i4x2i", kind, step, step) for n in names) + b"\0"
 
 
+def in_tiles(width, height):
+    def change(exr):
+        others = [attribute for attribute in exr.parts[0] if attribute.name != b"type"]
+        tiles = Attribute(b"tiles", b"tiledesc", struct.pack("<2IB", width, height, 0))
+        exr.parts[0][:] = [*others, Attribute(b"type", b"string", b"tiledimage"), tiles]
+
+    return change
+
+
 def box(*numbers):
     return struct.pack("<4i", *numbers)
 
@@ -86,6 +95,7 @@ def box(*numbers):
             lambda exr: exr.parts[0].extend(Attribute(b"x%d" % i, b"int", bytes(4)) for i in range(10_000)),
             "its header has more than 10000 attributes",
         ),
+        (in_tiles(8, 4194312), "pixels in tiles of 8x4194312"),
         (lambda exr: exr.parts[0].clear(), "damaged or incomplete"),
     ],
 )  # fmt: skip
