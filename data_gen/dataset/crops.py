@@ -59,6 +59,10 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
                 crops.append(data)
                 record["crops"].append(told)
     write_shard(Path(folder) / job.file, crops, record)
+    # Kernels are those of the scene: a process that makes thousands of scenes would keep them all.
+    import drjit as dr
+
+    dr.flush_kernel_cache()
     return job.file
 
 

@@ -17,8 +17,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
-# Of processor time and memory that one input may take: what deflate can make of the largest there are, and a copy.
-SECONDS, MEBIBYTES = 5.0, 1024
+SECONDS, MEBIBYTES = 5.0, 512  # of processor time and memory that one input of some kB may take
 PATIENCE = 60.0  # seconds by the clock, in which a machine with other work to do gives it that much
 START = 300.0  # seconds that a process may take until its first input
 

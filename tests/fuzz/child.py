@@ -40,7 +40,7 @@ def mebibytes(name: str) -> float:
         return next(int(line.split()[1]) / 1024 for line in file if line.startswith(name))
 
 
-def main(target: str, first: int, last: int, mib: int = 1024) -> None:
+def main(target: str, first: int, last: int, mib: int = 512) -> None:
     run = TARGETS[target]
     # The tests' own messages are kept apart from what a library prints to standard output.
     report = os.fdopen(os.dup(1), "w", buffering=1)

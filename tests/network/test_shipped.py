@@ -70,7 +70,9 @@ def test_a_firefly_stays_where_it_is(views, name):
     # 50 sweeps of its base, and what the network sees.
     far = np.s_[:, 10 + model.network.radius + 1 :]
     assert np.isfinite(after).all()
-    assert (np.abs(after - before)[far] <= 0.01 * before[far] + 1e-3).mean() > 0.99
+    # OIDN sees further than our networks, and its exposure is that of the whole image.
+    bound = 0.1 if name == "ngpt-combine" else 0.01
+    assert (np.abs(after - before)[far] <= bound * before[far] + 1e-3).mean() > 0.99
 
 
 @pytest.mark.parametrize("name", SHIPPED)
