@@ -23,8 +23,8 @@ PAGE = ROOT / "docs" / "RELIABILITY.md"
 HEAD = """\
 # Reliability
 
-What was tried against ngpt, how many times, and what came out: {tried} trials in {campaigns} campaigns, {date}, by
-`make reliability`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
+What was tried against ngpt, how many times, and what came out: {tried} trials in {campaigns} campaigns, {date}, those
+of `make reliability`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
 crash, a hang, a traceback, a file half-written under its final name, memory that grows) fails its test, and has no row.
 {failure}
 | campaign | tried | what came out | worst | seconds |
