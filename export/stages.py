@@ -10,7 +10,7 @@ from string import Template
 
 from ngpt.controlvariates import SWEEPS
 from ngpt.exposure import KEY
-from ngpt.network.features import CHANNELS, IMAGES, RADIANCE, SOURCES
+from ngpt.network.features import CHANNELS, IMAGES, RADIANCE, SOURCES, compared
 from ngpt.network.model import ModelConfig
 from ngpt.network.padding import MARGIN
 from ngpt.variances import FLOOR
@@ -431,7 +431,7 @@ def before(config: ModelConfig) -> str:
     base_default = ", float[1,3,0,0] base = {}" if config.base else ""
     lines = [cleaned(names), _SCALE.substitute(own=statistics(config))]
     scaled = [name for name in names if name in RADIANCE]
-    completed = [_computed(name) for name in config.inputs if name in SOURCES]
+    completed = [_computed(name, compared(config.inputs)) for name in config.inputs if name in SOURCES]
     lines += [f"{name}_scaled = Div ({name}_clean, exposure)" for name in scaled]
     if config.base:
         lines += [_BASE]
@@ -531,14 +531,17 @@ _PADS = f"""
 """
 
 
-def _computed(name: str) -> str:
-    """Nodes that make ``NAME_computed`` of scaled layers, as ``ngpt.network.features.completed`` does."""
+def _computed(name: str, other: str) -> str:
+    """Nodes that make ``NAME_computed`` of scaled layers, as ``ngpt.network.features.completed`` does.
+
+    ``other`` is the image it is relative to.
+    """
     source = SOURCES[name][0]
     if name.endswith("_change"):
         return f"""
     {name}_log = ngpt.SignedLog ({source}_scaled)
-    {name}_log_denoised = ngpt.SignedLog (denoised_scaled)
-    {name}_computed = Sub ({name}_log, {name}_log_denoised)"""
+    {name}_log_other = ngpt.SignedLog ({other}_scaled)
+    {name}_computed = Sub ({name}_log, {name}_log_other)"""
     if name.endswith("_noise"):
         return f"""
     {name}_clean = ngpt.Clean ({source.replace("_se", "_var")})
@@ -546,7 +549,7 @@ def _computed(name: str) -> str:
     {name}_root = Sqrt ({name}_positive)
     {name}_scaled = Div ({name}_root, exposure)
     {name}_mean = ReduceMean <keepdims: int = 1> ({name}_scaled, i1)
-    {name}_size = Abs (denoised_scaled)
+    {name}_size = Abs ({other}_scaled)
     {name}_brightness = ReduceMean <keepdims: int = 1> ({name}_size, i1)
     {name}_divisor = Add ({name}_brightness, one)
     {name}_computed = Div ({name}_mean, {name}_divisor)"""
@@ -559,7 +562,7 @@ def _computed(name: str) -> str:
     {name}_next = Concat <axis: int = {axis[1]}> ({name}_rest, {name}_edge)
     {name}_difference = Sub ({name}_next, {image}_scaled)
     {name}_contradiction = Sub ({source}_scaled, {name}_difference)
-    {name}_size = Abs (denoised_scaled)
+    {name}_size = Abs ({other}_scaled)
     {name}_divisor = Add ({name}_size, one)
     {name}_computed = Div ({name}_contradiction, {name}_divisor)"""
 

@@ -11,11 +11,12 @@
     primal_se, dx_se, dy_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
-Relative to the denoised image D, with L the signed log, and enlarged: what tells small differences apart in 16 bits:
+Relative to an image D, with L the signed log, and enlarged: what tells small differences apart in 16 bits. D is the
+base where "base" is among the inputs, the denoised image otherwise:
 
     primal_change, base_change, denoised_base_change
                  3   L(20 (L(x) - L(D)))
-    dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
+    dx_base, dy_base, dx_denoised, dy_denoised, dx_denoised_base, dy_denoised_base
                  3   L(20 (dx - ΔX) / (1 + |D|)), X the image in the name: where it contradicts the gradients
     primal_noise, dx_noise, dy_noise
                  1   ln(1 + 100 standard error / (1 + |D|)), means over RGB
@@ -51,6 +52,8 @@ CHANNELS = {
     "primal_change": 3,
     "base_change": 3,
     "denoised_base_change": 3,
+    "dx_base": 3,
+    "dy_base": 3,
     "dx_denoised": 3,
     "dy_denoised": 3,
     "dx_denoised_base": 3,
@@ -60,11 +63,11 @@ CHANNELS = {
     "dy_noise": 1,
 }
 
-# What is computed of other layers: of which.
+# What is computed of other layers: of which, beside ``compared``.
 SOURCES = {
-    **{f"{name}_change": (name, "denoised") for name in ("primal", "base", "denoised_base")},
-    **{f"{axis}_{name}": (axis, name, "denoised") for axis in ("dx", "dy") for name in combine.IMAGES},
-    **{f"{name}_noise": (f"{name}_se", "denoised") for name in ("primal", "dx", "dy")},
+    **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
+    **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *combine.IMAGES)},
+    **{f"{name}_noise": (f"{name}_se",) for name in ("primal", "dx", "dy")},
 }
 
 # The layers that grow with the light of the scene.
@@ -84,25 +87,33 @@ def channels(inputs: tuple[str, ...]) -> int:
 
 def sources(inputs: tuple[str, ...]) -> tuple[str, ...]:
     """The layers that these inputs are, or are computed of."""
-    return tuple(dict.fromkeys(source for name in inputs for source in SOURCES.get(name, (name,))))
+    beside = (compared(inputs),)
+    return tuple(
+        dict.fromkeys(source for name in inputs for source in (SOURCES[name] + beside if name in SOURCES else (name,)))
+    )
+
+
+def compared(inputs: tuple[str, ...]) -> str:
+    """The image that computed inputs are relative to."""
+    return "base" if "base" in inputs else "denoised"
 
 
 def completed(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> dict[str, Tensor]:
     """Normalised layers with what is computed of them, for those of ``inputs`` that are; before any padding."""
-    return dict(layers) | {name: _computed(name, layers) for name in inputs if name in SOURCES}
+    return dict(layers) | {name: _computed(name, layers, compared(inputs)) for name in inputs if name in SOURCES}
 
 
-def _computed(name: str, layers: Mapping[str, Tensor]) -> Tensor:
-    denoised = layers["denoised"]
+def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Tensor:
+    other = layers[compared_with]
     if name.endswith("_change"):
-        return signed_log(layers[SOURCES[name][0]]) - signed_log(denoised)
+        return signed_log(layers[SOURCES[name][0]]) - signed_log(other)
     if name.endswith("_noise"):
         error = layers[SOURCES[name][0]].mean(-3, keepdim=True)
-        return error / (1 + denoised.abs().mean(-3, keepdim=True))
+        return error / (1 + other.abs().mean(-3, keepdim=True))
     axis = -1 if name.startswith("dx") else -2
     image = layers[SOURCES[name][1]]
     last = image.narrow(axis, image.shape[axis] - 1, 1)
-    return (layers[name[:2]] - torch.diff(image, dim=axis, append=last)) / (1 + denoised.abs())
+    return (layers[name[:2]] - torch.diff(image, dim=axis, append=last)) / (1 + other.abs())
 
 
 def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:

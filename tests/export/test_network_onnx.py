@@ -36,6 +36,10 @@ CONFIGS = {
     "with a choice": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "denoised", *SOURCES), "wcv"), start=("base", "denoised", "denoised_base")
     ),
+    "relative to its base": ModelConfig(
+        *("dense", (4, 6), (1, 1), ("primal", "base", "primal_change", "dx_base", "dy_base", "dx_noise"), "wcv"),
+        start=("primal", "base"),
+    ),
     "of a primal alone": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "primal_change", "primal_noise")), start=("primal", "denoised")
     ),

@@ -381,3 +381,27 @@ def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
         target[0, :, 3, 3] = firefly
         gradients.append(torch.autograd.grad(pixelwise.huber(prediction, target), prediction)[0])
     assert torch.allclose(*gradients)
+
+
+def test_of_errors_of_one_size_the_pyramid_sees_the_wide_ones():
+    """A patch that is off counts as much at every resolution; a checkerboard of the same error only at the finest."""
+    target = torch.full((1, 3, 64, 64), 0.2)
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    sign = 1 - 2.0 * ((x + y) % 2)
+    fine, wide = (pixelwise.pyramid(target + 0.01 * s, target).item() for s in (sign, torch.ones_like(sign)))
+    assert pixelwise.pyramid(target, target).item() == 0
+    assert fine == pytest.approx(wide / 4, rel=0.1)
+    assert pixelwise.l1(target + 0.01 * sign, target).item() == pytest.approx(
+        pixelwise.l1(target + 0.01, target).item(), rel=0.1
+    )
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 13)])
+def test_the_pyramid_takes_any_size_and_any_radiance(size):
+    prediction = torch.zeros(2, 3, *size)
+    prediction[0], prediction[1, 0] = 1e12, -5
+    prediction.requires_grad_()
+    value = pixelwise.pyramid(prediction, torch.rand(2, 3, *size))
+    value.backward()
+    assert 0 < value.item() < 1 and torch.isfinite(prediction.grad).all()
+    assert make_loss({"kind": "l1", "pyramid": 1.0})(prediction, prediction.detach(), generator())[0].item() == 0

@@ -9,6 +9,7 @@ from ngpt.network import features, padding  # noqa: E402
 from ngpt.network.cost import per_pixel  # noqa: E402
 from ngpt.network.inference import reconstruct  # noqa: E402
 from ngpt.network.model import ModelConfig, Reconstructor, parameters  # noqa: E402
+from ngpt.network.transfer import signed_log  # noqa: E402
 from ngpt.network.unet import Convolution, DenseUNet, PlainUNet  # noqa: E402
 
 NGPT = ("primal", "dx", "dy", "albedo", "normal", "depth")
@@ -204,6 +205,19 @@ def test_what_is_computed_agrees_with_padding():
     wrong = features.completed(data, inputs)["dx_denoised"]
     assert wrong[0, 0, 4, 5].item() == pytest.approx(0.1 / (1 + image[0, 0, 4, 5].item()))
     assert (wrong != 0).sum() == 1
+
+
+def test_computed_inputs_are_relative_to_the_base_where_the_network_reads_it():
+    inputs = ("primal", "base", "primal_change", "dy_base", "primal_noise")
+    data = layers(9, 14, ("primal", "base", "dy", "primal_se"))
+    assert features.sources(inputs) == ("primal", "base", "dy", "primal_se")
+    completed = features.completed(data, inputs)
+    base = data["base"]
+    assert torch.equal(completed["primal_change"], signed_log(data["primal"]) - signed_log(base))
+    slope = data["dy"] - base.diff(dim=-2, append=base[..., -1:, :])
+    assert torch.equal(completed["dy_base"], slope / (1 + base.abs()))
+    noise = data["primal_se"].mean(1, keepdim=True) / (1 + base.abs().mean(1, keepdim=True))
+    assert torch.equal(completed["primal_noise"], noise)
 
 
 def test_exposure_is_the_typical_radiance():

@@ -2,8 +2,12 @@
 
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d
 
-from ngpt.network.transfer import signed_log
+from ngpt.network.transfer import signed_log, srgb
+
+# Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
+_SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
 
 
 def tone_mapped(image: Tensor) -> Tensor:
@@ -50,3 +54,20 @@ def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float
 def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |ln(1 + |p|) sgn p - ln(1 + |t|) sgn t|."""
     return (signed_log(prediction) - signed_log(target)).abs().mean()
+
+
+def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
+
+    What a viewer sees of an error depends on how wide it is: eyes average fine noise away, above all that of colours,
+    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of the
+    structural distance takes patches' means off. Halves each resolution, as far as images of odd sides have pixels.
+    """
+    total = prediction.new_zeros(())
+    for exposure in _EXPOSURES:
+        a, b = (srgb(tone_mapped(exposure * image.clamp(min=0)).clamp(max=1)) for image in (prediction, target))
+        for scale in range(_SCALES):
+            if scale:
+                a, b = (avg_pool2d(image, 2, ceil_mode=True) for image in (a, b))
+            total = total + (a - b).abs().mean()
+    return total / (_SCALES * len(_EXPOSURES))
