@@ -11,7 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ngpt.errors import NgptError
 from ngpt.network.features import RADIANCE
+from ngpt.stack import GradientStack
 
 Layers = dict[str, Tensor]
 
@@ -28,12 +30,23 @@ class Augmentation:
     ``colors``      permutation of RGB, and a factor for each of mean 1, 0..3, uniform on the simplex
     ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
     ``depth``       factor of depth, uniform between these
+    ``quieter``     factors of noise, log-uniform between these, one for each crop: shows its best input once more, with
+                    so much less noise (``quieter``). Networks learn from it what to make of more samples than anyone
+                    renders for training. () for none
     """
 
     geometry: bool = True
     colors: bool = True
     brightness: float = 1.0
     depth: tuple[float, float] = (0.1, 1.1)
+    quieter: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "quieter", tuple(self.quieter))
+        if self.quieter and not (len(self.quieter) == 2 and 0 < self.quieter[0] <= self.quieter[1] <= 1):
+            raise NgptError(
+                f"[augmentation]: quieter = {list(self.quieter)}: must be two factors, 0 < least <= most <= 1"
+            )
 
     def __call__(self, layers: Mapping[str, Tensor], rng: np.random.Generator) -> Layers:
         result = dict(layers)
@@ -49,6 +62,23 @@ class Augmentation:
         if "depth" in result:
             result["depth"] = result["depth"] * float(rng.uniform(*self.depth))
         return result
+
+
+def quieter(stack: GradientStack, reference: np.ndarray, direct: np.ndarray, factor: float) -> GradientStack:
+    """The stack with ``factor`` times its noise, as of 1 / factor² times the samples: a mean with the reference.
+
+    ``reference`` (H, W, 3) includes emission seen directly, ``direct`` is that alone. Features stay as they are.
+    """
+    light = reference - direct
+    truth = {
+        "primal": reference,
+        "direct": direct,
+        "dx": np.diff(light, axis=1, append=light[:, -1:]),
+        "dy": np.diff(light, axis=0, append=light[-1:]),
+    }
+    layers = {name: factor * stack[name] + (1 - factor) * truth[name] for name in truth if name in stack}
+    layers |= {name: factor**2 * stack[name] for name in ("primal_var", "dx_var", "dy_var") if name in stack}
+    return stack.replace(**layers)
 
 
 def flip_x(layers: Mapping[str, Tensor]) -> Layers:

@@ -13,7 +13,7 @@ from ngpt import combine
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.network import features, padding
-from ngpt.network.augment import Augmentation, Layers
+from ngpt.network.augment import Augmentation, Layers, quieter
 from ngpt.network.model import ModelConfig
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
@@ -149,10 +149,10 @@ class Mixture(Sequence[Any]):
 class Examples(TorchDataset):
     """Endless training examples, each a function of its index and the seed: whoever asks, and when.
 
-    Example ``i`` is one crop with one of its inputs, at random, normalised, augmented and padded: a dict of layers
-    (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the middle of that, where no padding is
-    whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random. What was read and prepared once is
-    kept in memory, up to ``cache`` bytes.
+    Example ``i`` is one crop with one of its inputs (or one more, ``Augmentation.quieter``), at random, normalised,
+    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the
+    middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
+    What was read and prepared once is kept in memory, up to ``cache`` bytes.
     """
 
     def __init__(
@@ -176,7 +176,7 @@ class Examples(TorchDataset):
         # Uniform over crops, whatever the number of their inputs.
         which = int(rng.integers(len(self.crops)))
         crop = self.crops[which]
-        k = int(rng.integers(crop.inputs))
+        k = int(rng.integers(crop.inputs + bool(self.augmentation.quieter)))
         layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
         layers = features.completed(layers, self.config.inputs)
         top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
@@ -189,13 +189,21 @@ class Examples(TorchDataset):
         if (which, k) in self._cache:
             return self._cache[which, k]
         crop = self.crops[which]
-        layers = layers_of(repair(crop.stack(k)), self.config)
+        stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
+        layers = layers_of(repair(stack), self.config)
         target = (crop.reference - crop.reference_direct).transpose(2, 0, 1)
         layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
         size = sum(layer.numel() * layer.element_size() for layer in layers.values())
         if size <= self._free:
             self._cache[which, k], self._free = layers, self._free - size
         return layers
+
+    def _quieter(self, which: int) -> GradientStack:
+        """The input of that crop with most samples, as of many more."""
+        crop = self.crops[which]
+        low, high = np.log(self.augmentation.quieter)
+        factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
+        return quieter(crop.stack(int(np.argmax(crop.spp))), crop.reference, crop.reference_direct, factor)
 
     def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
         height, width = layers["primal"].shape[-2:]

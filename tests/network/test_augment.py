@@ -5,8 +5,10 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import augment, padding  # noqa: E402
-from ngpt.network.augment import Augmentation  # noqa: E402
+from ngpt.network.augment import Augmentation, quieter  # noqa: E402
+from ngpt.stack import GradientStack  # noqa: E402
 
 
 def differences(image):
@@ -84,6 +86,33 @@ def test_nothing_happens_when_everything_is_off():
     before = example()
     after = off(before, np.random.default_rng(0))
     assert all(torch.equal(after[name], before[name]) for name in before)
+
+
+def test_a_quieter_stack_has_a_part_of_the_noise():
+    """Errors and standard errors of all layers shrink alike, and the stack stays one."""
+    rng = np.random.default_rng(3)
+    light, direct = rng.random((6, 9, 3), np.float32), np.zeros((6, 9, 3), np.float32)
+    direct[2, 3] = 7
+    truth = {"primal": light + direct, "direct": direct}
+    truth |= {"dx": np.diff(light, axis=1, append=light[:, -1:]), "dy": np.diff(light, axis=0, append=light[-1:])}
+    noisy = {name: layer + rng.standard_normal((6, 9, 3), np.float32) for name, layer in truth.items()}
+    variances = {f"{name}_var": rng.random((6, 9, 3), np.float32) for name in ("primal", "dx", "dy")}
+    albedo = rng.random((6, 9, 3), np.float32)
+    stack = GradientStack.from_arrays(**noisy, **variances, albedo=albedo, attributes={"ngpt:spp": 4})
+    result = quieter(stack, light + direct, direct, 0.1)
+    for name, layer in truth.items():
+        assert np.allclose(result[name] - layer, 0.1 * (noisy[name] - layer), atol=1e-5)
+    for name, layer in variances.items():
+        assert np.allclose(result[name], 0.01 * layer)
+    assert np.array_equal(result["albedo"], albedo) and np.array_equal(stack["primal"], noisy["primal"])
+    bare = GradientStack.from_arrays(primal=noisy["primal"])
+    assert quieter(bare, light + direct, direct, 0.1).names == ("primal",)
+
+
+@pytest.mark.parametrize("factors", [(0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3)])
+def test_factors_of_noise_are_checked(factors):
+    with pytest.raises(NgptError, match="two factors"):
+        Augmentation(quieter=factors)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 4), (16, 24)])

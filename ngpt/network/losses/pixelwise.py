@@ -60,8 +60,8 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
     """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
 
     What a viewer sees of an error depends on how wide it is: eyes average fine noise away, above all that of colours,
-    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of the
-    structural distance takes patches' means off. Halves each resolution, as far as images of odd sides have pixels.
+    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of
+    the structural distance takes patches' means off. Each resolution has half the pixels of the last, rounded up.
     """
     total = prediction.new_zeros(())
     for exposure in _EXPOSURES:
