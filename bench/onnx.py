@@ -11,6 +11,8 @@ Per size, on synthetic stacks with features and variances, all in this process a
     graph alone     the network with its base made inside the graph, as a host without ngpt has it
     torch, torch bf16   the network by PyTorch, in float32 and under autocast
     oidn high, oidn fast   Open Image Denoise with albedo and normal, for what people use today
+    oidn prefiltered    the first, with its features denoised before: `--method oidn`
+    ngpt-combine    as ngpt.reconstruct() runs it: base, OIDN of the primal and of the base, network
 
 Beside them, each in a process of its own: the largest memory, and the seconds from the command to the end of `ngpt
 denoise` for a stack of 64x64 pixels. Rows whose package is not installed are left out, and the results say so.
@@ -98,7 +100,7 @@ def bench_size(stack: GradientStack, half: Path | None, repeats: int) -> dict:
     if half:
         in_half = Network(half)
         calls["float16"] = lambda: in_half.reconstruct(layers, base)
-    calls |= torch_calls(data) | oidn_calls(data)
+    calls |= torch_calls(data) | oidn_calls(stack, data)
     return measure(calls, repeats)
 
 
@@ -120,7 +122,7 @@ def torch_calls(data) -> dict:
     return {"torch": lambda: run(False), "torch bf16": lambda: run(True)}
 
 
-def oidn_calls(data) -> dict:
+def oidn_calls(stack: GradientStack, data) -> dict:
     try:
         import mitsuba_oidn
     except ModuleNotFoundError:
@@ -133,6 +135,8 @@ def oidn_calls(data) -> dict:
     return {
         "oidn high": lambda: run(mitsuba_oidn.Quality.High),
         "oidn fast": lambda: run(mitsuba_oidn.Quality.Fast),
+        "oidn prefiltered": lambda: METHODS["oidn"].run(data),
+        "ngpt-combine": lambda: reconstruct(stack, "ngpt-combine"),
     }
 
 
