@@ -16,7 +16,7 @@ from export.text import IR_VERSION, OPSET, finish, parse
 from ngpt.controlvariates import SWEEPS
 from ngpt.errors import NgptError
 from ngpt.network import features
-from ngpt.network.model import Reconstructor
+from ngpt.network.model import WINDOW, Reconstructor
 from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 
@@ -76,7 +76,7 @@ def overlap(model: Reconstructor, given_base: bool = False) -> int:
 
     What the network sees, and before it what the control variates and the smoothing of their weights do.
     """
-    reach = model.network.radius
+    reach = max(model.network.radius, WINDOW // 2 if model.config.within else 0)
     if model.config.base and not given_base:
         reach += SWEEPS + 2
     return -(-reach // model.alignment) * model.alignment

@@ -1,6 +1,7 @@
 """What surrounds a network in its ONNX file: from the renderer's buffers to the network's channels, and back.
 
-    clean -> statistics -> base -> normalised -> padded -> [network] -> cropped -> bounded -> exponential -> exposure
+    clean -> statistics -> base -> normalised -> padded -> [network] -> cropped -> bounded -> exponential -> converging
+    -> exposure
 
 The same steps as in ``ngpt.network`` (features, padding, model) and ``ngpt.controlvariates``, from which the comments
 say where they differ; tests hold the two together. All of it is float32.
@@ -11,7 +12,7 @@ from string import Template
 from ngpt.controlvariates import SWEEPS
 from ngpt.exposure import KEY
 from ngpt.network.features import CHANNELS, IMAGES, RADIANCE, SOURCES, compared
-from ngpt.network.model import ModelConfig
+from ngpt.network.model import WINDOW, ModelConfig
 from ngpt.network.padding import MARGIN
 from ngpt.variances import FLOOR
 
@@ -436,6 +437,8 @@ def before(config: ModelConfig) -> str:
     if config.base:
         lines += [_BASE]
     lines += [f"start_{name} = Identity ({name}_scaled)" for name in config.start]
+    if config.within:
+        lines += [_WITHIN.substitute(within=float(config.within))]
     lines += [*completed, *(_encode(name) for name in config.inputs)]
     lines += [_PADS, *(_pad(name) for name in config.inputs)]
     padded = ", ".join(f"{name}_padded" for name in config.inputs)
@@ -443,7 +446,7 @@ def before(config: ModelConfig) -> str:
         "float[tiles,channel_count,rows,columns] channels, float exposure, float low, float high, int64 height_now, "
     )
     outputs += "int64 width_now"
-    outputs += starts(config)
+    outputs += passed(config)
     count = sum(CHANNELS[name] for name in config.inputs)
     lines += [f"channels = Concat <axis: int = 1> ({padded})"]
     body = "\n".join(lines)
@@ -504,6 +507,23 @@ _BASE = """
         else_branch: graph = take () => (float[tiles,3,height,width] taken) { taken = Div (base, exposure) }
     >
 """
+
+_WITHIN = Template(f"""
+    within_clean = ngpt.Clean (primal_var)
+    within_positive = Max (within_clean, zero)
+    within_mean = AveragePool <kernel_shape: ints = [{WINDOW}, {WINDOW}],
+        pads: ints = [{", ".join(4 * [str(WINDOW // 2)])}], count_include_pad: int = 0> (within_positive)
+    within_root = Sqrt (within_mean)
+    within_scaled = Div (within_root, exposure)
+    within_factor = Constant <value_float: float = $within> ()
+    within_reach = Mul (within_scaled, within_factor)
+    within_known = Greater (within_mean, zero)
+    within_free = Constant <value_float: float = 3.0e38> ()
+    reach = Where (within_known, within_reach, within_free)
+    least_image = Sub (base_scaled, reach)
+    above = Add (base_scaled, reach)
+    most_image = Max (above, zero)
+""")
 
 _PADS = f"""
     height_list = Shape <start: int = 2, end: int = 3> (primal)
@@ -624,9 +644,10 @@ def _pad(name: str) -> str:
     {name}_padded = Gather <axis: int = 3> ({name}_tall, columns_here)"""
 
 
-def starts(config: ModelConfig) -> str:
-    """What ``before`` passes on to ``after`` of the images that the network starts from."""
-    return "".join(f", float[tiles,3,height,width] start_{name}" for name in config.start)
+def passed(config: ModelConfig) -> str:
+    """What ``before`` passes on to ``after`` of images: those the network starts from, and the bounds of the result."""
+    names = [f"start_{name}" for name in config.start] + (["least_image", "most_image"] if config.within else [])
+    return "".join(f", float[tiles,3,height,width] {name}" for name in names)
 
 
 def _corrected(config: ModelConfig) -> str:
@@ -662,10 +683,18 @@ def _corrected(config: ModelConfig) -> str:
     return "\n    ".join(lines)
 
 
+def _converging(config: ModelConfig) -> str:
+    """Nodes that bound ``radiance`` as ``Reconstructor.converging`` does."""
+    if not config.within:
+        return "converging = Identity (radiance)"
+    return """near_below = Max (radiance, least_image)
+    converging = Min (near_below, most_image)"""
+
+
 def after(config: ModelConfig) -> str:
     """The graph from the network's output, and what ``before`` passes on, to the image."""
     return f"""after (float[tiles,{config.outputs},rows,columns] prediction, float exposure, float low, float high,
-    int64 height_now, int64 width_now{starts(config)}) => (float[tiles,3,height,width] image)
+    int64 height_now, int64 width_now{passed(config)}) => (float[tiles,3,height,width] image)
 {{
     as_list = Constant <value_ints: ints = [1]> ()
     margins = Constant <value_ints: ints = [{MARGIN}, {MARGIN}]> ()
@@ -679,5 +708,6 @@ def after(config: ModelConfig) -> str:
     bounded_below = Max (logarithm, low)
     bounded = Min (bounded_below, high)
     radiance = ngpt.SignedExp (bounded)
-    image = Mul (radiance, exposure)
+    {_converging(config)}
+    image = Mul (converging, exposure)
 }}"""

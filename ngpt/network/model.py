@@ -1,11 +1,13 @@
 """A neural reconstruction as a whole: its configuration, the network, and what is around it."""
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import avg_pool2d
 
 from ngpt.errors import NgptError
 from ngpt.network import features, padding
@@ -17,6 +19,8 @@ NETWORKS = ("dense", "plain")
 BASES = ("l2", "cv", "wcv")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
+# Side of the window, in pixels, over which ``within`` averages variances: those of single pixels know too little.
+WINDOW = 15
 
 
 @dataclass(frozen=True)
@@ -31,6 +35,9 @@ class ModelConfig:
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
                   and corrects their mean in the logarithm. By default the base; without any it predicts the image
                   itself, as NGPT does
+    ``within``    the result stays within that many standard errors of the primal from the base, so that it converges to
+                  the truth as the base does, whatever the network says; free where the variance is not known, or 0.
+                  0 for no bound
     """
 
     network: str
@@ -39,6 +46,7 @@ class ModelConfig:
     inputs: tuple[str, ...]
     base: str = ""
     start: tuple[str, ...] = ()
+    within: float = 0.0
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
@@ -73,6 +81,14 @@ class ModelConfig:
                 raise NgptError(
                     f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
                 )
+
+        if not isinstance(self.within, int | float) or isinstance(self.within, bool) or not 0 <= self.within < math.inf:
+            raise NgptError(f"within = {self.within!r}: must be a finite number of standard errors, 0 for no bound")
+        if self.within and not {"base", "primal_se"} <= set(self.layers):
+            raise NgptError(
+                f"within = {self.within}: bounds what is made of a base by the noise of the primal; give a base, and "
+                "inputs that are made of it and of primal_se"
+            )
 
     @property
     def outputs(self) -> int:
@@ -139,7 +155,8 @@ class Reconstructor(nn.Module):
         pads = padding.pads(height, width, self.alignment)
         scaled = features.completed(scaled, self.config.inputs)
         logarithm = padding.crop(self.predict(padding.pad(scaled, pads)), pads)
-        return signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1])) * exposure
+        image = signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1]))
+        return self.converging(image, scaled) * exposure
 
     def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
         """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
@@ -154,6 +171,17 @@ class Reconstructor(nn.Module):
         weights = torch.softmax(prediction[:, 3:], 1)
         mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
         return prediction[:, :3] + signed_log(mean)
+
+    def converging(self, image: Tensor, scaled: Mapping[str, Tensor]) -> Tensor:
+        """The image (N, 3, H, W) bounded by ``ModelConfig.within``, from normalised layers of the same size."""
+        if not self.config.within:
+            return image
+        variance = avg_pool2d(scaled["primal_se"].square(), WINDOW, 1, WINDOW // 2, count_include_pad=False)
+        # None at all is what is not known, or a light that no sample has met yet.
+        reach = torch.where(variance > 0, self.config.within * variance.sqrt(), math.inf)
+        # A base below 0 is wrong for certain.
+        most = (scaled["base"] + reach).clamp(min=0)
+        return torch.minimum(torch.maximum(image, scaled["base"] - reach), most)
 
     @staticmethod
     def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:

@@ -40,6 +40,11 @@ CONFIGS = {
         *("dense", (4, 6), (1, 1), ("primal", "base", "primal_change", "dx_base", "dy_base", "dx_noise"), "wcv"),
         start=("primal", "base"),
     ),
+    "converging": ModelConfig(
+        *("dense", (4, 6), (1, 1), ("primal", "base", "primal_noise", "dx_se"), "wcv"),
+        start=("primal", "base"),
+        within=0.3,
+    ),
     "of a primal alone": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "primal_change", "primal_noise")), start=("primal", "denoised")
     ),

@@ -8,7 +8,7 @@ from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import features, padding  # noqa: E402
 from ngpt.network.cost import per_pixel  # noqa: E402
 from ngpt.network.inference import reconstruct  # noqa: E402
-from ngpt.network.model import ModelConfig, Reconstructor, parameters  # noqa: E402
+from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
 from ngpt.network.transfer import signed_log  # noqa: E402
 from ngpt.network.unet import Convolution, DenseUNet, PlainUNet  # noqa: E402
 
@@ -188,6 +188,64 @@ def test_tiles_of_a_combiner_do_not_show():
         assert torch.allclose(reconstruct(model, data, tile=48), model(data), rtol=1e-5, atol=1e-6)
 
 
+def converging(within=1.5):
+    inputs = ("primal", "base", "primal_se")
+    return ModelConfig("dense", (4, 6), (1, 1), inputs, "wcv", ("primal", "base"), within)
+
+
+def anything(config):
+    """A network of that configuration that has no idea."""
+    torch.manual_seed(0)
+    model = Reconstructor(config).eval()
+    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.5)
+    return model
+
+
+def test_a_converging_network_stays_within_standard_errors_of_its_base():
+    model, data = anything(converging()), layers(40, 30, converging().layers)
+    data["primal_se"] *= 0.05
+    with torch.no_grad():
+        off = (model(data) - data["base"]).abs()
+        model.config = converging(0)
+        free = (model(data) - data["base"]).abs()
+    assert free.max() > 1.5 * data["primal_se"].max() >= off.max() > 0
+    # In the middle of even noise, to the last bit of it.
+    data["primal_se"].fill_(0.01)
+    model.config = converging()
+    with torch.no_grad():
+        assert (model(data) - data["base"]).abs().max().item() == pytest.approx(0.015, rel=1e-3)
+
+
+def test_a_converging_network_returns_a_converged_base():
+    data = layers(20, 20, converging().layers)
+    data["primal_se"].fill_(1e-7)
+    data["base"][0, :, 3, 3] = -0.1
+    with torch.no_grad():
+        result = anything(converging())(data)
+    assert torch.allclose(result, data["base"].clamp(min=0), rtol=1e-5, atol=1e-6)
+
+
+def test_unknown_noise_bounds_nothing():
+    data = layers(20, 40, converging().layers)
+    data["primal_se"][..., :20] = 0
+    data["primal_se"][..., 20:] = 1e-7
+    model = anything(converging())
+    with torch.no_grad():
+        bounded = model(data)
+        model.config = converging(0)
+        free = model(data)
+    known = 20 - WINDOW // 2
+    assert torch.equal(bounded[..., :known], free[..., :known])
+    assert torch.allclose(bounded[..., known:], data["base"][..., known:], rtol=1e-5, atol=1e-6)
+
+
+def test_tiles_of_a_converging_network_do_not_show():
+    model, data = anything(converging()), layers(50, 90, converging().layers)
+    data["primal_se"] *= torch.linspace(0, 0.1, 90)
+    with torch.no_grad():
+        assert torch.allclose(reconstruct(model, data, tile=48), model(data), rtol=1e-5, atol=1e-6)
+
+
 def test_what_is_computed_agrees_with_padding():
     """The contradiction of an image and its own differences is none, nor is it across the mirrors of the padding."""
     data = layers(9, 14, ("denoised", "primal_se"))
@@ -259,6 +317,11 @@ def test_errors_are_explained():
         ModelConfig("plain", (4,), (), ("primal", "denoised_base"))
     with pytest.raises(NgptError, match="start 'albedo': must be one of"):
         ModelConfig("plain", (4,), (), ("primal", "albedo"), start=("albedo",))
+    with pytest.raises(NgptError, match="within = 3: bounds what is made of a base"):
+        ModelConfig("plain", (4,), (), ("primal", "base"), "wcv", within=3)
+    for within in (-1, float("nan"), float("inf"), "far", True):
+        with pytest.raises(NgptError, match="must be a finite number of standard errors"):
+            ModelConfig("plain", (4,), (), ("primal", "base", "primal_se"), "wcv", within=within)
     with pytest.raises(NgptError, match="start 'denoised'"):
         ModelConfig("plain", (4,), (), ("primal",), start=("denoised",))
 
