@@ -76,7 +76,7 @@ def overlap(model: Reconstructor, given_base: bool = False) -> int:
 
     What the network sees, and before it what the control variates and the smoothing of their weights do.
     """
-    reach = max(model.network.radius, WINDOW // 2 if model.config.within else 0)
+    reach = max(model.network.radius, WINDOW // 2 if model.config.quiet else 0)
     if model.config.base and not given_base:
         reach += SWEEPS + 2
     return -(-reach // model.alignment) * model.alignment

@@ -1,7 +1,6 @@
 """What surrounds a network in its ONNX file: from the renderer's buffers to the network's channels, and back.
 
-    clean -> statistics -> base -> normalised -> padded -> [network] -> cropped -> bounded -> exponential -> converging
-    -> exposure
+    clean -> statistics -> base -> normalised -> padded -> [network] -> cropped -> bounded -> exponential -> exposure
 
 The same steps as in ``ngpt.network`` (features, padding, model) and ``ngpt.controlvariates``, from which the comments
 say where they differ; tests hold the two together. All of it is float32.
@@ -12,7 +11,7 @@ from string import Template
 from ngpt.controlvariates import SWEEPS
 from ngpt.exposure import KEY
 from ngpt.network.features import CHANNELS, IMAGES, RADIANCE, SOURCES, compared
-from ngpt.network.model import WINDOW, ModelConfig
+from ngpt.network.model import DARK, HUGE, WINDOW, ModelConfig
 from ngpt.network.padding import MARGIN
 from ngpt.variances import FLOOR
 
@@ -437,10 +436,10 @@ def before(config: ModelConfig) -> str:
     if config.base:
         lines += [_BASE]
     lines += [f"start_{name} = Identity ({name}_scaled)" for name in config.start]
-    if config.within:
-        lines += [_WITHIN.substitute(within=float(config.within))]
     lines += [*completed, *(_encode(name) for name in config.inputs)]
     lines += [_PADS, *(_pad(name) for name in config.inputs)]
+    if config.quiet:
+        lines += [_SHARE.substitute(quiet=float(config.quiet)), "quiet_base = Identity (base_scaled)"]
     padded = ", ".join(f"{name}_padded" for name in config.inputs)
     outputs = (
         "float[tiles,channel_count,rows,columns] channels, float exposure, float low, float high, int64 height_now, "
@@ -508,23 +507,6 @@ _BASE = """
     >
 """
 
-_WITHIN = Template(f"""
-    within_clean = ngpt.Clean (primal_var)
-    within_positive = Max (within_clean, zero)
-    within_mean = AveragePool <kernel_shape: ints = [{WINDOW}, {WINDOW}],
-        pads: ints = [{", ".join(4 * [str(WINDOW // 2)])}], count_include_pad: int = 0> (within_positive)
-    within_root = Sqrt (within_mean)
-    within_scaled = Div (within_root, exposure)
-    within_factor = Constant <value_float: float = $within> ()
-    within_reach = Mul (within_scaled, within_factor)
-    within_known = Greater (within_mean, zero)
-    within_free = Constant <value_float: float = 3.0e38> ()
-    reach = Where (within_known, within_reach, within_free)
-    least_image = Sub (base_scaled, reach)
-    above = Add (base_scaled, reach)
-    most_image = Max (above, zero)
-""")
-
 _PADS = f"""
     height_list = Shape <start: int = 2, end: int = 3> (primal)
     width_list = Shape <start: int = 3, end: int = 4> (primal)
@@ -549,6 +531,37 @@ _PADS = f"""
     row_distance = Abs (row_step)
     column_distance = Abs (column_step)
 """
+
+
+_SHARE = Template(f"""
+    huge = Constant <value_float: float = {HUGE}> ()
+    quiet_clean = ngpt.Clean (primal_var)
+    quiet_positive = Max (quiet_clean, zero)
+    quiet_root = Sqrt (quiet_positive)
+    quiet_scaled = Div (quiet_root, exposure)
+    quiet_noise = Min (quiet_scaled, huge)
+    quiet_square = Mul (quiet_noise, quiet_noise)
+    quiet_variances = ReduceMean <keepdims: int = 1> (quiet_square, i1)
+    quiet_size = Abs (base_scaled)
+    quiet_light = Min (quiet_size, huge)
+    quiet_lights = ReduceMean <keepdims: int = 1> (quiet_light, i1)
+    quiet_both = Concat <axis: int = 1> (quiet_variances, quiet_lights)
+    quiet_tall = Gather <axis: int = 2> (quiet_both, rows_here)
+    quiet_padded = Gather <axis: int = 3> (quiet_tall, columns_here)
+    quiet_means = AveragePool <kernel_shape: ints = [{WINDOW}, {WINDOW}],
+        pads: ints = [{", ".join(4 * [str(WINDOW // 2)])}], count_include_pad: int = 0> (quiet_padded)
+    quiet_variance = Slice (quiet_means, i0, i1, i1)
+    quiet_mean = Slice (quiet_means, i1, i2, i1)
+    quiet_error = Sqrt (quiet_variance)
+    dark = Constant <value_float: float = {DARK}> ()
+    quiet_raised = Add (quiet_mean, dark)
+    quiet_limit = Constant <value_float: float = $quiet> ()
+    quiet_least = Mul (quiet_raised, quiet_limit)
+    quiet_ratio = Div (quiet_error, quiet_least)
+    quiet_share = Min (quiet_ratio, one)
+    quiet_known = Greater (quiet_variance, zero)
+    share = Where (quiet_known, quiet_share, one)
+""")
 
 
 def _computed(name: str, other: str) -> str:
@@ -645,9 +658,10 @@ def _pad(name: str) -> str:
 
 
 def passed(config: ModelConfig) -> str:
-    """What ``before`` passes on to ``after`` of images: those the network starts from, and the bounds of the result."""
-    names = [f"start_{name}" for name in config.start] + (["least_image", "most_image"] if config.within else [])
-    return "".join(f", float[tiles,3,height,width] {name}" for name in names)
+    """What ``before`` passes on to ``after``: what the network starts from, and what it goes over to, and where."""
+    images = [f"start_{name}" for name in config.start] + (["quiet_base"] if config.quiet else [])
+    share = ", float[tiles,1,rows,columns] share" if config.quiet else ""
+    return "".join(f", float[tiles,3,height,width] {name}" for name in images) + share
 
 
 def _corrected(config: ModelConfig) -> str:
@@ -684,11 +698,14 @@ def _corrected(config: ModelConfig) -> str:
 
 
 def _converging(config: ModelConfig) -> str:
-    """Nodes that bound ``radiance`` as ``Reconstructor.converging`` does."""
-    if not config.within:
-        return "converging = Identity (radiance)"
-    return """near_below = Max (radiance, least_image)
-    converging = Min (near_below, most_image)"""
+    """Nodes that make ``converging`` of ``logarithm``: what goes over to the base as noise vanishes."""
+    if not config.quiet:
+        return "converging = Identity (logarithm)"
+    return """share_here = Slice (share, margins, ends, axes)
+    log_base = ngpt.SignedLog (quiet_base)
+    beyond_base = Sub (logarithm, log_base)
+    shared = Mul (beyond_base, share_here)
+    converging = Add (log_base, shared)"""
 
 
 def after(config: ModelConfig) -> str:
@@ -705,9 +722,9 @@ def after(config: ModelConfig) -> str:
     axes = Constant <value_ints: ints = [2, 3]> ()
     cropped = Slice (prediction, margins, ends, axes)
     {_corrected(config)}
-    bounded_below = Max (logarithm, low)
+    {_converging(config)}
+    bounded_below = Max (converging, low)
     bounded = Min (bounded_below, high)
     radiance = ngpt.SignedExp (bounded)
-    {_converging(config)}
-    image = Mul (converging, exposure)
+    image = Mul (radiance, exposure)
 }}"""

@@ -57,8 +57,8 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
         part = {name: layer[..., y_around, x_around].to(device) for name, layer in padded.items()}
         inner = np.s_[..., _within(y, y_around), _within(x, x_around)]
         logarithm[..., y, x] = model.predict(part)[inner].to(logarithm.device)
-    image = signed_exp(torch.minimum(torch.maximum(padding.crop(logarithm, pads), low), high))
-    return model.converging(image, scaled) * exposure
+    image = padding.crop(logarithm, pads)
+    return signed_exp(torch.minimum(torch.maximum(image, low), high)) * exposure
 
 
 def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:

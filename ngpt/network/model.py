@@ -19,8 +19,9 @@ NETWORKS = ("dense", "plain")
 BASES = ("l2", "cv", "wcv")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
-# Side of the window, in pixels, over which ``within`` averages variances: those of single pixels know too little.
-WINDOW = 15
+# Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
+# too little; what is added to radiance before noise is divided by it; the largest number whose square is no overflow.
+WINDOW, DARK, HUGE = 15, 0.01, 1e15
 
 
 @dataclass(frozen=True)
@@ -35,9 +36,9 @@ class ModelConfig:
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
                   and corrects their mean in the logarithm. By default the base; without any it predicts the image
                   itself, as NGPT does
-    ``within``    the result stays within that many standard errors of the primal from the base, so that it converges to
-                  the truth as the base does, whatever the network says; free where the variance is not known, or 0.
-                  0 for no bound
+    ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
+                  base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
+                  network says. Where the variance is 0, or not known, it does not. 0: nowhere
     """
 
     network: str
@@ -46,7 +47,7 @@ class ModelConfig:
     inputs: tuple[str, ...]
     base: str = ""
     start: tuple[str, ...] = ()
-    within: float = 0.0
+    quiet: float = 0.0
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
@@ -82,12 +83,12 @@ class ModelConfig:
                     f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
                 )
 
-        if not isinstance(self.within, int | float) or isinstance(self.within, bool) or not 0 <= self.within < math.inf:
-            raise NgptError(f"within = {self.within!r}: must be a finite number of standard errors, 0 for no bound")
-        if self.within and not {"base", "primal_se"} <= set(self.layers):
+        if not isinstance(self.quiet, int | float) or isinstance(self.quiet, bool) or not 0 <= self.quiet < math.inf:
+            raise NgptError(f"quiet = {self.quiet!r}: must be a finite relative standard error, 0 for none")
+        if self.quiet and not {"base", "primal_se"} <= set(self.layers):
             raise NgptError(
-                f"within = {self.within}: bounds what is made of a base by the noise of the primal; give a base, and "
-                "inputs that are made of it and of primal_se"
+                f"quiet = {self.quiet}: goes over to the base by the noise of the primal; give a base, and inputs that "
+                "are made of it and of primal_se"
             )
 
     @property
@@ -155,8 +156,7 @@ class Reconstructor(nn.Module):
         pads = padding.pads(height, width, self.alignment)
         scaled = features.completed(scaled, self.config.inputs)
         logarithm = padding.crop(self.predict(padding.pad(scaled, pads)), pads)
-        image = signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1]))
-        return self.converging(image, scaled) * exposure
+        return signed_exp(torch.minimum(torch.maximum(logarithm, bounds[0]), bounds[1])) * exposure
 
     def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
         """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
@@ -167,21 +167,24 @@ class Reconstructor(nn.Module):
             return prediction
         images = [scaled[name] for name in self.config.start]
         if len(images) == 1:
-            return prediction + signed_log(images[0])
-        weights = torch.softmax(prediction[:, 3:], 1)
-        mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
-        return prediction[:, :3] + signed_log(mean)
+            result = prediction + signed_log(images[0])
+        else:
+            weights = torch.softmax(prediction[:, 3:], 1)
+            mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
+            result = prediction[:, :3] + signed_log(mean)
+        if not self.config.quiet:
+            return result
+        base = signed_log(scaled["base"])
+        return base + self.share(scaled) * (result - base)
 
-    def converging(self, image: Tensor, scaled: Mapping[str, Tensor]) -> Tensor:
-        """The image (N, 3, H, W) bounded by ``ModelConfig.within``, from normalised layers of the same size."""
-        if not self.config.within:
-            return image
-        variance = avg_pool2d(scaled["primal_se"].square(), WINDOW, 1, WINDOW // 2, count_include_pad=False)
+    def share(self, scaled: Mapping[str, Tensor]) -> Tensor:
+        """How much the network's result counts beside the base, (N, 1, H, W) in [0, 1], by ``ModelConfig.quiet``."""
+        noise, light = scaled["primal_se"].clamp(max=HUGE).square(), scaled["base"].abs().clamp(max=HUGE)
+        both = torch.cat([layer.mean(1, keepdim=True) for layer in (noise, light)], 1)
+        variance, mean = avg_pool2d(both, WINDOW, 1, WINDOW // 2, count_include_pad=False).split(1, 1)
+        share = (variance.sqrt() / (self.config.quiet * (mean + DARK))).clamp(max=1)
         # None at all is what is not known, or a light that no sample has met yet.
-        reach = torch.where(variance > 0, self.config.within * variance.sqrt(), math.inf)
-        # A base below 0 is wrong for certain.
-        most = (scaled["base"] + reach).clamp(min=0)
-        return torch.minimum(torch.maximum(image, scaled["base"] - reach), most)
+        return torch.where(variance > 0, share, 1)
 
     @staticmethod
     def bounds(primal: Tensor) -> tuple[Tensor, Tensor]:

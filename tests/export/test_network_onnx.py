@@ -43,7 +43,7 @@ CONFIGS = {
     "converging": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "base", "primal_noise", "dx_se"), "wcv"),
         start=("primal", "base"),
-        within=0.3,
+        quiet=1.0,
     ),
     "of a primal alone": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "primal_change", "primal_noise")), start=("primal", "denoised")
