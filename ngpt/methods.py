@@ -163,6 +163,11 @@ METHODS = {
         (*_GRADIENTS, *_FEATURES, *_VARIANCES),
         **_neural("ngpt-combine", peers.oidn_missing),
     ),
+    "ngpt-primal": Method(
+        "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
+        ("primal", *_FEATURES, "primal_var"),
+        **_neural("ngpt-primal", peers.oidn_missing),
+    ),
     "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
     # Those below see no gradients.
     "nlm": Method(
@@ -197,7 +202,7 @@ def choose(stack: GradientStack) -> str:
     """
     spp = stack.attributes.get("ngpt:spp", 0)
     spp = spp if isinstance(spp, int | float) else 0
-    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1"):
+    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal"):
         entry = METHODS[name]
         usable = all(layer in stack for layer in entry.needs) and not entry.missing()
         if usable and spp <= MOST_SAMPLES.get(name, math.inf):

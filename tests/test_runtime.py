@@ -179,14 +179,16 @@ def test_the_method_takes_files_of_both_kinds():
 
 @pytest.mark.parametrize("oidn", [True, False])
 def test_auto_takes_the_best_network_where_it_was_measured(monkeypatch, oidn):
-    entry = METHODS["ngpt-combine"]
-    if oidn and entry.missing():
-        pytest.skip(entry.missing())
+    if oidn and METHODS["oidn"].missing():
+        pytest.skip(METHODS["oidn"].missing())
     if not oidn:
-        monkeypatch.setitem(METHODS, "ngpt-combine", replace(entry, missing=lambda: "OIDN is not installed"))
+        for name in ("ngpt-combine", "ngpt-primal"):
+            monkeypatch.setitem(METHODS, name, replace(METHODS[name], missing=lambda: "OIDN is not installed"))
     stack = full_stack(20, 30)
     first = "ngpt-combine" if oidn else "ngpt-fast"
     assert reconstruct(stack).method == first
     for spp, method in ((64, first), (65, first if oidn else "wcv"), (257, "wcv")):
         rendered = GradientStack(stack.layers, attributes={"ngpt:spp": spp})
         assert reconstruct(rendered, memory=300).method == method
+    bare = {name: layer for name, layer in stack.layers.items() if not name.startswith(("dx", "dy"))}
+    assert reconstruct(GradientStack(bare)).method == ("ngpt-primal" if oidn else "primal")
