@@ -32,6 +32,8 @@ def tables(results: dict[str, Any]) -> str:
     others = [name for name in results["metrics"] if name != primary]
     if others and any(row["scene"] is None for row in results["summary"]):
         lines += ["Means over scenes of the other metrics:", "", *_others(results, others), ""]
+    for name in dict.fromkeys((primary, "FLIP")):
+        lines += _duels(results, name)
     lines += _absences(results)
     facts = results["metadata"]
     versions = ", ".join(f"{name} {value}" for name, value in facts["versions"].items() if value)
@@ -131,6 +133,27 @@ def _others(results: dict[str, Any], names: list[str]) -> list[str]:
             texts = ["" if np.isnan(v) else f"**{v:.4g}**" if v == best else f"{v:.4g}" for v in values]
             rows.append([name, str(spp), *texts])
     return _table(["metric", "spp", *_heads(results, methods)], rows, 1)
+
+
+def _duels(results: dict[str, Any], metric: str) -> list[str]:
+    """How often each method is ahead of each other, in the cells that have both."""
+    methods = _present(results)
+    if metric not in results["metrics"] or len(methods) < 2:
+        return []
+    sign = 1 if results["metrics"][metric]["better"] == "lower" else -1
+    cells: dict[tuple, dict[str, float]] = {}
+    for row in results["summary"]:
+        if row["scene"] is not None and metric in row["metrics"]:
+            cells.setdefault((row["scene"], row["spp"]), {})[row["method"]] = sign * row["metrics"][metric]["median"]
+    rows = []
+    for m in methods:
+        texts = []
+        for other in methods:
+            pairs = [(cell[m], cell[other]) for cell in cells.values() if m != other and {m, other} <= cell.keys()]
+            texts.append(f"{sum(mine < theirs for mine, theirs in pairs)}/{len(pairs)}" if pairs else "")
+        rows.append([f"`{m}`", *texts])
+    text = f"In how many cells (a scene at a number of samples) the row's method has the better {metric} of the two:"
+    return [text, "", *_table(["", *_heads(results, methods)], rows, 1), ""]
 
 
 def _absences(results: dict[str, Any]) -> list[str]:

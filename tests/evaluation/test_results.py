@@ -66,6 +66,21 @@ def test_losses_are_marked():
     assert "| `primal`† | `l1` | `wcv` | `oidn`† |" in text
 
 
+def test_duels_are_counted_over_cells_that_both_have():
+    results = make_results({"primal": [0.5], "l1": [0.2], "oidn": [0.1]})
+    cell = next(c for c in results["cells"] if (c["scene"], c["method"]) == ("b", "l1"))
+    cell["metrics"] = {"relMSE": 1.0, "PSNR": 99.0}
+    results["cells"] = [c for c in results["cells"] if (c["scene"], c["method"]) != ("b", "primal")]
+    results["summary"] = summarised(results)
+    text = tables(results).split("the better relMSE")[1]
+    assert row_of(text, "`l1`") == ["`l1`", "1/1", "", "1/2"]
+    assert row_of(text, "`primal`") == ["`primal`", "", "0/1", "0/1"]
+    # Metrics of which more is better; equal is not better.
+    results["primary"] = "PSNR"
+    text = tables(results).split("the better PSNR")[1]
+    assert row_of(text, "`l1`") == ["`l1`", "0/1", "", "0/2"]
+
+
 def test_what_the_reference_cannot_tell_is_marked():
     text = tables(make_results({"l1": [0.2, 0.2, 0.2], "oidn": [0.1, 0.1, 0.4]}, noise=0.05))
     assert row_of(text, "a")[2:4] == ["*0.2000*", "**0.1000 ±75% ~**"]
