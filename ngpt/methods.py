@@ -188,24 +188,17 @@ METHODS = {
 }
 
 
-# Samples per pixel up to which a network was measured to be worth it. Beyond what it was trained for, it does not know
-# when to leave a converged image alone.
-MOST_SAMPLES = {"ngpt-combine": 256, "ngpt-fast": 64}
-
-
 def choose(stack: GradientStack) -> str:
     """The method that ``auto`` stands for: the best of those that the stack's layers and this machine's packages allow.
 
     Geometric means of the trimmed relMSE over thirteen scenes at 4, 16, 64 and 256 spp, in thousandths, of
-    docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.9, 6.0, 3.0, 1.7; ngpt-fast 21.1, 9.0, 4.4, 2.7; wcv 42.8,
-    14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5.
+    docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.5, 6.0, 2.9, 1.7; ngpt-fast 19.1, 8.1, 3.7, 2.0; wcv 42.8,
+    14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5. Beyond, the networks go over to wcv. ngpt-primal, for stacks without
+    gradients, has 12.0, 6.2, 3.6, 2.2 at the same time.
     """
-    spp = stack.attributes.get("ngpt:spp", 0)
-    spp = spp if isinstance(spp, int | float) else 0
     for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal"):
         entry = METHODS[name]
-        usable = all(layer in stack for layer in entry.needs) and not entry.missing()
-        if usable and spp <= MOST_SAMPLES.get(name, math.inf):
+        if all(layer in stack for layer in entry.needs) and not entry.missing():
             return name
     return "primal"
 
