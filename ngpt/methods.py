@@ -3,7 +3,6 @@
 A new method is one more entry in ``METHODS``; the command line, the reports and the tables find it there.
 """
 
-import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
