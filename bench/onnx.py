@@ -135,7 +135,7 @@ def oidn_calls(stack: GradientStack, data) -> dict:
     return {
         "oidn high": lambda: run(mitsuba_oidn.Quality.High),
         "oidn fast": lambda: run(mitsuba_oidn.Quality.Fast),
-        "oidn prefiltered": lambda: METHODS["oidn"].run(data),
+        "oidn prefiltered": lambda: reconstruct(stack, "oidn"),
         "ngpt-combine": lambda: reconstruct(stack, "ngpt-combine"),
     }
 
