@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ngpt.peers import oidn
+from ngpt.peers import oidn, prefiltered
 from ngpt.repair import Repaired
 
 # Inputs of a network that are no layers of a stack, but made of them by another denoiser.
@@ -25,8 +25,12 @@ def images(data: Repaired, base: np.ndarray | None, names: Collection[str]) -> d
     OIDN's images of the primal and of ``base``. Raises NgptError where OIDN is not installed.
     """
     sources = dict(zip(IMAGES, (data.image, base), strict=True))
+    if not sources.keys() & set(names):
+        return {}
+    # Once for both images: this is most of the time.
+    data = replace(data, features=data.features | prefiltered(data.features))
     return {
-        name: oidn(replace(data, image=np.ascontiguousarray(image, np.float32)), "prefiltered", "high")
+        name: oidn(replace(data, image=np.ascontiguousarray(image, np.float32)), "clean", "high")
         for name, image in sources.items()
         if name in names and image is not None
     }

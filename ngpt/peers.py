@@ -3,6 +3,7 @@
 Each is imported when it is first called; ``missing()`` says what to install.
 """
 
+from collections.abc import Mapping
 from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any
@@ -47,16 +48,26 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
         raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(qualities)}")
     level = getattr(mitsuba_oidn.Quality, qualities[quality])
     features = {}
-    if auxiliary != "none":
-        features = {name: np.ascontiguousarray(data.features[name]) for name in ("albedo", "normal")}
-        features["albedo"] = np.clip(features["albedo"], 0, 1)
     if auxiliary == "prefiltered":
-        features = {name: _prefiltered(name, layer) for name, layer in features.items()}
+        features = prefiltered(data.features)
+    elif auxiliary != "none":
+        features = _in_range(data.features)
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     options = {"hdr": True, "clean_aux": auxiliary in ("prefiltered", "clean"), "quality": level}
     # A copy: the result is a view of a buffer that OIDN owns.
     return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
+
+
+def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself."""
+    _require(oidn_missing(), "oidn")
+    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
+
+
+def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    layers = {name: np.ascontiguousarray(features[name]) for name in ("albedo", "normal")}
+    return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
 
 
 def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:

@@ -2,15 +2,18 @@
 
 import sys
 import types
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from full_stack import full_stack
 
+from ngpt import combine, peers
 from ngpt import nfor as nfor_module
-from ngpt import peers
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, reconstruct
 from ngpt.nfor import nfor
+from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
 PEERS = [name for name, method in METHODS.items() if method.summary.startswith("peer")]
@@ -138,3 +141,15 @@ def test_an_absent_peer_says_what_to_install(room, monkeypatch, name):
     monkeypatch.setattr(peers, "find_spec", lambda module: None)
     with pytest.raises(NgptError, match=f"method '{name}'.*not installed: pip install 'ngpt-recon\\[peers\\]'"):
         reconstruct(room[0], name)
+
+
+@pytest.mark.skipif(bool(peers.oidn_missing()), reason=peers.oidn_missing())
+def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
+    """As `--method oidn` has them, though the features are filtered once for both."""
+    data = repair(full_stack(40, 50))
+    base = 0.9 * data.image
+    images = combine.images(data, base, combine.IMAGES)
+    for name, image in (("denoised", data.image), ("denoised_base", base)):
+        expected = peers.oidn(replace(data, image=image), "prefiltered", "high")
+        assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
+    assert combine.images(data, base, ("primal",)) == {} == combine.images(data, None, ("denoised_base",))
