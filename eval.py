@@ -10,7 +10,7 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ngpt.console import Console, run_command
+from ngpt.system.console import Console, run_command
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -29,11 +29,11 @@ def run(arguments: list[str] | None) -> int:
     console = Console(args.quiet)
     command = shlex.join(["python", "eval.py", *(sys.argv[1:] if arguments is None else arguments)])
     # Here and not above: a mistyped option is said at once.
-    from evaluation.config import read_config
-    from evaluation.run import evaluate
-    from evaluation.stacks import write_json
-    from ngpt.advice import make_table
-    from ngpt.report_evaluation import write_evaluation_report
+    from ngpt.evaluation.config import read_config
+    from ngpt.evaluation.run import evaluate
+    from ngpt.evaluation.stacks import write_json
+    from ngpt.measure.advice import make_table
+    from ngpt.report.evaluation import write_evaluation_report
 
     config = read_config(args.config)
     config = replace(config, scenes=(*config.scenes, *args.scenes))

@@ -9,9 +9,9 @@ import sys
 from contextlib import ExitStack
 from pathlib import Path
 
-from ngpt.console import run_command
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output, exclusive
+from ngpt.system.console import run_command
+from ngpt.system.files import atomic_output, exclusive
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -28,12 +28,12 @@ def run(arguments: list[str] | None) -> int:
     parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
     options = parser.parse_args(arguments)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
-    from ngpt.network.cost import cost
-    from ngpt.network.data import Mixture, open_crops, split
-    from ngpt.network.distributed import Processes
-    from ngpt.network.losses import make_loss
-    from ngpt.network.settings import read_settings
-    from ngpt.network.trainer import Trainer, show
+    from ngpt.training.cost import cost
+    from ngpt.training.distributed import Processes
+    from ngpt.training.examples import Mixture, open_crops, split
+    from ngpt.training.loss import make_loss
+    from ngpt.training.settings import read_settings
+    from ngpt.training.trainer import Trainer, show
 
     settings = read_settings(options.config, options.set)
     if options.dry_run:

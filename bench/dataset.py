@@ -46,7 +46,7 @@ def measure(config, job) -> dict:
     from data_gen.dataset.cameras import View
     from data_gen.dataset.crops import made_scene, make_shard
     from data_gen.render import load_scene, render_stack
-    from ngpt.shards import Shard
+    from ngpt.training.shards import Shard
 
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "shards").mkdir()

@@ -14,15 +14,15 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
-from evaluation.config import scene_name
-from evaluation.results import write_text
-from evaluation.stacks import reference_noise
-from ngpt.display import auto_exposure, to_srgb8
-from ngpt.files import atomic_output
+from ngpt.evaluation.config import scene_name
+from ngpt.evaluation.results import write_text
+from ngpt.evaluation.stacks import reference_noise
+from ngpt.measure.metrics import compare, relative_squared_error
 from ngpt.methods import METHODS, reconstruct
-from ngpt.metrics import compare, relative_squared_error
-from ngpt.png import encode_png
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.report.png import encode_png
 from ngpt.stack import GradientStack
+from ngpt.system.files import atomic_output
 
 METRIC = "relMSE trimmed"
 CROP = 48  # pixels, shown four times as large

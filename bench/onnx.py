@@ -31,8 +31,8 @@ import ngpt
 from bench.common import measure, metadata, save, summary
 from bench.reconstruction import synthetic
 from ngpt.methods import METHODS, WEIGHTS, reconstruct
+from ngpt.network.run_onnx import Network, planes
 from ngpt.repair import repair
-from ngpt.runtime import Network, planes
 from ngpt.stack import GradientStack
 
 SIZES = ("1280x720", "1920x1080")
@@ -76,7 +76,7 @@ def stack_of(width: int, height: int) -> GradientStack:
 
 def half_precision(folder: Path) -> Path | None:
     try:
-        from export.network import network_model
+        from ngpt.export.network import network_model
     except ModuleNotFoundError:
         return None
     path, weights = folder / "half.onnx", WEIGHTS / "ngpt-fast.safetensors"
@@ -109,8 +109,8 @@ def torch_calls(data) -> dict:
         import torch
     except ModuleNotFoundError:
         return {}
-    from ngpt.network.data import layers_of
     from ngpt.network.weights import load_weights
+    from ngpt.training.examples import layers_of
 
     model, _ = load_weights(WEIGHTS / "ngpt-fast.safetensors")
     layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}

@@ -20,12 +20,12 @@ import numpy as np
 from scipy.fft import dctn, idctn
 
 from bench.common import measure, metadata, save
-from ngpt.arrays import by_rows, empty
-from ngpt.controlvariates import cv, wcv
-from ngpt.gradients import adjoint_by_rows, differences, forward_differences
-from ngpt.leastsquares import Equations, sum_of, total_of
-from ngpt.poisson import DEFAULT_ALPHA, l1, l2, least_norms
-from ngpt.weighted import wl2
+from ngpt.classical.arrays import by_rows, empty
+from ngpt.classical.controlvariates import cv, wcv
+from ngpt.classical.gradients import adjoint_by_rows, differences, forward_differences
+from ngpt.classical.leastsquares import Equations, sum_of, total_of
+from ngpt.classical.poisson import DEFAULT_ALPHA, l1, l2, least_norms
+from ngpt.classical.weighted import wl2
 
 SIZES = ("1280x720", "1920x1080")
 

@@ -14,7 +14,7 @@ Rendered are the built-in scenes and each FOLDER/*/scene.xml that is without med
 
 References are rendered for a fixed time, kept in CACHE, and taken from there the next time. A run that was broken off
 goes on where it ended if it is started with the same arguments. Written are bench/results/sampler.json, the table, and
-for each scene named by --maps docs/images/NAME-gradients.png, see evaluation/gradientmap.py.
+for each scene named by --maps docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
 """
 
 import argparse
@@ -29,12 +29,12 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save, summary
-from evaluation.config import scene_name
-from evaluation.gradientmap import variances_of_differences, write_map
-from evaluation.results import write_text
-from evaluation.stacks import reference_noise
+from ngpt.evaluation.config import scene_name
+from ngpt.evaluation.gradientmap import variances_of_differences, write_map
+from ngpt.evaluation.results import write_text
+from ngpt.evaluation.stacks import reference_noise
+from ngpt.measure.metrics import compare
 from ngpt.methods import reconstruct
-from ngpt.metrics import compare
 from ngpt.stack import GradientStack
 
 METHODS = ("l2", "l1", "wcv")
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    from data_gen.builtin import SCENES
+    from data_gen.scenes.builtin import SCENES
 
     args.cache.mkdir(parents=True, exist_ok=True)
     files = [str(path) for path in sorted(args.folder.glob("*/scene.xml"))] if args.folder else []

@@ -5,7 +5,7 @@ import re
 import sys
 from pathlib import Path
 
-from ngpt.console import Console, run_command
+from ngpt.system.console import Console, run_command
 
 
 def part(text: str) -> tuple[int, int]:

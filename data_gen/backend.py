@@ -38,8 +38,8 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         mi.set_variant(name)
         # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
-        for plugin in ("common", "gpt_basic", "gpt"):
-            module = f"data_gen.integrators.{plugin}"
+        for plugin in ("common", "gpt_basic", "gpt.integrator"):
+            module = f"data_gen.samplers.{plugin}"
             if module in sys.modules:
                 importlib.reload(sys.modules[module])
             else:

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.builtin import SCENES
 from data_gen.render import SAMPLERS, choose_sampler, complaint
+from data_gen.scenes.builtin import SCENES
 from ngpt.errors import NgptError
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")

@@ -10,16 +10,16 @@ from pathlib import Path
 
 import mitsuba as mi
 
-import ngpt
-from data_gen.builtin import SCENES
-from data_gen.camera import DEFAULT_MEMORY, CameraSamples, Progress, render_passes
-from data_gen.features import features
 from data_gen.film import GradientFilm
-from data_gen.lights import emission_seen
-from data_gen.spectrum import to_rgb
+from data_gen.paths.camera import DEFAULT_MEMORY, CameraSamples, Progress, render_passes
+from data_gen.paths.features import features
+from data_gen.paths.lights import emission_seen
+from data_gen.paths.spectrum import to_rgb
+from data_gen.scenes.builtin import SCENES
 from ngpt.errors import NgptError
-from ngpt.exr import with_channels
+from ngpt.io.exr import with_channels
 from ngpt.stack import GradientStack
+from ngpt.version import __version__
 
 # Name -> what it renders, as the command line explains it.
 SAMPLERS = {
@@ -152,8 +152,8 @@ def render_stack(
 
     ``spp`` is the number of (base) paths per pixel, ``seconds`` a limit of wall-clock time (one of them may be None),
     ``sampler`` "auto" or one of ``SAMPLERS``, and ``progress`` is called with (samples done, spp) before the first pass
-    and after each; for it, ``memory`` and ``stop`` see ``data_gen.camera.render_passes()``. With ``diagnostics`` the
-    stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels; without
+    and after each; for it, ``memory`` and ``stop`` see ``data_gen.paths.camera.render_passes()``. With ``diagnostics``
+    the stack carries the images of ``data_gen.film.GradientFilm.diagnose()`` as further channels; without
     ``with_features``, which sampler "primal" alone can do without, it holds the primal alone. The scene's
     reconstruction filter is not used: the pixels of a stack, and so their differences, are box-filtered.
 
@@ -175,7 +175,7 @@ def render_stack(
         "ngpt:seconds": time.perf_counter() - start,
         "ngpt:normalSpace": "camera",
         "ngpt:discarded": film.discarded,
-        "software": f"ngpt {ngpt.__version__}, Mitsuba {mi.__version__} {mi.variant()}",
+        "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
     }
     stack = GradientStack(layers, attributes=attributes)
     return with_channels(stack, film.diagnose()) if diagnostics else stack
@@ -206,7 +206,7 @@ def render_film(
     passes: dict | None = None,
     with_features: bool = True,
 ) -> GradientFilm:
-    """Runs the sampler of that name; ``passes`` are options of ``data_gen.camera.render_passes()``."""
+    """Runs the sampler of that name; ``passes`` are options of ``data_gen.paths.camera.render_passes()``."""
     sensor, passes = scene.sensors()[0], passes or {}
     integrator = reference_integrator(scene)
     if sampler == "gpt":

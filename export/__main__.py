@@ -4,9 +4,9 @@ import argparse
 import sys
 from pathlib import Path
 
-from ngpt.console import Console, run_command
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output, check_output
+from ngpt.system.console import Console, run_command
+from ngpt.system.files import atomic_output, check_output
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -14,7 +14,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def run(arguments: list[str] | None) -> int:
-    from ngpt.poisson import DEFAULT_ALPHA
+    from ngpt.classical.poisson import DEFAULT_ALPHA
 
     parser = argparse.ArgumentParser(prog="python -m export", description="Write a reconstruction as an ONNX file.")
     what = parser.add_mutually_exclusive_group()
@@ -44,11 +44,11 @@ def run(arguments: list[str] | None) -> int:
 def write(args: argparse.Namespace) -> list[Path]:
     """Writes what the arguments ask for; returns the files."""
     if not args.weights:
-        from export.poisson import l2_model
+        from ngpt.export.poisson import l2_model
 
         models = {args.output: l2_model(args.alpha)}
     else:
-        from export.network import network_model, statistics_model
+        from ngpt.export.network import network_model, statistics_model
 
         name = args.weights.stem
         models = {args.output: network_model(args.weights, name, args.precision)}
@@ -58,7 +58,7 @@ def write(args: argparse.Namespace) -> list[Path]:
         with atomic_output(path, args.force) as temporary:
             temporary.write_bytes(model.SerializeToString())
     if args.vector:
-        from export.vector import write_vector
+        from ngpt.export.vector import write_vector
 
         write_vector(models[args.output], args.vector, args.force)
     return list(models)

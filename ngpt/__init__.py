@@ -8,12 +8,12 @@ ngpt.write("out.exr", image, like=stack)
 from importlib import import_module
 from typing import TYPE_CHECKING
 
-__version__ = "0.1.0"
+from ngpt.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from ngpt.denoiser import Denoiser
     from ngpt.errors import NgptError
-    from ngpt.exr import read, read_image, write
+    from ngpt.io.exr import read, read_image, write
     from ngpt.merging import merge
     from ngpt.methods import METHODS, Result, denoise, reconstruct
     from ngpt.stack import GradientStack
@@ -35,7 +35,7 @@ __all__ = [
 # Imported when they are asked for. So the commands are at work, and handle what interrupts them, before NumPy and SciPy
 # have been loaded, which comes with this package otherwise.
 _HOMES = {"Denoiser": "denoiser", "GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
-_HOMES |= dict.fromkeys(("read", "read_image", "write"), "exr")
+_HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
 _HOMES |= dict.fromkeys(("METHODS", "Result", "denoise", "reconstruct"), "methods")
 
 

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.exr import pass_through, with_channels
+from ngpt.io.exr import pass_through, with_channels
 from ngpt.stack import GradientStack
 
 # Layers with a variance, and the layers that hold it.

@@ -12,11 +12,13 @@ from typing import Any
 
 import numpy as np
 
-from ngpt import combine, controlvariates, nfor, peers, poisson, runtime, weighted
+from ngpt.classical import controlvariates, poisson, weighted
+from ngpt.classical.variances import auto_alpha
+from ngpt.denoisers import nfor, nlm, oidn
 from ngpt.errors import NgptError
+from ngpt.network import combine, run_onnx
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
-from ngpt.variances import auto_alpha
 
 
 @dataclass(frozen=True)
@@ -113,16 +115,16 @@ def _neural(name: str, also_missing: Callable[[], str] = lambda: "") -> dict[str
             if find_spec("torch") is None or find_spec("safetensors") is None:
                 raise NgptError(f"method '{name}': {path.name} needs PyTorch: pip install 'ngpt-recon[train]'")
             # torch takes seconds to come in.
-            from ngpt.network import inference
+            from ngpt.network import run_torch
 
-            return inference.run(data, path, device)
+            return run_torch.run(data, path, device)
         return _by_onnx(data, path, device, memory)
 
-    return {"run": run, "options": {"weights": "", "device": "auto", "memory": runtime.MEMORY}, "missing": missing}
+    return {"run": run, "options": {"weights": "", "device": "auto", "memory": run_onnx.MEMORY}, "missing": missing}
 
 
 def _by_onnx(data: Repaired, path: Path, device: str, memory: int) -> np.ndarray:
-    network = runtime.Network(path, device)
+    network = run_onnx.Network(path, device)
     layers = {"primal": data.image, **data.features, **data.known_variances()}
     if data.dx is not None:
         layers |= {"dx": data.dx, "dy": data.dy}
@@ -160,29 +162,29 @@ METHODS = {
     "ngpt-combine": Method(
         "OIDN's images and the gradients, weighed and corrected by a small network",
         (*_GRADIENTS, *_FEATURES, *_VARIANCES),
-        **_neural("ngpt-combine", peers.oidn_missing),
+        **_neural("ngpt-combine", oidn.missing),
     ),
     "ngpt-primal": Method(
         "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
         ("primal", *_FEATURES, "primal_var"),
-        **_neural("ngpt-primal", peers.oidn_missing),
+        **_neural("ngpt-primal", oidn.missing),
     ),
     "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
     # Those below see no gradients.
     "nlm": Method(
         "peer: joint non-local means of scikit-image",
         ("primal", "albedo", "normal", "primal_var"),
-        peers.nlm,
+        nlm.nlm,
         {},
-        peers.nlm_missing,
+        nlm.missing,
     ),
     "nfor": Method("peer: first-order regression on features", ("primal", *_FEATURES, "primal_var"), _nfor, {}),
     "oidn": Method(
         "peer: Intel Open Image Denoise",
         ("primal", "albedo", "normal"),
-        peers.oidn,
+        oidn.oidn,
         {"auxiliary": "prefiltered", "quality": "high"},
-        peers.oidn_missing,
+        oidn.missing,
     ),
 }
 

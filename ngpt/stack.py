@@ -2,16 +2,13 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
-
-if TYPE_CHECKING:
-    from ngpt.exr import StackSource
 
 
 @dataclass(eq=False)
@@ -24,7 +21,8 @@ class GradientStack:
     included. The last column of dx and the last row of dy are unused; they are kept as they are.
 
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
-    ``source`` is the file the stack was read from, for what passes through it. ``path`` is for messages.
+    ``source`` is the file the stack was read from (``ngpt.io.exr.StackSource``), for what passes through it.
+    ``path`` is for messages.
 
     Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
     images without pixels, and finite numbers that float32 cannot hold.
@@ -32,7 +30,7 @@ class GradientStack:
 
     layers: dict[str, np.ndarray]
     attributes: dict[str, Any] = field(default_factory=dict)
-    source: "StackSource | None" = None
+    source: Any = None
     path: str = "stack"
 
     def __post_init__(self) -> None:

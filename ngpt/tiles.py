@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ngpt.poisson import DEFAULT_ALPHA, check_alpha, l2
+from ngpt.classical.poisson import DEFAULT_ALPHA, check_alpha, l2
 
 # With the apron on both sides 1024: a good length for the transforms, 70 MB of work space.
 TILE = 880
@@ -31,7 +31,7 @@ def l2_tiled(
     alpha: float = DEFAULT_ALPHA,
     tile: int = TILE,
 ) -> None:
-    """``ngpt.poisson.l2`` of an image of any size in the memory of one tile and its apron.
+    """``ngpt.classical.poisson.l2`` of an image of any size in the memory of one tile and its apron.
 
     ``read(rows, columns)`` returns what l2 takes, (primal, dx, dy) or (primal, dx, dy, trusted), of these slices of the
     image; ``write(rows, columns, image)`` receives the result, every pixel once, from top to bottom. Memory-mapped

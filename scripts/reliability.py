@@ -80,7 +80,7 @@ def main() -> int:
     parser.add_argument("-k", dest="chosen", metavar="EXPRESSION", help="run only these")
     parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help="default: docs/RELIABILITY.md")
     args = parser.parse_args()
-    from ngpt.files import atomic_output
+    from ngpt.system.files import atomic_output
 
     with tempfile.TemporaryDirectory(prefix="ngpt-reliability-") as fresh:
         folder = args.folder or Path(fresh)

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
-from ngpt.gradients import forward_differences
 from ngpt.stack import GradientStack
 
 
@@ -22,6 +22,16 @@ def noisy_stack(rng):
     dx, dy = (g + rng.normal(0, 0.01, g.shape) for g in forward_differences(clean))
     stack = GradientStack.from_arrays(primal=clean + rng.normal(0, 0.1, clean.shape), dx=dx, dy=dy)
     return stack, clean
+
+
+@pytest.fixture
+def one_thread():
+    """PyTorch on one thread: threads that wait for each other are slow where other processes want the cores as well."""
+    torch = pytest.importorskip("torch")
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    yield
+    torch.set_num_threads(before)
 
 
 @pytest.fixture(scope="session")

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ngpt.gradients import forward_differences
+from ngpt.classical.gradients import forward_differences
 from ngpt.stack import GradientStack
 
 

@@ -13,7 +13,7 @@ import pytest
 from full_stack import full_stack
 
 import ngpt
-from ngpt.dataset import read_manifest
+from ngpt.training.dataset import read_manifest
 
 ROOT = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
@@ -128,7 +128,7 @@ class DataGen(Work):
         return [sys.executable, "-m", "data_gen", "--config", "configs/data-tiny.toml", "--out", out]
 
     def results(self, out):
-        from ngpt.shards import Shard
+        from ngpt.training.shards import Shard
 
         seen: dict[str, object] = {}
         for path in visible(out):

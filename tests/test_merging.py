@@ -8,7 +8,7 @@ import pytest
 import ngpt
 from ngpt.cli import main
 from ngpt.errors import NgptError
-from ngpt.exr import pass_through, with_channels
+from ngpt.io.exr import pass_through, with_channels
 from ngpt.merging import merge
 from ngpt.stack import GradientStack
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import ngpt
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
-from ngpt.gradients import forward_differences
 from ngpt.methods import METHODS, reconstruct
 from ngpt.repair import repair
 from ngpt.stack import GradientStack

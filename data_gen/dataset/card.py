@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.console import Console
-from ngpt.dataset import Dataset, summary
-from ngpt.display import auto_exposure, to_srgb8
-from ngpt.files import atomic_output
-from ngpt.png import encode_png
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.report.png import encode_png
+from ngpt.system.console import Console
+from ngpt.system.files import atomic_output
+from ngpt.training.dataset import Dataset, summary
 
 CELLS = 24  # crops on the contact sheet, evenly chosen
 COLUMNS = 4  # each shows its noisiest input and its reference

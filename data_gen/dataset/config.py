@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
-from ngpt.records import Shape, check, read_toml
+from ngpt.system.records import Shape, check, read_toml
 
 
 @dataclass(frozen=True)

@@ -9,13 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-import ngpt
 from data_gen.backend import use_variant
 from data_gen.dataset.config import Config, Job
 from ngpt.errors import NgptError
+from ngpt.methods import denoise
 from ngpt.repair import repair
-from ngpt.shards import CropData, write_shard
 from ngpt.stack import GradientStack
+from ngpt.training.shards import CropData, write_shard
+from ngpt.version import __version__
 
 # Views that turn out to be black are replaced this often.
 ATTEMPTS = 6
@@ -37,7 +38,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
 
     crops: list[CropData] = []
     record: dict = {"scene": job.scene, "batch": job.batch, "crops": [], "failures": []}
-    record["versions"] = {"ngpt": ngpt.__version__, "mitsuba": mi.__version__, "variant": variant}
+    record["versions"] = {"ngpt": __version__, "mitsuba": mi.__version__, "variant": variant}
     start = time.perf_counter()
     try:
         with tempfile.TemporaryDirectory(prefix="ngpt-scene-") as temporary:
@@ -80,7 +81,7 @@ def scene_seed(config: Config, name: str) -> tuple[int, int]:
 
 
 def made_scene(config: Config, name: str, folder: Path) -> Path:
-    from data_gen.dataset.scenes import make_scene
+    from data_gen.scenes.procedural.scenes import make_scene
 
     return make_scene(scene_seed(config, name), folder)
 
@@ -115,7 +116,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
     converged = render_stack(around.scene, config.reference_spp, seeds[-1])
-    reference = ngpt.denoise(converged, method=config.reference_method)
+    reference = denoise(converged, method=config.reference_method)
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
     direct = np.nan_to_num(converged["direct"], posinf=0)

@@ -13,11 +13,11 @@ from pathlib import Path
 
 from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
-from ngpt.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output, exclusive
-from ngpt.shards import Shard
-from ngpt.workers import end_with_parent
+from ngpt.system.files import atomic_output, exclusive
+from ngpt.system.workers import end_with_parent
+from ngpt.training.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
+from ngpt.training.shards import Shard
 
 
 class Serial(Executor):

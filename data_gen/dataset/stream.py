@@ -18,9 +18,9 @@ from pathlib import Path
 
 from data_gen.dataset.config import Config, made_name
 from data_gen.dataset.crops import make_shard
-from ngpt.dataset import Crop
 from ngpt.errors import NgptError
-from ngpt.shards import Shard
+from ngpt.training.dataset import Crop
+from ngpt.training.shards import Shard
 
 
 class Stream:

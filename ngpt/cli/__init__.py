@@ -9,8 +9,8 @@ import sys
 from importlib import import_module
 from typing import NoReturn
 
-import ngpt
-from ngpt.console import Console, run_command
+from ngpt.system.console import Console, run_command
+from ngpt.version import __version__
 
 VERBS = {
     "demo": "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
@@ -38,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(arguments: list[str] | None) -> int:
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
-    parser.add_argument("--version", action="version", version=f"ngpt {ngpt.__version__}")
+    parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     verbs = parser.add_subparsers(dest="verb", required=True, metavar="VERB", parser_class=_Parser)
     for verb, summary in VERBS.items():
         subparser = verbs.add_parser(verb, help=summary, description=f"{summary[0].upper()}{summary[1:]}.")

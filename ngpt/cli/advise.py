@@ -4,9 +4,9 @@ import argparse
 import time
 from dataclasses import asdict
 
-from ngpt.advice import advise, describe, read_table
 from ngpt.cli.arguments import add_json, assignment, duration, natural, positive, print_json, size
-from ngpt.console import Console
+from ngpt.measure.advice import advise, describe, read_table
+from ngpt.system.console import Console
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,16 +8,16 @@ from pathlib import Path
 
 import numpy as np
 
-import ngpt
 from ngpt.cli.arguments import add_force, positive, size
-from ngpt.console import Console
 from ngpt.errors import NgptError
-from ngpt.exr import write
-from ngpt.files import check_output
+from ngpt.io.exr import write
+from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, reconstruct
-from ngpt.metrics import compare
-from ngpt.report import Entry, Scene, median, write_report
+from ngpt.report.page import Entry, Scene, median, write_report
 from ngpt.stack import GradientStack
+from ngpt.system.console import Console
+from ngpt.system.files import check_output
+from ngpt.version import __version__
 
 TABLE_METRICS = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR")
 LAYER_VIEWS = ("dx", "dy", "albedo", "normal", "depth")
@@ -43,7 +43,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     use_variant(args.variant or DEFAULT_VARIANT)
     import mitsuba as mi
 
-    from data_gen.builtin import SCENES
+    from data_gen.scenes.builtin import SCENES
 
     names = args.scene or list(SCENES)
     for name in names:
@@ -63,7 +63,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         + [word for name in args.scene or [] for word in ("--scene", name)]
     )
     footer = {
-        "ngpt": ngpt.__version__,
+        "ngpt": __version__,
         "Mitsuba": f"{mi.__version__} ({mi.variant()})",
         "NumPy": np.__version__,
         "Python": platform.python_version(),

@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import RESULT_SUFFIX, add_force, add_json, add_layers, add_untrusted, print_json, stack_files
-from ngpt.console import Console
 from ngpt.errors import NgptError
-from ngpt.exr import read, read_image, write
-from ngpt.files import check_output
+from ngpt.io.exr import read, read_image, write
+from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, reconstruct
-from ngpt.metrics import compare
-from ngpt.runtime import MEMORY
+from ngpt.network.run_onnx import MEMORY
+from ngpt.system.console import Console
+from ngpt.system.files import check_output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -3,9 +3,9 @@
 import argparse
 
 from ngpt.cli.arguments import add_json, print_json
-from ngpt.console import Console
-from ngpt.exr import read_image
-from ngpt.metrics import compare
+from ngpt.io.exr import read_image
+from ngpt.measure.metrics import compare
+from ngpt.system.console import Console
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -5,16 +5,17 @@ from pathlib import Path
 
 import numpy as np
 
-import ngpt
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
-from ngpt.console import Console
-from ngpt.dataset import summary
 from ngpt.errors import NgptError
-from ngpt.exr import pass_through, read
-from ngpt.layers import LAYERS, format_aliases
+from ngpt.io.aliases import format_aliases
+from ngpt.io.exr import pass_through, read
+from ngpt.layers import LAYERS
 from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
+from ngpt.system.console import Console
+from ngpt.training.dataset import summary
+from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -49,15 +50,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def overview() -> dict:
     """What this installation offers."""
     report = {
-        "version": ngpt.__version__,
+        "version": __version__,
         "methods": {name: method.missing() or method.summary for name, method in METHODS.items()},
     }
     try:
         use_renderer()
     except NgptError as error:
         return report | {"rendering": f"not available: {error}"}
-    from data_gen.builtin import SCENES
     from data_gen.render import SAMPLERS
+    from data_gen.scenes.builtin import SCENES
 
     scenes = {name: (scene.__doc__ or "").split("\n")[0] for name, scene in SCENES.items()}
     return report | {"samplers": SAMPLERS, "built-in scenes": scenes}

@@ -3,10 +3,10 @@
 import argparse
 
 from ngpt.cli.arguments import add_force, add_json, print_json
-from ngpt.console import Console
-from ngpt.exr import read, write
-from ngpt.files import check_output
+from ngpt.io.exr import read, write
 from ngpt.merging import merge
+from ngpt.system.console import Console
+from ngpt.system.files import check_output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

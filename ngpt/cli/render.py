@@ -7,10 +7,10 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, positive, print_json, size
-from ngpt.console import Console
 from ngpt.errors import NgptError
-from ngpt.exr import write
-from ngpt.files import check_output
+from ngpt.io.exr import write
+from ngpt.system.console import Console
+from ngpt.system.files import check_output
 
 DEFAULT_SPP = 32
 
@@ -55,7 +55,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.camera import DEFAULT_MEMORY
+    from data_gen.paths.camera import DEFAULT_MEMORY
     from data_gen.render import check_options, load_scene, render_stack
 
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)

@@ -1,1 +1,1 @@
-"""The neural reconstruction: network, training and inference in PyTorch. ``import ngpt`` imports none of it."""
+"""What runs a network: inputs, shape, weights, in ONNX Runtime and in PyTorch. ``import ngpt`` imports no torch."""

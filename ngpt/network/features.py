@@ -7,7 +7,7 @@
     depth        1   over the image's largest, [0, 1]; 0 where the path escapes
     base         3   as primal: a classical reconstruction the network starts from
     denoised, denoised_base
-                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.combine``
+                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.network.combine``
     primal_se, dx_se, dy_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
@@ -32,8 +32,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ngpt import combine
-from ngpt.exposure import BLOCK, KEY
+from ngpt.network import combine
+from ngpt.network.exposure import BLOCK, KEY
 from ngpt.network.transfer import signed_log
 
 CHANNELS = {

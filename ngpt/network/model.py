@@ -98,7 +98,7 @@ class ModelConfig:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.data``)."""
+        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.training.examples``)."""
         return features.sources(self.inputs)
 
     @property

@@ -12,9 +12,9 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.records import parse_json
+from ngpt.system.files import atomic_output
+from ngpt.system.records import parse_json
 
 FORMAT = 1
 _TYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)

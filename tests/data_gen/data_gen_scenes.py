@@ -5,7 +5,7 @@ def glass():
     """Smooth and rough glass under a lamp large enough to be found through them."""
     import mitsuba as mi
 
-    from data_gen.builtin import _camera, _diffuse, _light, _room, _sphere
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _room, _sphere
 
     return {
         "type": "scene",
@@ -25,7 +25,7 @@ def glass():
 
 def fog():
     """A ball in a scattering medium that fills the view."""
-    from data_gen.builtin import _camera, _diffuse, _light, _sphere
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere
 
     return {
         "type": "scene",
@@ -54,7 +54,7 @@ def within_fog():
 
 def hidden_lamp():
     """The diffuse room with a lamp that the camera does not see."""
-    from data_gen.builtin import diffuse
+    from data_gen.scenes.builtin import diffuse
 
     scene = diffuse()
     scene["integrator"]["hide_emitters"] = True
@@ -63,7 +63,7 @@ def hidden_lamp():
 
 def one_sided(side):
     """A scene without symmetry, of which ``side`` = -1 is the mirror image of ``side`` = 1."""
-    from data_gen.builtin import _camera, _diffuse, _light, _sphere, _wall
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
 
     return {
         "type": "scene",
@@ -78,7 +78,7 @@ def one_sided(side):
 
 def furnace():
     """The inside of a ball whose wall glows and reflects half of what it gets: radiance is 1 everywhere."""
-    from data_gen.builtin import _camera, _diffuse, _rgb, _sphere
+    from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
 
     wall = _sphere([0, 0, 0], 2, _diffuse(0.5, 0.5, 0.5)) | {"flip_normals": True}
     return {
@@ -93,7 +93,7 @@ def furnace():
 
 def polished(alpha):
     """A metal floor of the given roughness beside a lacquered ball, under a lamp of radiance 1."""
-    from data_gen.builtin import _camera, _light, _sphere, _wall
+    from data_gen.scenes.builtin import _camera, _light, _sphere, _wall
 
     return {
         "type": "scene",
@@ -116,7 +116,7 @@ def plenty():
     import mitsuba as mi
     import numpy as np
 
-    from data_gen.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _transform, _wall
+    from data_gen.scenes.builtin import _box, _camera, _diffuse, _light, _rgb, _room, _sphere, _transform, _wall
 
     tiles = {"type": "checkerboard", "to_uv": _transform().scale([3, 3, 1])}
     waves = np.sin(np.linspace(0, 12, 32, dtype=np.float32)) * np.ones((32, 1), np.float32)

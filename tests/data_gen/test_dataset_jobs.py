@@ -15,16 +15,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ngpt.dataset import Dataset, problems, read_manifest
 from ngpt.errors import NgptError
+from ngpt.training.dataset import Dataset, problems, read_manifest
 
 pytest.importorskip("safetensors")
 pytest.importorskip("mitsuba")
 
 from data_gen.dataset import crops, jobs
 from data_gen.dataset.config import Config, Files, read_config
-from data_gen.dataset.scenes import make_scene
-from ngpt.shards import write_shard
+from data_gen.scenes.procedural.scenes import make_scene
+from ngpt.training.shards import write_shard
 
 ROOT = Path(__file__).parents[2]
 TINY = replace(read_config(ROOT / "configs" / "data-tiny.toml"))

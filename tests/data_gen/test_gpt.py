@@ -42,7 +42,7 @@ def test_unbiased_with_a_large_budget(renderer, scene):
 @pytest.mark.parametrize("threshold", [0.0, 10.0])
 def test_unbiased_whatever_is_connectable(renderer, threshold, monkeypatch):
     """All that is not a mirror, and nothing at all, which leaves random sequence replay."""
-    from data_gen.integrators import gpt
+    from data_gen.samplers.gpt import integrator as gpt
 
     monkeypatch.setattr(gpt, "ROUGHNESS_THRESHOLD", threshold)
     scene = load(renderer, plenty, (32, 32))
@@ -79,8 +79,8 @@ def test_agrees_with_the_teaching_sampler(renderer):
 def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     import drjit as dr
 
-    from data_gen import shift
-    from data_gen.integrators import gpt
+    from data_gen.paths import shift
+    from data_gen.samplers.gpt import integrator as gpt
 
     module = gpt if function == "SHIFTS" else shift
     scene = load(renderer, "diffuse", (32, 32))
@@ -143,7 +143,7 @@ def escapes_from(reconnects, replay_inverts):
 def test_the_shift_of_the_shift_is_the_path(renderer):
     import mitsuba as mi
 
-    from data_gen.shift import reconnects, replay_inverts
+    from data_gen.paths.shift import reconnects, replay_inverts
 
     assert escapes_from(reconnects, replay_inverts) == 0
     # Without the test of the reverse shift; without the kind of event in it; with a rule that is not symmetric
@@ -164,7 +164,7 @@ def random_geometry(mi, n=4096):
 def test_jacobian_of_the_inverse_is_the_inverse(renderer):
     import drjit as dr
 
-    from data_gen.shift import reconnection_jacobian
+    from data_gen.paths.shift import reconnection_jacobian
 
     base, offset, target = random_geometry(renderer)
     normal = renderer.Normal3f(0, 0, 1)
@@ -178,7 +178,7 @@ def test_jacobian_is_that_of_the_shift(renderer):
     """Against finite differences: a little triangle about the target, as solid angles seen from either side."""
     import drjit as dr
 
-    from data_gen.shift import reconnection_jacobian
+    from data_gen.paths.shift import reconnection_jacobian
 
     base, offset, target = random_geometry(renderer)
 
@@ -197,7 +197,7 @@ def test_jacobian_is_that_of_the_shift(renderer):
 def test_weights_of_a_pair_sum_to_one(renderer):
     import drjit as dr
 
-    from data_gen.shift import gradient_weight, mis_weight
+    from data_gen.paths.shift import gradient_weight, mis_weight
 
     r = renderer.Float([1e-30, 1e-3, 1, 7, 1e30])
     assert dr.allclose(gradient_weight(r, True) + gradient_weight(1 / r, True), 2)
@@ -208,7 +208,7 @@ def test_weights_of_a_pair_sum_to_one(renderer):
 
 
 def test_connectable_materials(renderer):
-    from data_gen.vertex import Materials, smallest_roughness
+    from data_gen.paths.vertex import Materials, smallest_roughness
 
     rough = {"type": "roughconductor", "alpha": 0.3}
     smooth = {"type": "roughplastic", "alpha": 0.01}

@@ -10,7 +10,7 @@ from ngpt.testing import z_test
 
 
 def make_plan(scene, **options):
-    from data_gen.integrators import plan
+    from data_gen.samplers.gpt import plan
 
     defaults = {"roughness_threshold": 0.05, "max_depth": 8, "rr_depth": 5, "shift": "replay"}
     return plan.make_plan(scene, **defaults | {"hide_emitters": False} | options)
@@ -59,7 +59,7 @@ def test_no_light_at_all(renderer):
 @pytest.mark.parametrize(("name", "flag"), [("diffuse", "replays"), ("glossy", "shared"), ("environment", "shared")])
 def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
     """Code that a scene does not need, put in by force."""
-    from data_gen.integrators import gpt
+    from data_gen.samplers.gpt import integrator as gpt
 
     scene = load(renderer, name, (32, 32))
     lean = render(scene)
@@ -82,7 +82,7 @@ def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
 
 @pytest.mark.parametrize("scene", [plenty, glass, "environment"])
 def test_half_vector_copy_is_unbiased(renderer, scene, monkeypatch):
-    from data_gen import shift
+    from data_gen.paths import shift
     from data_gen.render import gpt_integrator
 
     scene_has_frosted_glass = scene is glass
@@ -124,8 +124,8 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     """Taken over from another vertex, an emitter has the direction, density and weight that it has here."""
     import drjit as dr
 
-    from data_gen.lights import Lights, emission, replay_light, sample_light, shared_emission
-    from data_gen.vertex import seen_from
+    from data_gen.paths.lights import Lights, emission, replay_light, sample_light, shared_emission
+    from data_gen.paths.vertex import seen_from
 
     mi, lamp = renderer, dict(LAMPS[name])
     if name == "envmap":

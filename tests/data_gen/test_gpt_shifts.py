@@ -61,8 +61,8 @@ class Steps:
     def __init__(self, mi, shift, threshold=0.05):
         import drjit as dr
 
-        from data_gen.integrators import offset_path
-        from data_gen.integrators.plan import make_plan
+        from data_gen.samplers.gpt import offset_path
+        from data_gen.samplers.gpt.plan import make_plan
 
         self.mi, self.dr = mi, dr
         self.scene = mi.load_dict(museum())
@@ -87,7 +87,7 @@ class Steps:
         return mi.Ray3f(origin, self.dr.normalize(aim - origin))
 
     def base_step(self, x):
-        from data_gen.integrators.base_path import base_step
+        from data_gen.samplers.gpt.base_path import base_step
 
         mi, β = self.mi, self.mi.Spectrum(1)
         step, _ = base_step(self.scene, self.plan, self.u.clone(), x, β, mi.Float(1), mi.UInt32(1), mi.Bool(True), [])
@@ -95,7 +95,7 @@ class Steps:
 
     def offset_at(self, ray):
         """An offset path that has come along ``ray``."""
-        from data_gen.integrators.offset_path import start
+        from data_gen.samplers.gpt.offset_path import start
 
         mi = self.mi
         x = self.dr.zeros(mi.SurfaceInteraction3f)
@@ -107,8 +107,8 @@ class Steps:
 
     def reverse_step(self):
         """The step of the offset path, as if it had been the base path's."""
-        from data_gen.shift import reconnects
-        from data_gen.vertex import SMOOTH, evaluate, seen_from
+        from data_gen.paths.shift import reconnects
+        from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 
         mi, dr, y, step, there = self.mi, self.dr, self.y, self.step, self.there
         bsdf = y.bsdf()
@@ -183,7 +183,7 @@ def round_trips(steps):
 
 
 def mutants_of_rules(mi, dr):
-    """Rules of data_gen.shift, each replaced by one that is wrong."""
+    """Rules of data_gen.paths.shift, each replaced by one that is wrong."""
     return [
         # The reverse shift would reconnect.
         ("replay_inverts", lambda *_: mi.Bool(True)),
@@ -196,7 +196,7 @@ def mutants_of_rules(mi, dr):
 def test_round_trips_see_wrong_rules(renderer, monkeypatch):
     import drjit as dr
 
-    from data_gen import shift
+    from data_gen.paths import shift
 
     for name, mutant in mutants_of_rules(renderer, dr):
         with monkeypatch.context() as patch:
@@ -219,7 +219,7 @@ def test_half_vector_copy_is_an_involution_with_its_jacobian(renderer, above, η
     """Reflection, transmission through a thin sheet, and refraction into and out of glass."""
     import drjit as dr
 
-    from data_gen.shift import copy_half_vector
+    from data_gen.paths.shift import copy_half_vector
 
     mi, n = renderer, 1 << 14
     wi, wi_offset = directions(mi, dr, n, 1, True), directions(mi, dr, n, 2, True)
@@ -249,8 +249,8 @@ def test_a_mirror_sampled_at_the_joined_vertex_rejects_the_shift(renderer):
     """Lacquer mirrors as well: an offset path that has just joined it must not follow the mirrored base path."""
     import drjit as dr
 
-    from data_gen.integrators.offset_path import step_joined
-    from data_gen.vertex import DELTA, SMOOTH
+    from data_gen.paths.vertex import DELTA, SMOOTH
+    from data_gen.samplers.gpt.offset_path import step_joined
 
     steps = Steps(renderer, "replay")
     other = steps.dr.normalize(steps.step.x.p - renderer.Point3f(3, 3, 20))

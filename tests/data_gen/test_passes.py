@@ -19,7 +19,7 @@ def same(a, b):
     ("sampler", "size"), [("gpt", (16, 12)), ("gpt", (7, 5)), ("gpt-basic", (7, 5)), ("primal", (16, 12))]
 )
 def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, sampler, size):
-    from data_gen import camera
+    from data_gen.paths import camera
     from data_gen.render import render_stack
 
     scene = load(renderer, "glossy", size)
@@ -36,7 +36,7 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeyp
 
 
 def test_large_images_with_small_blocks(renderer, monkeypatch):
-    from data_gen import camera
+    from data_gen.paths import camera
     from data_gen.render import render_stack
 
     scene = load(renderer, "glossy", (33, 21))
@@ -48,8 +48,8 @@ def test_large_images_with_small_blocks(renderer, monkeypatch):
 
 
 def test_passes_do_not_move_blocks_within_packets(renderer):
-    from data_gen.camera import blocks_within
     from data_gen.film import GradientFilm
+    from data_gen.paths.camera import blocks_within
 
     assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
     # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.

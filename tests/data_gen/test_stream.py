@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.shards import CropData, write_shard
 from ngpt.stack import GradientStack
+from ngpt.training.shards import CropData, write_shard
 
 pytest.importorskip("safetensors")
 pytest.importorskip("mitsuba")

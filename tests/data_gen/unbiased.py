@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ngpt.gradients import forward_differences
+from ngpt.classical.gradients import forward_differences
 from ngpt.testing import z_test
 
 
 def load(mi, scene, size):
     """A built-in scene by name, or one that a function describes, at (width, height) pixels."""
-    from data_gen.builtin import SCENES
     from data_gen.render import set_film_size
+    from data_gen.scenes.builtin import SCENES
 
     scene = mi.load_dict(SCENES[scene]() if isinstance(scene, str) else scene())
     set_film_size(scene, size)

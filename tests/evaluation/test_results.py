@@ -4,11 +4,11 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from evaluation.axes import Axes, ticks
-from evaluation.frontier import Point, draw, pareto
-from evaluation.results import as_csv, summarised
-from evaluation.stacks import content_hash
-from evaluation.tables import tables
+from ngpt.evaluation.axes import Axes, ticks
+from ngpt.evaluation.frontier import Point, draw, pareto
+from ngpt.evaluation.results import as_csv, summarised
+from ngpt.evaluation.stacks import content_hash
+from ngpt.evaluation.tables import tables
 
 
 def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:

@@ -10,15 +10,15 @@ import pytest
 
 import ngpt
 from eval import main as command
-from evaluation import cells
-from evaluation.config import read_config
-from evaluation.run import evaluate, picture_path
-from evaluation.stability import flicker_and_bias, rolling_shutter, study
-from ngpt.console import Console
+from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
-from ngpt.exr import read_image
-from ngpt.gradients import forward_differences
+from ngpt.evaluation import cells
+from ngpt.evaluation.config import read_config
+from ngpt.evaluation.run import evaluate, picture_path
+from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
+from ngpt.io.exr import read_image
 from ngpt.stack import GradientStack
+from ngpt.system.console import Console
 
 QUIET = Console(quiet=True)
 CONFIG = """

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 import OpenEXR
 import pytest
+from browser import Session
 from exr_files import noise, same_bits, window, write_raw
-from test_report import Session
 
 import ngpt
 

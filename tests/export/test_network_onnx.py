@@ -17,12 +17,12 @@ from full_stack import full_layers
 from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
-from export.network import network_model, overlap, statistics_model
-from export.vector import example_layers, quiet
-from ngpt import combine
 from ngpt.errors import NgptError
-from ngpt.exposure import statistics
+from ngpt.export.network import network_model, overlap, statistics_model
+from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.network import combine
+from ngpt.network.exposure import statistics
 from ngpt.network.features import SOURCES, exposure
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.weights import load_weights, save_weights

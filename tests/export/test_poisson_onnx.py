@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ngpt.poisson import l2
+from ngpt.classical.poisson import l2
 
 pytest.importorskip("onnx")
 ort = pytest.importorskip("onnxruntime")
@@ -11,7 +11,7 @@ ort = pytest.importorskip("onnxruntime")
 
 @pytest.fixture(scope="module")
 def session():
-    from export.poisson import l2_model
+    from ngpt.export.poisson import l2_model
 
     return lambda alpha: ort.InferenceSession(l2_model(alpha).SerializeToString(), providers=["CPUExecutionProvider"])
 
@@ -34,7 +34,7 @@ def test_one_file_for_every_size(session, rng, alpha):
 
 
 def test_metadata_and_plain_operators(session):
-    from export.poisson import l2_model
+    from ngpt.export.poisson import l2_model
 
     metadata = session(0.2).get_modelmeta().custom_metadata_map
     assert metadata["ngpt.method"] == "l2" and float(metadata["ngpt.alpha"]) == 0.2

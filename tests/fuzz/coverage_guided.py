@@ -14,11 +14,13 @@ from pathlib import Path
 
 import atheris
 
-with atheris.instrument_imports(include=["ngpt.exrheader", "ngpt.records", "ngpt.dataset", "ngpt.network.settings"]):
-    from ngpt.dataset import read_manifest
+with atheris.instrument_imports(
+    include=["ngpt.io", "ngpt.system.records", "ngpt.training.dataset", "ngpt.training.settings"]
+):
     from ngpt.errors import NgptError
-    from ngpt.exrheader import read_headers
-    from ngpt.network.settings import read_settings
+    from ngpt.io.header import read_headers
+    from ngpt.training.dataset import read_manifest
+    from ngpt.training.settings import read_settings
 
 from data_mutations import to_json
 from exr_mutations import seeds

@@ -1,6 +1,6 @@
 """OpenEXR files taken apart into what they are made of, and put together again, whole or broken.
 
-Written from the format's description (openexr.com, "OpenEXR File Layout") and not from ngpt.exrheader, which it tests.
+Written from the format's description (openexr.com, "OpenEXR File Layout") and not from ngpt.io.header, which it tests.
 """
 
 import struct

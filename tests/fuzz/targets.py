@@ -20,7 +20,7 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.exr import read, write
+from ngpt.io.exr import read, write
 from ngpt.methods import WEIGHTS, reconstruct
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
@@ -43,8 +43,8 @@ def _dataset() -> tuple[dict, bytes]:
     """A manifest and the shard it lists."""
     import tempfile
 
-    from ngpt.dataset import FORMAT, VERSION, checksum
-    from ngpt.shards import CropData, write_shard
+    from ngpt.training.dataset import FORMAT, VERSION, checksum
+    from ngpt.training.shards import CropData, write_shard
 
     stack = full_stack(8, 8)
     stack = stack.replace(direct=np.zeros_like(stack["primal"]))
@@ -60,7 +60,7 @@ def _dataset() -> tuple[dict, bytes]:
 
 def _read_all(folder: Path) -> None:
     """What training and `ngpt info` do with a dataset."""
-    from ngpt.dataset import Dataset, problems, summary
+    from ngpt.training.dataset import Dataset, problems, summary
 
     data = Dataset(folder)
     for crop in data:
@@ -83,7 +83,7 @@ def manifest(number: int, folder: Path) -> None:
 
 def shard(number: int, folder: Path) -> None:
     """With the checksum of the broken shard in the manifest, so that it is not refused for that alone."""
-    from ngpt.dataset import checksum
+    from ngpt.training.dataset import checksum
 
     value, data = _dataset()
     (folder / "shards").mkdir(exist_ok=True)
@@ -125,8 +125,8 @@ class _Crop:
 def _trainer(folder: Path):
     import torch
 
-    from ngpt.network.settings import from_dict
-    from ngpt.network.trainer import Trainer
+    from ngpt.training.settings import from_dict
+    from ngpt.training.trainer import Trainer
 
     torch.set_num_threads(1)
 
@@ -154,7 +154,7 @@ def checkpoint(number: int, folder: Path) -> None:
 def settings(number: int, folder: Path) -> None:
     """Of training and of data generation."""
     from data_gen.dataset.config import read_config
-    from ngpt.network.settings import read_settings
+    from ngpt.training.settings import read_settings
 
     rng = random.Random(number)
     name = rng.choice(("fast.toml", "data-cpu.toml", "paper.toml"))

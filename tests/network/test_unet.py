@@ -7,11 +7,11 @@ torch = pytest.importorskip("torch")
 
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import features, padding  # noqa: E402
-from ngpt.network.cost import per_pixel  # noqa: E402
-from ngpt.network.inference import reconstruct  # noqa: E402
 from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
+from ngpt.network.run_torch import reconstruct  # noqa: E402
 from ngpt.network.transfer import signed_log  # noqa: E402
 from ngpt.network.unet import Convolution, DenseUNet, PlainUNet  # noqa: E402
+from ngpt.training.cost import per_pixel  # noqa: E402
 
 NGPT = ("primal", "dx", "dy", "albedo", "normal", "depth")
 PAPER = {"network": "dense", "channels": (40, 80, 80, 80), "units": (4, 3, 2, 2)}

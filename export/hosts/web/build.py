@@ -16,7 +16,7 @@ from pathlib import Path
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.files import atomic_output
+from ngpt.system.files import atomic_output
 
 HERE = Path(__file__).parent
 MODEL = Path(ngpt.__file__).parent / "weights" / "ngpt-fast.onnx"

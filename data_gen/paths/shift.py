@@ -1,0 +1,112 @@
+"""Shift mappings of gradient-domain path tracing, one vertex at a time, as pure functions.
+
+A shift takes a base path through one pixel to an offset path through its neighbour. Vertex by vertex it does one of
+four things (survey, sections 3.1 to 3.3):
+
+    reconnect   go straight to the next vertex of the base path, which both paths share from then on
+    replay      sample the next direction from the same random numbers
+    copy        take the direction that has the same half-vector, in the shading frame
+    reject      give up: no offset path corresponds to this base path
+
+Gradients are unbiased if the shift is an involution, T(T(x)) = x: shifting the offset path back must give the base
+path, with the inverse Jacobian, or be rejected from either side. So each rule below is symmetric, or comes with the
+test of what the reverse shift would have done.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.vertex import SMOOTH
+
+
+def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bool) -> mi.Bool:
+    """Whether the offset path goes to the base path's next vertex.
+
+    ``kind`` is the kind of event by which the base path left its vertex; the others say which vertices are connectable,
+    an escape to the environment being so (Kettunen et al. 2015, section 5.2).
+    """
+    return (kind == SMOOTH) & base & base_next & offset
+
+
+def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool, base: mi.Bool) -> mi.Bool:
+    """Whether the replay of an event would be undone by the reverse shift.
+
+    It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else
+    it replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
+    """
+    return ~reconnects(offset_kind, offset, offset_next, base)
+
+
+def keeps_joined(kind: mi.UInt32) -> mi.Bool:
+    """Whether a path that has come to the shared vertex from elsewhere may leave it as its companion does.
+
+    A mirror or a hole, unlike a smooth event, sends light from elsewhere elsewhere. From either side the shift is
+    rejected then: the mirror that one path has sampled, the other cannot have sampled in the same direction.
+    """
+    return kind == SMOOTH
+
+
+def reconnection_jacobian(base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f) -> mi.Float:
+    """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``.
+
+    (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3).
+    """
+    to_base, to_offset = base - target, offset - target
+    near, far = dr.squared_norm(to_base), dr.squared_norm(to_offset)
+    # One factor is a ratio of cosines, the other of squared distances: r³ would leave float32 before they do.
+    cosines = dr.abs(dr.dot(normal, to_offset) / dr.dot(normal, to_base)) * dr.sqrt(near / far)
+    return cosines * (near / far)
+
+
+def copy_half_vector(
+    wi: mi.Vector3f, wo: mi.Vector3f, η: mi.Float, wi_offset: mi.Vector3f, same: mi.Bool
+) -> tuple[mi.Vector3f, mi.Float, mi.Bool]:
+    """The direction that has, with ``wi_offset``, the half-vector of ``wi`` and ``wo``; dω'/dω; whether it exists.
+
+    Directions are local to the shading frame of either vertex and lead away from it; ``η`` is the relative index of
+    refraction along ``wo``. A refraction is copied only to the ``same`` material from the same side, since the reverse
+    shift must know η; one without bending (thin sheets) is copied as a mirrored reflection. The base vertex must not be
+    left by a Dirac delta. [Kettunen et al. 2015, supplement; Walter et al. 2007, eq. 13-17, 40]
+    """
+    refracts = wi.z * wo.z < 0
+    thin = refracts & (η == 1)
+    bends = refracts & ~thin
+    above = mi.Vector3f(wo.x, wo.y, dr.select(thin, -wo.z, wo.z))
+    scale = dr.select(bends, η, 1)
+    h = wi + scale * above
+    length2 = dr.squared_norm(h)
+    h = h * dr.rsqrt(length2)
+
+    # Reflection about h, of which either sign will do
+    c = dr.dot(wi_offset, h)
+    mirrored = 2 * c * h - wi_offset
+    # Refraction: wi' + η wo' is to be parallel to h.
+    cos2 = 1 - (1 - dr.square(c)) / dr.square(scale)
+    bent = (c * h - wi_offset) / scale - dr.mulsign(dr.safe_sqrt(cos2), c) * h
+    wo_offset = dr.select(bends, bent, mirrored)
+
+    length2_offset = dr.squared_norm(wi_offset + scale * wo_offset)
+    cosines = dr.abs(dr.dot(wo_offset, h) / dr.dot(above, h))
+    J = dr.select(bends, length2_offset / length2 / cosines, cosines)
+    wo_offset.z = dr.select(thin, -wo_offset.z, wo_offset.z)
+    exists = ((wi_offset.z * wo_offset.z < 0) == refracts) & (~refracts | (same & (wi.z * wi_offset.z > 0)))
+    # What is no refraction about h to begin with has no inverse.
+    exists &= (~bends | ((cos2 > 0) & (dr.dot(wi, h) * dr.dot(wo, h) < 0))) & dr.isfinite(J) & (J > 0)
+    return dr.select(exists, wo_offset, mi.Vector3f(0, 0, 1)), dr.select(exists, J, 0), exists
+
+
+def mis_weight(chosen: mi.Float, other: mi.Float) -> mi.Float:
+    """Power heuristic of two techniques' densities by their ratio: squares of densities would leave float32."""
+    return dr.select(chosen > 0, dr.rcp(1 + dr.square(other / chosen)), 0)
+
+
+def gradient_weight(r: mi.Float, good: mi.Bool) -> mi.Float:
+    """2 w, twice the weight with which base path x is responsible for the pair (x, T(x)).
+
+    ``r`` = p(T(x)) |J| / p(x). Either path of a pair may be the one that was sampled, so the balance heuristic gives it
+    w = 1 / (1 + r), and its mirror image the rest (survey, eq. 16-17). A rejected shift has no mirror image: w = 1. The
+    film averages the two directions of a difference, hence twice.
+    """
+    return dr.select(good, 2 / (1 + r), 2)

@@ -1,0 +1,1 @@
+"""The samplers: what renders the layers of a gradient stack."""

@@ -1,0 +1,37 @@
+"""What our integrators share as Mitsuba plugins."""
+
+from __future__ import annotations
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.film import GradientFilm
+from ngpt.layers import LAYERS
+
+
+class GradientIntegrator(mi.SamplingIntegrator):
+    """An integrator that renders the layers of a gradient stack.
+
+    ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
+    layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
+    pixels. Derived classes implement ``render_film()`` and ``sample()``.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        self.channels: list[str] = []
+
+    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
+        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
+        raise NotImplementedError
+
+    def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
+        """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
+        sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
+        spp = spp or sensor.sampler().sample_count()
+        layers = self.render_film(scene, sensor, seed, spp).develop()
+        self.channels = [f"{name}.{c}" for name in layers for c in LAYERS[name].channels]
+        return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
+
+    def aov_names(self):
+        return self.channels

@@ -1,0 +1,121 @@
+"""The base path of ``gpt``, vertex by vertex: Mitsuba's ``path``, and what offset paths need to know of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.lights import emission
+from data_gen.paths.shift import mis_weight
+from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
+from data_gen.samplers.gpt.plan import Plan
+
+
+@dataclass
+class Step:
+    """What the base path does at its current vertex x; x1 is the next one. Symbols as in ``gpt``."""
+
+    x: mi.SurfaceInteraction3f
+    x_connectable: mi.Bool
+    β: mi.Spectrum
+    # Emitter sampling
+    u_light: mi.Point2f
+    light: mi.DirectionSample3f
+    light_weight: mi.Spectrum  # Le / p; Le V / p where emitters are not shared
+    lit: mi.Bool  # the sample is seen from x
+    L_light: mi.Spectrum  # f m Le V / p
+    # BSDF sampling
+    u_lobe: mi.Float
+    u_direction: mi.Point2f
+    wo: mi.Vector3f
+    η: mi.Float  # relative index of refraction along the sampled direction
+    kind: mi.UInt32
+    p: mi.Float
+    f_p: mi.Spectrum  # f / p, survival included
+    survival: mi.Float  # 1 / probability to survive Russian roulette
+    goes_on: mi.Bool  # there is a next vertex, or an escape
+    walks: mi.Bool  # some path of the five may go on
+    seen: mi.Bool  # an escape sees the environment
+    β1: mi.Spectrum
+    x1: mi.SurfaceInteraction3f
+    x1_connectable: mi.Bool
+    Le: mi.Spectrum  # emitted at x1 toward x
+    p_light: mi.Float  # density with which emitter sampling would have found x1
+    L_bsdf: mi.Spectrum  # m Le
+
+
+def base_step(scene, plan: Plan, random, x, β, η, depth, seen, offsets) -> tuple[Step, mi.Float]:
+    """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
+
+    Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
+    """
+    u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
+    u_survival = random.next_1d()
+    bsdf = x.bsdf()
+    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    light, light_weight = scene.sample_emitter_direction(x, u_light, not plan.lights.shared, lit)
+    lit &= light.pdf != 0
+    if plan.lights.shared:
+        lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit)
+    f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
+
+    found = sample.pdf > 0
+    kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
+    seen = seen | (kind != NULL)
+    η = dr.select(found, η * sample.eta, η)
+    survival, walks = roulette(plan, depth, β * f_p, f_p, η, u_survival, offsets)
+    goes_on = walks & found
+    f_p = dr.select(goes_on, f_p * survival, 0)
+
+    x1 = scene.ray_intersect(x.spawn_ray(x.to_world(sample.wo)), goes_on)
+    Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
+    step = Step(
+        x=x,
+        x_connectable=plan.materials.connectable(bsdf),
+        β=β,
+        u_light=u_light,
+        light=light,
+        light_weight=light_weight,
+        lit=lit,
+        L_light=L_light,
+        u_lobe=u_lobe,
+        u_direction=u_direction,
+        wo=sample.wo,
+        η=sample.eta,
+        kind=kind,
+        p=sample.pdf,
+        f_p=f_p,
+        survival=survival,
+        goes_on=goes_on,
+        walks=walks,
+        seen=seen,
+        β1=β * f_p,
+        x1=x1,
+        x1_connectable=~x1.is_valid() | plan.materials.connectable(x1.bsdf()),
+        Le=Le,
+        p_light=p_light,
+        L_bsdf=Le * mis_weight(sample.pdf, p_light),
+    )
+    return step, η
+
+
+def roulette(plan: Plan, depth, β1, f_p, η, u, offsets) -> tuple[mi.Float, mi.Bool]:
+    """Russian roulette: 1 / probability to survive, and whether the path does.
+
+    By the throughput of the brightest of all five paths, so that none is starved.
+    """
+    largest = dr.max(β1)
+    for y in offsets:
+        ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
+        largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
+    q = dr.fmin(largest * dr.square(η), 0.95)
+    plays = depth >= plan.rr_depth
+    return dr.select(plays, dr.rcp(q), 1), (largest > 0) & (~plays | (u < q))
+
+
+def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:
+    """MIS weight of a sampled emitter whose direction BSDF sampling finds with density ``p``."""
+    return dr.select(delta, 1, mis_weight(p_light, p))

@@ -1,0 +1,200 @@
+r"""The gradient-domain path tracer: one base path and four offset paths that join it as early as they can.
+
+Each base path is Mitsuba's ``path``: emitter sampling and BSDF sampling combined by the power heuristic, Russian
+roulette by throughput. Its four offset paths go through the neighbours of its pixel with the same sub-pixel, lens, time
+and wavelength samples. An offset path goes straight to the base path's next vertex where materials allow it, and
+replays the base path's random numbers where not (mirrors, glass). Past the vertex they share, both are one path, so
+four offsets cost about as much as the base path and not four times that.
+
+    x, y              base path, offset path y = T(x); x1 is the base path's next vertex
+    L, Le             radiance of the base path without, and of only, the emission that the camera sees directly
+    β, β'             throughput f |J| / p of either path, both divided by the density of the *base* path
+    J                 |dT/dx|, the Jacobian of the shift
+    p, p'             densities of BSDF sampling, in solid angle
+    r                 p(y) |J| / p(x), the product of the ratios of each step (survey, eq. 17); 1 while replaying
+    w                 1 / (1 + r), or 1 where the shift is rejected: see data_gen.paths.shift.gradient_weight()
+    m                 MIS weight of emitter against BSDF sampling, each path's own
+    Δ                 gradient sample 2 w (C(y) |J| - C(x)) / p(x), the sum over all lengths of paths and over the two
+                      techniques, which are shifted separately: C is the contribution f m of one
+    a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
+    A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
+
+An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
+from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
+apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
+this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
+
+The base path is in ``base_path``, the offset paths in ``offset_path``, the rules of shifting in
+``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel.
+
+Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
+directions of a difference sum to one whatever paths survive.
+
+[Kettunen et al. 2015, "Gradient-Domain Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering",
+sections 3 and 4.1]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import SHIFTS, GradientFilm
+from data_gen.paths.camera import CameraSamples, render_passes
+from data_gen.paths.features import features
+from data_gen.paths.spectrum import to_rgb
+from data_gen.samplers.common import GradientIntegrator
+from data_gen.samplers.gpt.base_path import base_step
+from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
+from data_gen.samplers.gpt.plan import Plan, make_plan
+from ngpt.errors import NgptError
+
+# α of Beckmann and GGX above which a material is connectable.
+ROUGHNESS_THRESHOLD = 0.05
+
+
+class GPT(GradientIntegrator):
+    """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces.
+
+    Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``:
+
+    ``max_depth``            default -1: no limit
+    ``rr_depth``             5
+    ``hide_emitters``        false
+    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
+    ``shift``                "replay" before paths join, or "half-vector": that of smooth events is copied, others are
+                             replayed, which is rarely better
+    ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
+                             Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
+    ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
+                             without a counterpart: rejected, or of zero density, at a step that the base path took
+
+    Not handled: media (they are not seen), and polarised variants, for which rendering raises NgptError.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        max_depth = props.get("max_depth", -1)
+        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
+        self.rr_depth = props.get("rr_depth", 5)
+        self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+        self.shift = props.get("shift", "replay")
+        self.reuse = props.get("reuse", False)
+        self.diagnostics = props.get("diagnostics", False)
+        if self.shift not in ("replay", "half-vector"):
+            raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: replay, half-vector")
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """The primal estimate alone, by Mitsuba's ``path``."""
+        depths = {"max_depth": self.max_depth if self.max_depth < 0xFFFFFFFF else -1, "rr_depth": self.rr_depth}
+        path = mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters, **depths})
+        return path.sample(scene, sampler, ray, medium, active)
+
+    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
+        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
+        if mi.is_polarized:
+            raise NgptError(
+                f"sampler 'gpt' does not follow polarised light (variant '{mi.variant()}'); "
+                f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
+            )
+        plan = make_plan(
+            scene,
+            roughness_threshold=self.roughness_threshold,
+            max_depth=self.max_depth,
+            rr_depth=self.rr_depth,
+            shift=self.shift,
+            hide_emitters=self.hide_emitters,
+        )
+        return render_passes(
+            lambda camera, film: self.sample_pass(scene, plan, camera, film), sensor, seed, spp, **progress
+        )
+
+    def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
+        """Takes one base path and its four offset paths for each camera sample."""
+        ray, importance, _ = camera.rays()
+        shifted = [camera.rays(shift) for shift in SHIFTS.values()]
+        L, Le, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
+        L, Le = to_rgb(L, ray.wavelengths), to_rgb(Le, ray.wavelengths)
+        Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
+        inside = [inside for _, _, inside in shifted]
+        if self.reuse:
+            L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in offsets], Δ, inside)
+        values = {"primal": L + Le, "direct": Le}
+        values |= features(scene, camera.sensor, camera.random.clone(), ray)
+        if self.diagnostics:
+            values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
+        dr.eval(values, Δ, inside)
+        for name, value in values.items():
+            film.put(name, value)
+        for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
+            film.put(name, value, active)
+
+    def trace(self, scene, plan: Plan, random, ray, importance, shifted):
+        """L, Le and the four offset paths at their ends, in the order of SHIFTS, of base paths that begin with ``ray``.
+
+        At the first vertex all offset paths are apart, and few later on: that step stands before the loop.
+        """
+        x = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray))
+        seen = mi.Bool(not plan.hides)
+        Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
+        offsets = []
+        for offset_ray, offset_importance, inside in shifted:
+            hit = self.first_hit(scene, offset_ray)
+            offsets.append(start(plan, x, importance, offset_ray, hit, offset_importance, inside))
+        if plan.max_depth < 2:
+            return dr.zeros(mi.Spectrum, dr.width(hit.t)), Le, offsets
+        β = dr.select(x.is_valid(), importance, 0)
+        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, offsets)
+        L = β * step.L_light + step.β1 * step.L_bsdf
+        offsets = first_steps(scene, plan, step, offsets)
+        L, offsets = self.walk(scene, plan, random, step, η, L, offsets)
+        return L, Le, offsets
+
+    @dr.syntax
+    def walk(self, scene, plan, random, step, η, L, offsets):
+        """The rest of all paths past their first ``step``."""
+        x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
+        depth = mi.UInt32(2)
+        active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
+        while dr.hint(active, label="gpt"):
+            step, η = base_step(scene, plan, random, x, β, η, depth, seen, offsets)
+            L += β * step.L_light + step.β1 * step.L_bsdf
+            offsets = later_steps(scene, plan, step, offsets)
+            x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
+            depth += 1
+            active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
+        return L, offsets
+
+    def first_hit(self, scene, ray) -> mi.PreliminaryIntersection3f:
+        """Where a camera ray leads, through lamps that hide from the camera."""
+        ray = mi.Ray3f(ray)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        if self.hide_emitters:
+            lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
+            hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
+        return hit
+
+
+def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
+    """L of each sample as the mean over the four pairs with neighbours: what either path of a pair says of this pixel.
+
+    A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
+    A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
+    """
+    dr.eval(A, Δ, inside)
+    names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
+    L = mi.Color3f(0)
+    for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):
+        back = names.index(next(name for name, shift in SHIFTS.items() if shift == (-x, -y)))
+        # The same sample of another pixel, in the same block.
+        neighbour = mi.UInt32(lane + dr.opaque(mi.Int32, camera.block * (x + camera.size.x * y)))
+        L += (a + dr.gather(mi.Color3f, A[back] + Δ[back], neighbour, active)) / 8
+    return L
+
+
+def count(flags: list[mi.Bool]) -> mi.Float:
+    return sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
+
+
+mi.register_integrator("gpt", lambda props: GPT(props))

@@ -1,0 +1,261 @@
+"""The offset paths of ``gpt``: how each is taken along the steps of its base path. Symbols as in ``gpt``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import shift
+from data_gen.paths.lights import emission, replay_light, shared_emission
+from data_gen.paths.shift import mis_weight
+from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
+from data_gen.samplers.gpt.base_path import Step, light_mis
+from data_gen.samplers.gpt.plan import Plan
+
+
+@dataclass
+class Offset:
+    """The state of one offset path at the current vertex of its base path."""
+
+    ray: mi.Ray3f  # apart: led to the offset path's own vertex; joined: to the shared one
+    hit: mi.PreliminaryIntersection3f  # apart: that vertex
+    β: mi.Spectrum
+    r: mi.Float
+    apart: mi.Bool
+    joined: mi.Bool
+    seen: mi.Bool  # an escape sees the environment
+    a: mi.Spectrum
+    Δ: mi.Spectrum
+    failed: mi.Bool  # the base path went on to where no offset path corresponds to it
+    w2: mi.Float  # settled: 2 w of all that follows
+    A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ
+
+
+@dataclass
+class Move:
+    """One step of an offset path apart from its base path; ``good`` is False where the shift is rejected."""
+
+    ray: mi.Ray3f
+    hit: mi.PreliminaryIntersection3f
+    f_p: mi.Spectrum  # f |J| / p, with the p of the base path
+    r: mi.Float  # p' |J| / p
+    seen: mi.Bool
+    L_bsdf: mi.Spectrum
+    reaches: mi.Bool  # there is a next vertex
+    good: mi.Bool
+
+
+def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Offset:
+    """An offset path up to its first vertex, ``hit``; it has ended where it finds none.
+
+    A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
+    """
+    lives = inside & hit.is_valid()
+    ended = inside & ~hit.is_valid() & x.is_valid()
+    return Offset(
+        ray=mi.Ray3f(ray),
+        hit=hit,
+        β=mi.Spectrum(offset_importance),
+        r=mi.Float(1),
+        apart=lives if plan.replays else lives & x.is_valid(),
+        joined=mi.Bool(False),
+        seen=mi.Bool(not plan.hides),
+        a=dr.select(ended, -importance * (1 if plan.replays else 2), 0),
+        Δ=dr.zeros(mi.Spectrum, dr.width(hit.t)),
+        failed=mi.Bool(False) if plan.replays else ended,
+        # Beyond the border there is no path that could have its part of the weight.
+        w2=dr.select(ended, 1 if plan.replays else 2, dr.select(inside, mi.Float(0), 2)),
+        A=dr.zeros(mi.Spectrum, dr.width(hit.t)),
+    )
+
+
+def first_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
+    """Takes all offset paths along the first step, in which none is joined yet.
+
+    A loop keeps the kernel small; its state rotates, so that each path stays in registers when its turn comes.
+    """
+
+    def rotate(i, y, *others):
+        y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
+        return i + 1, *others, y
+
+    settle(step, offsets)
+    state = (mi.UInt32(0), *offsets)
+    return list(dr.while_loop(state, lambda i, *_: i < len(offsets), rotate, label="first step")[1:])
+
+
+def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
+    """Takes all offset paths along any other step. Most of these find all of them settled.
+
+    Rare branches are real ones, not masks: they cost 2.5 times less.
+    """
+    busy, apart = mi.Bool(False), mi.Bool(False)
+    for y in offsets:
+        busy |= y.joined
+        apart |= y.apart
+    settle(step, offsets)
+
+    def join(*offsets):
+        return tuple(step_joined(step, y) for y in offsets)
+
+    def rotate(i, y, *others):
+        y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
+        return i + 1, *others, y
+
+    offsets = dr.if_stmt(tuple(offsets), busy, join, lambda *offsets: offsets)
+    if plan.replays:
+        state = (mi.UInt32(0), *offsets)
+        offsets = dr.while_loop(state, lambda i, *_: apart & (i < len(offsets)), rotate, label="offset paths")[1:]
+    return list(offsets)
+
+
+def settle(step: Step, offsets: list[Offset]) -> None:
+    """Adds to settled paths what the base path finds in this step."""
+    C = step.L_light + step.f_p * step.L_bsdf
+    for y in offsets:
+        y.Δ = y.Δ + y.a * C
+        y.A = y.A + y.w2 * step.β * C
+        y.a = y.a * step.f_p
+
+
+def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
+    """A step from the offset path's own vertex y."""
+    y = path.hit.compute_surface_interaction(path.ray)
+    bsdf = y.bsdf()
+    connectable = plan.materials.connectable(bsdf)
+    # Emitter sampling is replayed: densities cancel in r, and the same numbers lead to, or near, the same point.
+    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
+    f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
+    L_light = f * light.weight * light_mis(light.delta, light.p, p)
+    w2_light = shift.gradient_weight(path.r, True)
+    Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
+
+    joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
+    parts = step.walks & ~joins
+    none = mi.Bool(False)
+    move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none)
+    move = dr.if_stmt((move,), joins, lambda move: reconnect(scene, plan, step, y, bsdf, move), lambda move: move)
+    if plan.replays:
+        move = dr.if_stmt(
+            (move,), parts, lambda move: part(scene, plan, step, y, bsdf, connectable, move), lambda move: move
+        )
+    β1, r1 = path.β * move.f_p, path.r * move.r
+    good = move.good & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
+    β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
+    apart, joined = good & parts & move.reaches, good & joins & move.reaches
+    w2 = shift.gradient_weight(r1, good)
+    return Offset(
+        ray=move.ray,
+        hit=move.hit,
+        β=β1,
+        r=r1,
+        apart=apart,
+        joined=joined,
+        seen=move.seen,
+        # Rejected or at its end, it has nothing to set against the rest of the base path.
+        a=dr.select(apart | joined, 0, -w2 * step.β1),
+        Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
+        failed=path.failed | (step.goes_on & (r1 == 0)),
+        w2=dr.select(apart | joined, 0, w2),
+        A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
+    )
+
+
+def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
+    """Straight to the base path's next vertex, or, where it escapes, along with it."""
+    x1 = step.x1
+    reaches = x1.is_valid()
+    direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
+    occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)))
+    J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
+    f, p = evaluate(bsdf, y, y.to_local(direction))
+    y1 = seen_from(x1, direction)
+    ratio = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
+    Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, y, y1, ratio)
+    return Move(
+        ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
+        hit=move.hit,
+        f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0),
+        r=J * p / step.p,
+        seen=mi.Bool(True),
+        L_bsdf=Le * mis_weight(p, p_light),
+        reaches=reaches,
+        good=~occluded,
+    )
+
+
+def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Move:
+    """In a direction of its own, with the half-vector of the base path or along its random numbers."""
+    sample, f_p = bsdf.sample(mi.BSDFContext(), y, step.u_lobe, step.u_direction)
+    found = sample.pdf > 0
+    wo, p, r = sample.wo, sample.pdf, mi.Float(1)
+    kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
+    allowed = mi.Bool(True)
+    if plan.half_vectors:
+        copies = step.goes_on & (step.kind == SMOOTH)
+        same = y.bsdf() == step.x.bsdf()
+        copied, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
+        f1, p1 = evaluate(bsdf, y, copied, copies)
+        found = dr.select(copies, exists & (p1 > 0), found)
+        wo, p = dr.select(copies, copied, wo), dr.select(copies, p1, p)
+        f_p = dr.select(copies, f1 * (J / step.p), f_p)
+        r = dr.select(copies, p1 * J / step.p, r)
+        # Past the end of its base path an offset path has no half-vectors to copy, nor would the reverse shift.
+        allowed = dr.select(copies, found, (kind != SMOOTH) | ~step.x.is_valid())
+        kind = dr.select(copies, SMOOTH, kind)
+    seen = move.seen if not plan.hides else move.seen | (kind != NULL)
+    ray = y.spawn_ray(y.to_world(wo))
+    hit = scene.ray_intersect_preliminary(ray, active=found)
+    y1 = hit.compute_surface_interaction(ray)
+    reaches = found & y1.is_valid()
+    Le, p_light = emission(scene, y1, y, reaches | (found & seen), found & (kind == SMOOTH))
+    inverts = shift.replay_inverts(
+        kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
+    )
+    return Move(
+        ray=ray,
+        hit=hit,
+        f_p=dr.select(found, f_p * step.survival, 0),
+        r=r,
+        seen=seen,
+        L_bsdf=Le * mis_weight(p, p_light),
+        reaches=reaches,
+        good=allowed & inverts,
+    )
+
+
+def step_joined(step: Step, path: Offset) -> Offset:
+    """A step from the shared vertex x, to which a joined offset path has come from elsewhere; settles it."""
+    y = seen_from(step.x, path.ray.d)
+    bsdf = y.bsdf()
+    f, p = evaluate(bsdf, y, y.to_local(step.light.d), step.lit)
+    L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
+    w2_light = shift.gradient_weight(path.r, True)
+    Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
+
+    f, p = evaluate(bsdf, y, step.wo, step.goes_on)
+    β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
+    r1 = path.r * p / step.p
+    good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
+    β1 = dr.select(good, β1, 0)
+    L_bsdf = step.Le * mis_weight(p, step.p_light)
+    w2 = shift.gradient_weight(r1, good)
+    a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
+    A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf
+    return Offset(
+        ray=path.ray,
+        hit=path.hit,
+        β=path.β,
+        r=path.r,
+        apart=path.apart,
+        joined=mi.Bool(False),
+        seen=path.seen,
+        a=dr.select(path.joined, a, path.a),
+        Δ=dr.select(path.joined, Δ, path.Δ),
+        failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
+        w2=dr.select(path.joined, w2, path.w2),
+        A=dr.select(path.joined, A, path.A),
+    )

@@ -1,0 +1,48 @@
+"""What the kernel of ``gpt`` contains for a scene: code that its transport cannot reach is not compiled."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import mitsuba as mi
+
+from data_gen.paths.lights import Lights
+from data_gen.paths.vertex import Materials
+
+
+@dataclass
+class Plan:
+    """Facts about a scene, and options, that do not change while it is rendered.
+
+    ``replays``       offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
+    ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
+    ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
+    """
+
+    materials: Materials
+    lights: Lights
+    max_depth: int
+    rr_depth: int
+    replays: bool
+    half_vectors: bool
+    hide_emitters: bool
+
+    @property
+    def hides(self) -> bool:
+        return self.hide_emitters and self.lights.far
+
+
+def make_plan(
+    scene: mi.Scene,
+    roughness_threshold: float,
+    max_depth: int,
+    rr_depth: int,
+    shift: str,
+    hide_emitters: bool,
+) -> Plan:
+    """Inspects the scene; the parameters are those of ``gpt``."""
+    materials = Materials(scene, roughness_threshold)
+    # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
+    replays = not materials.all_connectable
+    half_vectors = replays and shift == "half-vector"
+    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters)

@@ -1,0 +1,80 @@
+r"""The teaching gradient-domain path tracer: Algorithm 1 of the survey, random sequence replay.
+
+It is here to be read, and as a check on faster samplers: every difference it takes is between two complete path-traced
+samples, so there is nothing to go wrong, but also nothing saved. One sample costs five.
+
+    L               radiance of a path, a function of its random numbers u and its position on the film
+    base, offset    the path through pixel p, and the path of the same u through a neighbour q of p
+    Δ               L(u, q) - L(u, p): small where equal random numbers give similar paths, so of low variance
+
+The density of u is the same for both paths, hence the Jacobian of the shift and the densities cancel (survey, eq. 6-8),
+and the difference needs no more than Mitsuba's own estimator, called twice. Both directions of a difference, p to q and
+q to p, are sampled and weighted 1/2 each.
+
+[Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 2.3 and Algorithm 1]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import SHIFTS, GradientFilm
+from data_gen.paths.camera import CameraSamples, render_passes
+from data_gen.paths.features import features
+from data_gen.paths.lights import emission_seen
+from data_gen.paths.spectrum import to_rgb
+from data_gen.samplers.common import GradientIntegrator
+
+
+class GPTBasic(GradientIntegrator):
+    """Gradient-domain path tracing by random sequence replay, around any Mitsuba integrator that samples radiance.
+
+    Plugin ``gpt_basic``. Its only parameter is a nested integrator (default: ``path``), which decides what transport
+    is rendered; ``path`` and ``volpath`` are the usual ones.
+
+    Not meant for production: shifted paths part for good at the first reflection that differs, which makes gradients
+    noisier than those of a shift that reconnects.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
+        self.nested = nested[0] if nested else mi.load_dict({"type": "path"})
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """The primal estimate alone: see the nested integrator."""
+        return self.nested.sample(scene, sampler, ray, medium, active)
+
+    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
+        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
+        return render_passes(lambda camera, film: self.sample_pass(scene, camera, film), sensor, seed, spp, **progress)
+
+    def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
+        """Takes one base path for each camera sample and shifts it to the four neighbours of its pixel."""
+        L, Le, _ = self.radiance(scene, camera, (0, 0))
+        film.put("primal", L + Le)
+        film.put("direct", Le)
+        usable = dr.isfinite(dr.sum(L))
+        for name, shift in SHIFTS.items():
+            L_shifted, _, inside = self.radiance(scene, camera, shift)
+            film.put(name, L_shifted - L, inside & usable)
+        ray, _, _ = camera.rays()
+        film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
+
+    def radiance(self, scene, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
+        """L(u, p + shift) without, and with only, the emission seen directly; and whether p + shift is on the film.
+
+        Direct emission has little noise of its own, but its edges would be the strongest gradients of the image.
+        """
+        ray, importance, inside = camera.rays(shift)
+        medium = camera.sensor.get_medium()
+        # The clone starts from the same state each time: same u.
+        L, _, _ = self.nested.sample(scene, camera.random.clone(), ray, medium, inside)
+        Le = emission_seen(scene, self.nested, medium, ray, inside)
+        L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
+        dr.eval(L, Le, inside)
+        return L, Le, inside
+
+
+mi.register_integrator("gpt_basic", lambda props: GPTBasic(props))

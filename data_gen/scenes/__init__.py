@@ -1,0 +1,1 @@
+"""Scenes: built in, and made from a seed."""

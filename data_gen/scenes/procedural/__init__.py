@@ -1,0 +1,1 @@
+"""Scenes made from a seed: rooms, things, materials, textures."""

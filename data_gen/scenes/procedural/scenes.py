@@ -1,0 +1,293 @@
+"""Scenes that never run out: rooms and open sets made from a seed, written as Mitsuba scene files.
+
+A scene is a folder: ``scene.xml``, one mesh for each material, and the pictures. Units are metres, +y is up. Its camera
+stands in free space, as a painter would place it; ``data_gen.dataset.cameras`` finds further ones from there.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+import numpy as np
+
+from data_gen.scenes.procedural import things
+from data_gen.scenes.procedural.materials import ROLES, SLOTS, Palette, inside, plugin
+from data_gen.scenes.procedural.meshes import (
+    Mesh,
+    box,
+    cylinder,
+    lathe,
+    merge,
+    quads,
+    rotation,
+    sphere,
+    wall,
+    write_ply,
+)
+from data_gen.scenes.procedural.textures import colour, sky, write_pfm
+from ngpt.report.display import to_srgb8
+from ngpt.report.png import encode_png
+
+MAX_DEPTH = 12
+
+SIZES = {"wall": (0.7, 4), "floor": (0.4, 3), "paper": (0.15, 0.6)}
+
+
+class Stage:
+    """A scene while it is made: parts by slot, lights, and where things stand."""
+
+    def __init__(self, rng: np.random.Generator):
+        self.rng = rng
+        self.meshes: dict[str, list[Mesh]] = {}
+        self.standing: list[tuple[float, float, float]] = []
+        self.sky = False
+        self.spots: list[xml.Element] = []
+        # Every role is played by one slot at a time; few slots make a scene of one mind, many a jumble.
+        self.cast = {role: rng.permutation(slots)[: rng.integers(1, len(slots) + 1)] for role, slots in ROLES.items()}
+
+    def add(self, parts: list[things.Part]) -> None:
+        for role, mesh in parts:
+            slot = str(self.rng.choice(self.cast[role]))
+            if role != "leaf":
+                # Metres that the picture covers.
+                low, high = SIZES.get(role, (0.1, 1.5))
+                size = np.exp(self.rng.uniform(np.log(low), np.log(high)))
+                turn = rotation([0, 0, 1], float(self.rng.choice([0, 0, 0, 0.25, 0.5])) * np.pi)[:2, :2]
+                mesh = replace(mesh, uvs=mesh.uvs @ turn / size)
+            self.meshes.setdefault(slot, []).append(mesh)
+
+    def stand(self, parts: list[things.Part], area: tuple[float, float], angle: float | None = None) -> bool:
+        """Puts a thing on the floor, x and z within ``area`` / 2, where nothing stands; False if there is no room."""
+        reach = max(np.hypot(*mesh.vertices[:, [0, 2]].T).max() for _, mesh in parts)
+        for _ in range(20):
+            x, z = (self.rng.uniform(-0.5, 0.5, 2)) * np.maximum(np.array(area) - 2 * reach, 0)
+            if all(np.hypot(x - a, z - b) > 0.85 * (reach + r) for a, b, r in self.standing):
+                self.standing.append((x, z, reach))
+                turn = self.rng.uniform(0, 2 * np.pi) if angle is None else angle
+                self.add(things.placed(parts, [x, 0, z], turn))
+                return True
+        return False
+
+    def free_spot(self, area: tuple[float, float]) -> np.ndarray:
+        """The place on the floor, of 200 tried, that is farthest from what stands there, (x, z)."""
+        spots = self.rng.uniform(-0.45, 0.45, (200, 2)) * area
+        gaps = [min([np.hypot(*(spot - [x, z])) - r for x, z, r in self.standing], default=1.0) for spot in spots]
+        return spots[int(np.argmax(gaps))]
+
+
+def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Four walls, furniture, and light from lamps, windows or both."""
+    rng = stage.rng
+    width, depth, height = rng.uniform(3, 8), rng.uniform(3, 8), rng.uniform(2.3, 3.6)
+    x, z = width / 2, depth / 2
+    stage.add([("floor", quads([[[-x, 0, z], [x, 0, z], [x, 0, -z], [-x, 0, -z]]]))])
+    stage.add([("wall", quads([[[-x, height, -z], [x, height, -z], [x, height, z], [-x, height, z]]]))])
+    daylight = rng.random() < 0.55
+    corners = np.array([[-x, -z], [x, -z], [x, z], [-x, z]])[::-1]
+    with_windows = rng.permutation(4)[: rng.integers(1, 3)] if daylight else []
+    for side in range(4):
+        start, end = corners[side], corners[(side + 1) % 4]
+        _side(stage, start, end, height, side in with_windows)
+    stage.sky = daylight
+    if not daylight or rng.random() < 0.7:
+        _lamps(stage, width, depth, height)
+    names = rng.choice(list(things.LARGE), rng.integers(5, 12))
+    for name in names:
+        stage.stand(things.LARGE[str(name)](rng), (width, depth), float(rng.choice([0, 0.5, 1, 1.5])) * np.pi)
+    if rng.random() < 0.5:
+        stage.add(things.placed([("fabric", box([2.2, 0.012, 1.5]))], [rng.uniform(-1, 1), 0.006, rng.uniform(-1, 1)]))
+    spot = stage.free_spot((width, depth))
+    return np.array([spot[0], rng.uniform(0.9, 1.8), spot[1]]), np.array([-0.3 * spot[0], 0.8, -0.3 * spot[1]])
+
+
+def _side(stage: Stage, start, end, height: float, windows: bool) -> None:
+    """One wall of a room, with windows, their bars, panes and blinds, or with pictures."""
+    rng = stage.rng
+    length = float(np.linalg.norm(end - start))
+    u = np.array([end[0] - start[0], 0, end[1] - start[1]])
+    origin = np.array([start[0], 0, start[1]])
+    inward = np.cross(u / length, [0, 1, 0])
+    angle = np.arctan2(inward[0], inward[2])
+    if not windows:
+        stage.add([("wall", wall(origin, u, [0, height, 0]))])
+        stage.add([("wood", box([length, 0.1, 0.02]).placed(origin + u / 2 + [0, 0.05, 0] + 0.01 * inward, angle))])
+        for place in rng.uniform(0.15, 0.85, rng.integers(0, 3)):
+            parts = things.picture(rng, *rng.uniform(0.3, 1.2, 2))
+            stage.add(things.placed(parts, origin + place * u + [0, 1.5, 0] + 0.01 * inward, angle))
+        return
+    count = int(rng.integers(1, 1 + max(1, int(length / 1.8))))
+    low, high = rng.uniform(0.02, 0.35), rng.uniform(0.75, 0.95)
+    span = rng.uniform(0.5, 0.95) / count
+    openings = [((i + 0.5) / count - span / 2, (i + 0.5) / count + span / 2, low, high) for i in range(count)]
+    stage.add([("wall", wall(origin, u, [0, height, 0], openings))])
+    blinds, bars = rng.random() < 0.2, int(rng.integers(0, 4))
+    for u0, u1, v0, v1 in openings:
+        wide, tall = (u1 - u0) * length, (v1 - v0) * height
+        middle = origin + (u0 + u1) / 2 * u + [0, (v0 + v1) / 2 * height, 0]
+        frame = [box([wide, 0.05, 0.08], [0, s * tall / 2, 0]) for s in (-1, 1)]
+        frame += [box([0.05, tall, 0.08], [s * wide / 2, 0, 0]) for s in (-1, 1)]
+        frame += [box([0.03, tall, 0.04], [t * wide, 0, 0]) for t in (np.arange(bars) + 1) / (bars + 1) - 0.5]
+        parts: list[things.Part] = [("wood", merge(frame))]
+        if rng.random() < 0.35:
+            parts.append(
+                (
+                    "pane",
+                    quads(
+                        [
+                            [
+                                [-wide / 2, -tall / 2, 0],
+                                [wide / 2, -tall / 2, 0],
+                                [wide / 2, tall / 2, 0],
+                                [-wide / 2, tall / 2, 0],
+                            ]
+                        ]
+                    ),
+                )
+            )
+        if blinds:
+            slats = [box([wide, 0.004, 0.04], [0, y, 0.08]) for y in np.arange(-tall / 2, tall / 2, 0.05)]
+            parts.append(("wood", merge(slats)))
+        elif rng.random() < 0.4:
+            side = rng.choice([-1, 1]) * wide / 2
+            parts += things.placed(things.curtain(rng), [side, -middle[1] + 0.03, 0.12])
+        stage.add(things.placed(parts, middle, angle))
+
+
+def _lamps(stage: Stage, width: float, depth: float, height: float) -> None:
+    """Panels, globes, spots under the ceiling, a strip behind a ledge, or lamps with shades."""
+    rng = stage.rng
+    kind = str(rng.choice(["panel", "panel", "globe", "points", "cove", "shade"]))
+    x, z = rng.uniform(-0.25, 0.25, 2) * [width, depth]
+    if kind == "panel":
+        size = rng.uniform(0.2, 1.5, 2)
+        parts: list[things.Part] = [("lamp", box([size[0], 0.04, size[1]], [x, height - 0.1, z]))]
+    elif kind == "globe":
+        drop = rng.uniform(0.3, 0.9)
+        parts = [("lamp", sphere(rng.uniform(0.04, 0.18)).placed([x, height - drop, z]))]
+        parts.append(("metal", cylinder(0.008, drop, 10).placed([x, height - drop, z])))
+    elif kind == "points":
+        places = rng.uniform(-0.4, 0.4, (rng.integers(3, 8), 2)) * [width, depth]
+        parts = [("lamp", cylinder(0.035, 0.01, 16).placed([a, height - 0.03, b])) for a, b in places]
+    elif kind == "cove":
+        ledge = box([width - 0.1, 0.12, 0.03], [0, height - 0.3, 0.25 - depth / 2])
+        board = box([width - 0.1, 0.03, 0.25], [0, height - 0.36, 0.125 - depth / 2])
+        strip = box([width - 0.4, 0.02, 0.03], [0, height - 0.33, 0.1 - depth / 2])
+        parts = [("wall", merge([ledge, board])), ("lamp", strip)]
+    else:
+        shade = lathe([(rng.uniform(0.15, 0.35), 0), (0.06, rng.uniform(0.15, 0.35))])
+        drop = rng.uniform(0.4, 1.0)
+        parts = things.placed([("metal", shade), ("lamp", sphere(0.05, 16))], [x, height - drop, z])
+    stage.add(parts)
+    for _ in range(rng.integers(0, 3)):
+        stage.stand(things.floor_lamp(rng), (width, depth))
+
+
+def open_set(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
+    """Things on a ground without walls, under a sky or between the lamps of a studio."""
+    rng = stage.rng
+    small = rng.random() < 0.4
+    area = (1.6, 1.6) if small else (7.0, 7.0)
+    stage.add([("floor", quads([[[-60, 0, 60], [60, 0, 60], [60, 0, -60], [-60, 0, -60]]]))])
+    if small:
+        stage.add(things.clutter(rng, *area, int(rng.integers(6, 22))))
+    else:
+        for name in rng.choice([*things.LARGE, "sculpture", "sculpture", "plant"], rng.integers(5, 14)):
+            stage.stand(things.LARGE[str(name)](rng), area)
+    stage.sky = rng.random() < 0.65
+    if not stage.sky or rng.random() < 0.3:
+        for _ in range(rng.integers(1, 4)):
+            angle, far = rng.uniform(0, 2 * np.pi), rng.uniform(0.7, 1.3) * area[0]
+            size = np.append(np.exp(rng.uniform(np.log(0.06), np.log(0.7), 2)), 0.02) * area[0]
+            place = [far * np.sin(angle), rng.uniform(0.5, 1.2) * area[0], far * np.cos(angle)]
+            stage.add([("lamp", box(size).placed(place, angle))])
+    if not stage.sky or rng.random() < 0.4:
+        back = wall([-area[0], 0, -area[0]], [2 * area[0], 0, 0], [0, 1.5 * area[0], 0])
+        stage.add([("wall", back)])
+    spot = stage.free_spot(area)
+    if small:
+        angle = rng.uniform(-1.2, 1.2)
+        return np.array([2 * np.sin(angle), rng.uniform(0.4, 1.4), 2 * np.cos(angle)]), np.array([0, 0.1, 0])
+    return np.array([spot[0], rng.uniform(0.8, 2.0), spot[1]]), np.array([-0.2 * spot[0], 0.7, -0.2 * spot[1]])
+
+
+LAYOUTS = {"room": room, "open": open_set}
+
+
+def make_scene(seed: int | tuple[int, ...], folder: Path) -> Path:
+    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files."""
+    rng = np.random.default_rng(seed)
+    layout = "room" if rng.random() < 0.7 else "open"
+    stage = Stage(rng)
+    origin, target = LAYOUTS[layout](stage)
+
+    def save(image: np.ndarray, raw: bool) -> str:
+        image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
+        pixels = np.rint(255 * np.clip(image, 0, 1)).astype(np.uint8) if raw else to_srgb8(image)
+        name = f"picture{len(list(folder.glob('picture*.png')))}.png"
+        (folder / name).write_bytes(encode_png(pixels, level=1))
+        return name
+
+    root = xml.Element("scene", version="3.0.0")
+    root.append(plugin("integrator", "path", max_depth=MAX_DEPTH, rr_depth=5))
+    root.append(_camera(rng, origin, target))
+    palette = Palette(rng, save)
+    for slot in SLOTS:
+        # Far below, where nobody looks: what holds the place of a material that this scene has no use for.
+        mesh = merge(stage.meshes.get(slot, [box([0.01] * 3, [0, -50, 0])]))
+        root.append(_shape(folder, slot, mesh, palette.material(slot)))
+    if "lamp" in stage.meshes:
+        lamps = merge(stage.meshes["lamp"])
+        power = np.exp(rng.uniform(np.log(10), np.log(250)))
+        light = power / max(_surface(lamps), 0.01) / np.pi
+        # Two emitters always: one alone has a kernel of its own.
+        middle = len(stage.meshes["lamp"][0].faces) if len(stage.meshes["lamp"]) > 1 else len(lamps.faces) // 2
+        for name, part in (("lamp0", np.s_[:middle]), ("lamp1", np.s_[middle:])):
+            black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
+            shape = _shape(folder, name, replace(lamps, faces=lamps.faces[part]), black)
+            tint = colour(rng, 0.75, 1, 0.5)
+            root.append(inside(shape, plugin("emitter", "area", radiance=light * tint)))
+    if stage.sky:
+        write_pfm(folder / "sky.pfm", np.float32(np.exp(rng.normal(0, 1))) * sky(rng))
+        root.append(plugin("emitter", "envmap", filename="sky.pfm"))
+    xml.indent(root)
+    xml.ElementTree(root).write(folder / "scene.xml", encoding="utf-8")
+    return folder / "scene.xml"
+
+
+def _camera(rng: np.random.Generator, origin, target) -> xml.Element:
+    lens = plugin("sensor", "thinlens", fov=rng.uniform(45, 75), aperture_radius=1e-4, focus_distance=2.0)
+    transform = xml.SubElement(lens, "transform", name="to_world")
+    point = ({"origin": origin, "target": target}).items()
+    xml.SubElement(transform, "lookat", {k: ", ".join(f"{x:.6g}" for x in v) for k, v in point} | {"up": "0, 1, 0"})
+    film = plugin("film", "hdrfilm", width=1280, height=720, pixel_format="rgb", component_format="float32")
+    return inside(lens, inside(film, plugin("rfilter", "box")))
+
+
+def _shape(folder: Path, name: str, mesh: Mesh, bsdf: xml.Element) -> xml.Element:
+    write_ply(folder / f"{name}.ply", mesh)
+    return inside(plugin("shape", "ply", filename=f"{name}.ply"), bsdf)
+
+
+def _surface(mesh: Mesh) -> float:
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2)
+
+
+def main() -> int:
+    if len(sys.argv) != 3 or not sys.argv[1].isdigit():
+        print("usage: python -m data_gen.scenes.procedural.scenes SEED FOLDER", file=sys.stderr)
+        return 2
+    folder = Path(sys.argv[2])
+    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        print(f"{folder}: exists and is not an empty folder; give a new one", file=sys.stderr)
+        return 2
+    folder.mkdir(parents=True, exist_ok=True)
+    print(make_scene(int(sys.argv[1]), folder))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

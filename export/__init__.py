@@ -1,1 +1,0 @@
-"""export: reconstructions as ONNX files that any renderer can run."""

@@ -1,0 +1,1 @@
+"""Reconstructions from gradients without a network: screened Poisson and control variates."""

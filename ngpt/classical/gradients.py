@@ -1,0 +1,70 @@
+"""Forward differences: the one place that fixes the sign and position of a gradient.
+
+dx[y, x] = I[y, x + 1] - I[y, x]    last column 0
+dy[y, x] = I[y + 1, x] - I[y, x]    last row 0
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ngpt.classical.arrays import Array, by_rows
+
+
+def forward_differences(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The gradients (dx, dy) of an image, each of the image's own shape (H, W, ...)."""
+    dx, dy = differences(np.moveaxis(image, (0, 1), (-2, -1)), 0, image.shape[0])
+    return np.moveaxis(dx, (-2, -1), (0, 1)), np.moveaxis(dy, (-2, -1), (0, 1))
+
+
+def adjoint_differences(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
+    """The adjoint of ``forward_differences``, i.e. the negative divergence, (H, W, ...).
+
+    The last column of dx and the last row of dy stand for no difference and are ignored. With it,
+    ``(forward_differences(I) * (dx, dy)).sum() == (I * adjoint_differences(dx, dy)).sum()``.
+    """
+    x, y = (np.moveaxis(np.array(d), (0, 1), (-2, -1)) for d in (dx, dy))
+    x[..., -1], y[..., -1, :] = 0, 0
+    return np.moveaxis(adjoint(x, y), (-2, -1), (0, 1))
+
+
+def differences(planes: Array, first: int, last: int) -> tuple[Array, Array]:
+    """dx and dy of rows first .. last - 1 of (..., H, W) planes."""
+    here, below = planes[..., first:last, :], planes[..., first + 1 : last + 1, :]
+    dx, dy = -here, -here
+    dx[..., :-1] += here[..., 1:]
+    dx[..., -1] = 0
+    rows = below.shape[-2]
+    dy[..., :rows, :] += below
+    dy[..., rows:, :] = 0
+    return dx, dy
+
+
+def adjoint(dx: Array, dy: Array) -> Array:
+    """The adjoint of ``differences``, (..., rows, W); the unused column of dx and row of dy must be 0."""
+    total = -dx
+    total -= dy
+    total[..., 1:] += dx[..., :-1]
+    total[..., 1:, :] += dy[..., :-1, :]
+    return total
+
+
+def adjoint_by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
+    """As ``by_rows``, but the function's first three values are v, dx, dy, of which v + adjoint(dx, dy) is made.
+
+    v may be None for 0.
+    """
+
+    def band(first: int, last: int) -> tuple:
+        v, dx, dy, *values = function(first, last)
+        total = adjoint(dx, dy)
+        if v is not None:
+            total += v
+        others = len(out) - 1
+        return (total, *values[:others], last, dy[..., -1, :], *values[others:])
+
+    total, *arrays, bands = by_rows(band, *out)
+    # The lowest differences of a band belong to the next band's first row, too.
+    for last, lowest, *_ in bands[:-1]:
+        total[..., last, :] += lowest
+    return (total, *arrays, [values for _, _, *values in bands])

@@ -1,0 +1,248 @@
+"""Least squares over an image and its differences: what the linear reconstructions and the inner solves share.
+
+The equations are I ≈ P and ∇I ≈ G. All solvers look for the correction u = I - P, for which they read u ≈ 0 and
+∇u ≈ r with r = G - ∇P: exact gradients have r = 0 and give u = 0, whatever the weights.
+"""
+
+import math
+
+import numpy as np
+
+from ngpt.classical.arrays import Array, by_rows, cast, dct2, detach, empty, idct2, image, like, module, planes
+from ngpt.classical.gradients import adjoint, adjoint_by_rows, differences
+from ngpt.errors import NgptError
+
+# Ratio of the largest value to a typical one beyond which float32 transforms would spread their rounding of the one
+# over the other: such inputs are solved in double precision.
+FLOAT32_RANGE = 2.0**16
+
+
+class Equations:
+    """The right-hand sides as planes (C, H, W), in double precision where their range asks for it.
+
+    ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, NumPy or torch, finite
+    ``trusted``  for dx and dy, (H, W) booleans: a difference marked False has no equation; None trusts all
+    """
+
+    def __init__(self, primal: Array, dx: Array, dy: Array, trusted: tuple[Array, Array] | None = None):
+        if primal.ndim != 3 or not primal.shape == dx.shape == dy.shape:
+            shapes = ", ".join(str(tuple(a.shape)) for a in (primal, dx, dy))
+            raise NgptError(f"primal, dx and dy have shapes {shapes}; they must all be of one shape (H, W, C)")
+        self.dtype = primal.dtype
+        self.xp = module(primal)
+        self.trusted = trusted
+        self.primal, self.dx, self.dy = map(planes, (primal, dx, dy))
+        sample = abs(detach(primal[::4, ::4]))
+        self.typical = float((sample**0.5).sum() / max(int((sample > 0).sum()), 1)) ** 2
+
+    def residual(self, first: int, last: int) -> tuple[Array, Array]:
+        """r = G - ∇P of rows first .. last - 1, (C, rows, W) for dx and dy, 0 where there is no equation."""
+        x, y = differences(self.primal, first, last)
+        x, y = self.dx[:, first:last] - x, self.dy[:, first:last] - y
+        x[..., -1] = 0
+        if last == self.primal.shape[1]:
+            y[..., -1, :] = 0
+        if self.trusted is not None:
+            x, y = (self.xp.where(t[first:last], v, 0) for t, v in zip(self.trusted, (x, y), strict=True))
+        return x, y
+
+    def divergence(self) -> Array:
+        """∇ᵀ r as (C, H, W), the right-hand side of least squares with equal weights."""
+
+        def rows(first, last):
+            x, y = self.residual(first, last)
+            return None, x, y, _peak(x, y)
+
+        b, peaks = adjoint_by_rows(rows, empty(self.primal, len(self.primal), channels_last=True))
+        return b if self._holds(peaks) else self.divergence()
+
+    def scaled_residual(self) -> tuple[Array, float]:
+        """(r / scale, scale), r as (2, C, H, W); scale is a power of two (exact) of about the mean of |r|, or 0."""
+
+        def rows(first, last):
+            r = self.xp.stack(self.residual(first, last))
+            return r, _peak(r), sum_of(abs(detach(r)))
+
+        r, bands = by_rows(rows, empty(self.primal, 2, len(self.primal)))
+        if not self._holds([peak for peak, _ in bands]):
+            return self.scaled_residual()
+        mean = sum(total for _, total in bands) / math.prod(r.shape)
+        scale = 2.0 ** round(math.log2(mean)) if mean > 0 else 0.0
+        if scale > 0:
+            r, _ = by_rows(lambda first, last: (r[..., first:last, :] * (1 / scale),), r)
+        return r, scale
+
+    def _holds(self, peaks: list) -> bool:
+        """Whether the precision does for these largest values of r in each band; turns to double precision if not."""
+        peak = float(np.max(peaks))
+        if not math.isfinite(peak):
+            raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
+        if peak <= FLOAT32_RANGE * self.typical or self.primal.dtype == self.xp.float64:
+            return True
+        self.primal, self.dx, self.dy = (cast(a, self.xp.float64) for a in (self.primal, self.dx, self.dy))
+        return False
+
+    def image(self, u: Array, scale: float = 1.0, out: Array | None = None) -> Array:
+        """P + scale · u as (H, W, C) in the precision of the input; ``out`` (C, H, W) is memory that may be reused."""
+        out = empty(u, len(u), channels_last=True) if out is None else out
+
+        def rows(first, last):
+            part = u[:, first:last] if scale == 1 else scale * u[:, first:last]
+            return (self.primal[:, first:last] + part,)
+
+        return cast(image(by_rows(rows, out)[0]), self.dtype)
+
+
+def _peak(*arrays: Array) -> float:
+    """The largest absolute value, which is not finite if one is not; 0 without any."""
+    extremes = [abs(float(v)) for a in map(detach, arrays) if math.prod(a.shape) for v in (a.min(), a.max())]
+    return float(np.max(extremes, initial=0))
+
+
+def solve(b: Array, screen: float, mean: Array | float | None = None) -> Array:
+    """The planes u (C, H, W) with (screen + ∇ᵀ∇) u = b; b is overwritten.
+
+    The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is that
+    of u where the caller knows it: differences have none, and what rounding leaves of it is divided by ``screen``.
+    """
+    height, width = b.shape[-2:]
+    λy, λx = (like(4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2, b) for n in (height, width))
+    # With all channels and in their layout: NumPy is slow where the axes of arrays lie in different order in memory.
+    screened = module(b).zeros_like(b[:, :1]) + screen
+    screened += λx
+    coefficients = dct2(b)
+    coefficients, _ = by_rows(lambda i, j: (coefficients[:, i:j] / (λy[i:j, None] + screened),), coefficients)
+    if mean is not None:
+        coefficients[:, 0, 0] = mean * math.sqrt(height * width)
+    return idct2(coefficients)
+
+
+def solve_weighted(
+    r: Array, screen: Array | float, weights: Array, tolerance: float, max_iterations: int = 200
+) -> tuple[Array, int]:
+    """The u (C, H, W) that minimises Σ screen |u|² + Σ weights |∇u - r|², and the number of iterations it took.
+
+    ``r`` (2, C, H, W), 0 in the unused column and row; ``weights`` (2, 1, H, W) >= 0; ``screen`` > 0, (1, H, W), or a
+    number for one that is the same everywhere.
+
+    Conjugate gradients until the residual in the norm of the preconditioner is ``tolerance`` of the first.
+
+    On tensors that require it the result is differentiable in all arguments: a residual that is zero but for its
+    derivative is added, and that is sent through the same solver on the way back, for the system is symmetric.
+    """
+    constants = detach(r), detach(screen), detach(weights)
+    system = _Weighted(*constants[1:])
+    flux = constants[2] * constants[0]
+    b, _ = adjoint_by_rows(lambda i, j: (None, *flux[..., i:j, :]), empty(r, len(r[0])))
+    u, iterations = system.solve(b, tolerance, max_iterations)
+    if any(getattr(a, "requires_grad", False) for a in (r, screen, weights)):
+        flux = weights * (r - module(r).stack(differences(u, 0, u.shape[1])))
+        zero = adjoint(*flux) - screen * u
+        if zero.requires_grad:
+            zero.register_hook(lambda g: system.solve(g, tolerance, max_iterations)[0])
+            u = u + (zero - zero.detach())
+    return u, iterations
+
+
+class _Weighted:
+    """The matrix screen + ∇ᵀ weights ∇ and its preconditioner D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2, by cosine transforms.
+
+    D is the mean weight around a pixel where ``screen`` varies, and 1 where it does not [Concus and Golub 1973, "Use of
+    Fast Direct Methods for the Efficient Numerical Solution of Nonseparable Elliptic Equations"]. In the latter case
+    the mean of the solution is 0, as that of the right-hand side.
+    """
+
+    def __init__(self, screen: Array | float, weights: Array):
+        self.weights = weights
+        self.mean: float | None = None
+        if isinstance(screen, float):
+            self.screen = module(weights).full_like(weights[0], screen)
+            self.scaling = module(weights).ones_like(weights[0])
+            self.σ = screen
+            self.mean = 0.0
+            return
+        self.screen = screen
+        mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights))).clip(1, None)
+        self.scaling = (mean + screen) ** -0.5
+        self.σ = float((screen * self.scaling**2).mean())
+
+    def solve(self, b: Array, tolerance: float, max_iterations: int) -> tuple[Array, int]:
+        zeros = module(b).zeros_like
+        u, p, residual, q, z = zeros(b), zeros(b), b, empty(b, len(b)), empty(b, len(b))
+        z, gain = self._precondition(residual, z)
+        goal, previous = tolerance**2 * gain, math.inf
+        for iteration in range(max_iterations):
+            if not gain > goal:
+                return u, iteration
+            p = _plus(z, gain / previous, p, p)
+            q, energies = self._apply(p, q)
+            step, previous = gain / total_of(energies), gain
+            u, residual = _plus(u, step, p, u), _plus(residual, -step, q, residual)
+            z, gain = self._precondition(residual, z)
+        return u, max_iterations
+
+    def _precondition(self, residual: Array, out: Array) -> tuple[Array, float]:
+        """z = D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2 residual, and the product of the two."""
+        out, _ = by_rows(lambda i, j: (self.scaling[:, i:j] * residual[:, i:j],), out)
+        out = solve(out, self.σ, self.mean)
+
+        def finish(i, j):
+            z = self.scaling[:, i:j] * out[:, i:j]
+            return z, sum_of(z * residual[:, i:j])
+
+        z, products = by_rows(finish, out)
+        return z, total_of(products)
+
+    def _apply(self, p: Array, out: Array) -> tuple[Array, list]:
+        """(screen + ∇ᵀ weights ∇) p, and its product with p in parts."""
+
+        def rows(i, j):
+            dx, dy = differences(p, i, j)
+            x, y, own = self.weights[0, :, i:j] * dx, self.weights[1, :, i:j] * dy, self.screen[:, i:j] * p[:, i:j]
+            return own, x, y, sum_of(x * dx + y * dy + own * p[:, i:j])
+
+        result, energies = adjoint_by_rows(rows, out)
+        return result, energies
+
+
+def _plus(a: Array, factor: float, b: Array, out: Array) -> Array:
+    """a + factor b"""
+    return by_rows(lambda i, j: (a[:, i:j] + factor * b[:, i:j],), out)[0]
+
+
+def unused_zeroed(differences: Array) -> Array:
+    """(2, C, H, W) values of differences with the unused column of dx and row of dy set to 0, in place."""
+    differences[0, ..., -1] = 0
+    differences[1, ..., -1, :] = 0
+    return differences
+
+
+def _around(weights: Array) -> Array:
+    """Sum of the weights of a pixel's differences, (1, H, W)."""
+    total = weights[0, ..., :] + weights[1]
+    total[..., 1:] += weights[0, ..., :-1]
+    total[..., 1:, :] += weights[1, ..., :-1, :]
+    return total
+
+
+def sum_of(values: Array) -> float:
+    """The sum, accumulated in double precision."""
+    return float(values.sum(dtype=module(values).float64))
+
+
+def total_of(bands: list) -> float:
+    """The sum of the one further value of each band, as ``by_rows`` lists them."""
+    return float(sum(value for (value,) in bands))
+
+
+def robust_mean(values: Array) -> float:
+    """The mean of values >= 0 when none counts as more than a hundred times this mean.
+
+    Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
+    """
+    mean = math.inf
+    while True:
+        clipped = float(values.clip(None, 100 * mean).mean(dtype=module(values).float64)) if values.shape[-1] else 0.0
+        if not clipped < 0.5 * mean:
+            return clipped
+        mean = clipped

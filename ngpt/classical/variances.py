@@ -1,0 +1,108 @@
+"""Variances of a stack made fit for weights, and the α they suggest.
+
+Given are sample variances of pixel means, from as few as two samples: too noisy to be used pixel by pixel, zero where
+all samples missed the light, and, like the values, larger where a sample hit it. Weights made of them as they are would
+believe the pixels that saw nothing, which darkens the image. So they are summed over colours (a colour is weighted as
+one vector), averaged over a neighbourhood, and bounded from below in proportion to their mean. All of this follows the
+exposure of the image: k times the image, with k² times the variances, has the same weights but for the factor k⁻².
+"""
+
+import math
+
+import numpy as np
+
+from ngpt.classical.arrays import Array, cast, detach, module, to_numpy
+from ngpt.classical.leastsquares import robust_mean
+
+# What is added to every variance, as a share of the mean over primal and differences.
+FLOOR = 1e-3
+
+# Share of the largest variances that do not count for α.
+OUTLIERS = 1e-4
+
+
+def auto_alpha(primal_var: Array, dx_var: Array, dy_var: Array, norm: int = 2) -> float:
+    """The α that weights the primal against the gradients as their noise does; variances are (H, W, C).
+
+    ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
+    by inverse variance. ``norm`` 1: mean standard deviation of gradients over that of the primal, the same for l1.
+    Values that are not finite or negative are left out, and so are the largest: one in ten thousand, but at least one.
+    The result is in [1e-3, 1e3], and 1 without any noise.
+
+    l2 at this α has 0.46 times the relMSE that it has at 0.2 (geometric mean over ten scenes at 4, 16 and 64 spp; at
+    worst 1.08 times). l1 is within 2 % on average at either.
+    """
+
+    def mean(*layers: Array) -> float:
+        values = np.concatenate([_positive_values(layer) for layer in layers]) ** (norm / 2)
+        if not values.size:
+            return 0.0
+        left_out = min(math.ceil(OUTLIERS * values.size), values.size - 1)
+        return float(np.partition(values, values.size - 1 - left_out)[: values.size - left_out].mean())
+
+    primal, gradients = mean(primal_var), mean(dx_var[:, :-1], dy_var[:-1])
+    if primal == gradients == 0:
+        return 1.0
+    ratio = gradients / primal if primal > 0 else math.inf
+    return min(max(ratio ** (1 / norm), 1e-3), 1e3)
+
+
+def smooth_variances(
+    primal_var: Array, dx_var: Array, dy_var: Array, trusted: tuple[Array, Array] | None = None
+) -> tuple[Array, Array]:
+    """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
+
+    Each is averaged twice over 3 x 3 pixels, over the values that are there: those that are not finite or negative are
+    missing. The result is divided by the mean of all three layers (a robust one), and ``FLOOR`` is added; without any
+    noise it is 1 everywhere. Differences that are not ``trusted``, and those that do not exist, have infinite variance.
+    """
+    xp = module(primal_var)
+    layers = [_smoothed(*_over_colours(layer)) for layer in (primal_var, dx_var[:, :-1], dy_var[:-1])]
+    mean = robust_mean(xp.concatenate([layer.reshape(-1) for layer in layers]))
+    p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
+    differences = xp.stack([p, p])
+    differences[0, :, :-1], differences[1, :-1] = x, y
+    return cast(p, primal_var.dtype)[None], cast(without_missing(differences, trusted), primal_var.dtype)
+
+
+def without_missing(variances: Array, trusted: tuple[Array, Array] | None) -> Array:
+    """Variances (2, H, W) of differences as (2, 1, H, W), infinite where there is none or it is not ``trusted``."""
+    xp = module(variances)
+    variances[0, :, -1] = math.inf
+    variances[1, -1] = math.inf
+    if trusted is not None:
+        variances = xp.where(xp.stack(trusted), variances, math.inf)
+    return variances[:, None]
+
+
+def _positive_values(variance: Array) -> np.ndarray:
+    """The sums over colours that are usable, as a list."""
+    total, good = _over_colours(detach(variance))
+    return to_numpy(total[good])
+
+
+def _over_colours(variance: Array) -> tuple[Array, Array]:
+    """(H, W, C) -> sum over C in double precision (squares of large radiances add up), and where it is usable."""
+    xp = module(variance)
+    good = (xp.isfinite(variance) & (variance >= 0)).all(-1)
+    return xp.where(good, cast(variance, xp.float64).sum(-1), 0), good
+
+
+def _smoothed(variance: Array, good: Array) -> Array:
+    """Twice the mean over 3 x 3 values that are good; where there are none, the mean of all that are."""
+    count = cast(good, variance.dtype)
+    mean = float(variance.sum()) / max(float(count.sum()), 1)
+    for _ in range(2):
+        variance, count = _box(variance), _box(count)
+    return module(variance).where(count > 0, variance / count.clip(1e-9, None), mean)
+
+
+def _box(values: Array) -> Array:
+    """Sums over 3 x 3 values, (H, W)."""
+    rows = values + 0
+    rows[1:] += values[:-1]
+    rows[:-1] += values[1:]
+    total = rows + 0
+    total[:, 1:] += rows[:, :-1]
+    total[:, :-1] += rows[:, 1:]
+    return total

@@ -1,0 +1,1 @@
+"""Denoisers that use no gradients, as methods: OIDN, NFOR, non-local means."""

@@ -1,0 +1,89 @@
+"""Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
+
+from collections.abc import Mapping
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.repair import Repaired
+
+AUXILIARY = ("prefiltered", "clean", "noisy", "none")
+
+
+def missing() -> str:
+    return "" if find_spec("mitsuba_oidn") else "OIDN (mitsuba-oidn) is not installed: pip install 'ngpt-recon[peers]'"
+
+
+def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
+    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo and normal.
+
+    ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first and calls them
+                   clean then, which is how its documentation has the best quality made; "clean" calls them clean as
+                   they are; "noisy" does not; "none" hides them
+    ``quality``    "high", "balanced" or "fast"
+    """
+    require_oidn()
+    if auxiliary not in AUXILIARY:
+        raise NgptError(f"method 'oidn': auxiliary '{auxiliary}': choose one of: {', '.join(AUXILIARY)}")
+    import mitsuba_oidn
+
+    qualities = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
+    if quality not in qualities:
+        raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(qualities)}")
+    level = getattr(mitsuba_oidn.Quality, qualities[quality])
+    features = {}
+    if auxiliary == "prefiltered":
+        features = prefiltered(data.features)
+    elif auxiliary != "none":
+        features = _in_range(data.features)
+    # With the light sources seen, as a renderer hands it over and OIDN was trained.
+    image = np.ascontiguousarray(data.image + data.direct, np.float32)
+    options = {"hdr": True, "clean_aux": auxiliary in ("prefiltered", "clean"), "quality": level}
+    # A copy: the result is a view of a buffer that OIDN owns.
+    return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
+
+
+def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself."""
+    require_oidn()
+    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
+
+
+def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    layers = {name: np.ascontiguousarray(features[name]) for name in ("albedo", "normal")}
+    return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
+
+
+def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:
+    """A feature denoised by OIDN's own model for it."""
+    if not layer.any():
+        return layer
+    result = np.zeros_like(layer)
+    device, held = _filters()
+    key = (name, layer.shape)
+    if key not in held:
+        if len(held) > 8:
+            held.clear()
+        held[key] = device.new_filter("RT")
+    held[key].set_image(name, layer)
+    held[key].set_image("output", result)
+    held[key].execute()
+    return result
+
+
+@lru_cache(maxsize=1)
+def _filters() -> tuple[Any, dict]:
+    """The device, and its filters by feature and size: to make one takes longer than to run it."""
+    import mitsuba_oidn
+
+    # On the CPU arrays are used where they lie; results would have to be copied from elsewhere.
+    return mitsuba_oidn.Device(mitsuba_oidn.DeviceType.CPU), {}
+
+
+def require_oidn() -> None:
+    """Raises NgptError where OIDN is not installed."""
+    if missing():
+        raise NgptError(f"method 'oidn': {missing()}")

@@ -1,0 +1,63 @@
+"""Speed against accuracy as a picture: error over total seconds, both axes logarithmic, by hand as SVG."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from html import escape
+
+from ngpt.evaluation.axes import Axes
+
+COLORS = ("#777777", "#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#c9a400", "#17a2a8", "#8a5a2b", "#d62f45", "#5b4fd6")
+
+
+@dataclass(frozen=True)
+class Point:
+    """A method at a sample count: total seconds and error, both positive."""
+
+    method: str
+    spp: int
+    seconds: float
+    error: float
+
+
+def pareto(points: list[Point]) -> list[bool]:
+    """For each point whether no other is at least as fast and as good, and better in one of the two."""
+    return [
+        not any(
+            (o.seconds <= p.seconds and o.error <= p.error) and (o.seconds < p.seconds or o.error < p.error)
+            for o in points
+        )
+        for p in points
+    ]
+
+
+def draw(points: list[Point], title: str, metric: str, noise: float | None = None) -> str:
+    """An SVG: a line for each method over its sample counts, filled rings for the Pareto set, the line through it.
+
+    ``noise`` is the reference's, below which errors mean nothing: a dashed line, where it is in the picture.
+    """
+    x = [p.seconds for p in points]
+    y = [p.error for p in points]
+    axes = Axes((min(x) / 1.15, max(x) * 1.15), (min(y) / 1.2, max(y) * 1.2))
+    parts = axes.frame("seconds, rendering and reconstruction", metric, title)
+    best = sorted((p for p, is_best in zip(points, pareto(points), strict=True) if is_best), key=lambda p: p.seconds)
+    path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in best)
+    parts.append(f'<path d="M{path}" fill="none" stroke="#000000" stroke-width="7" stroke-opacity="0.12"/>')
+    if noise and axes.y_range[0] < noise < axes.y_range[1]:
+        parts.append(axes.level(noise, "#999999", "noise of reference"))
+    methods = list(dict.fromkeys(p.method for p in points))
+    for i, method in enumerate(methods):
+        color = COLORS[i % len(COLORS)]
+        own = sorted((p for p in points if p.method == method), key=lambda p: p.spp)
+        path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in own)
+        dashes = f' stroke-dasharray="{5 * (i // len(COLORS))} 3"' if i >= len(COLORS) else ""
+        parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
+        for p in own:
+            shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
+            name = escape(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
+            look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
+            parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")
+    parts += axes.legend([(m, COLORS[i % len(COLORS)]) for i, m in enumerate(methods)])
+    note = "rings: Pareto set"
+    parts.append(f'<text x="{axes.right + 10}" y="{axes.bottom}" font-size="11" fill="#555555">{note}</text>')
+    return "\n".join([*parts, "</svg>"]) + "\n"

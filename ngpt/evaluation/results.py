@@ -1,0 +1,139 @@
+"""What the folder of results holds: results.json, results.csv, results.md and plots, all from the cells."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.evaluation.frontier import Point, draw, pareto
+from ngpt.evaluation.stacks import summary, write_json
+from ngpt.evaluation.tables import tables
+from ngpt.system.files import atomic_output
+
+_SECONDS = ("render", "reconstruct", "total")
+
+
+def write_results(results: dict[str, Any], out: Path) -> None:
+    """Adds ``summary`` and ``plots`` to the results and writes all files of the folder but the pictures."""
+    results["summary"] = summarised(results)
+    results["plots"] = {"frontier": {}}
+    (out / "plots").mkdir(exist_ok=True)
+    for scene in [*results["scenes"], None]:
+        points = _points([row for row in results["summary"] if row["scene"] == scene and _is_drawn(row)])
+        if points:
+            name = scene or "mean"
+            title = scene or f"geometric mean over {len(shared_scenes(results))} scenes"
+            noise = results["scenes"][scene]["reference"]["noise"] if scene else None
+            write_text(out / f"plots/frontier-{name}.svg", draw(points, title, results["primary"], noise))
+            results["plots"]["frontier"][name] = f"plots/frontier-{name}.svg"
+    write_json(out / "results.json", results)
+    write_text(out / "results.csv", as_csv(results))
+    write_text(out / "results.md", tables(results))
+
+
+def write_text(path: Path, text: str) -> None:
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text(text)
+
+
+def shared_scenes(results: dict[str, Any]) -> list[str]:
+    """The scenes that are there: the ones that means are over."""
+    return [name for name, entry in results["scenes"].items() if not entry.get("absent")]
+
+
+def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
+    """A row for each scene, spp and method: median and quartiles over seeds; then geometric means over scenes.
+
+    ``error`` is the primary metric's median. Means, with scene None, are of methods that are there on all scenes; a
+    metric that is not an error (PSNR, SSIM) has its arithmetic mean. ``pareto`` says that no cell of the scene is both
+    faster and better.
+    """
+    rows: list[dict[str, Any]] = []
+    groups: dict[tuple, list[dict[str, Any]]] = {}
+    for cell in results["cells"]:
+        if not cell["absent"]:
+            groups.setdefault((cell["scene"], cell["spp"], cell["method"]), []).append(cell)
+    for (scene, spp, method), cells in groups.items():
+        scores = {}
+        for name in cells[0]["metrics"]:
+            values = [cell["metrics"][name] for cell in cells if cell["metrics"].get(name) is not None]
+            if values:
+                scores[name] = summary(values)
+        seconds = {key: _median(cell["seconds"][key] for cell in cells) for key in _SECONDS}
+        rows.append(_row(results, scene, spp, method, scores, seconds, len(cells)))
+    scenes = shared_scenes(results)
+    for spp in results["settings"]["spp"]:
+        for method in results["methods"]:
+            parts = [row for row in rows if (row["spp"], row["method"]) == (spp, method)]
+            if scenes and len(parts) == len(scenes):
+                scores = {}
+                for name in parts[0]["metrics"]:
+                    if all(name in row["metrics"] for row in parts):
+                        lower = results["metrics"][name]["better"] == "lower"
+                        scores[name] = {
+                            key: _mean([row["metrics"][name][key] for row in parts], geometric=lower)
+                            for key in ("median", "low", "high")
+                        }
+                times: dict[str, float | None] = {}
+                for key in _SECONDS:
+                    known = [row["seconds"][key] for row in parts if row["seconds"][key] is not None]
+                    times[key] = _mean(known, geometric=True) if len(known) == len(parts) else None
+                rows.append(_row(results, None, spp, method, scores, times, min(row["seeds"] for row in parts)))
+    for scene in {row["scene"] for row in rows}:
+        timed = [row for row in rows if row["scene"] == scene and _is_drawn(row)]
+        for row, is_best in zip(timed, pareto(_points(timed)), strict=True):
+            row["pareto"] = is_best
+    return rows
+
+
+def _is_drawn(row: dict[str, Any]) -> bool:
+    """Whether there are a time and an error; logarithmic axes know no zero."""
+    return bool(row["error"]) and bool(row["seconds"]["total"])
+
+
+def _points(rows: list[dict[str, Any]]) -> list[Point]:
+    return [Point(row["method"], row["spp"], row["seconds"]["total"], row["error"]) for row in rows]
+
+
+def _row(
+    results: dict[str, Any],
+    scene: str | None,
+    spp: int,
+    method: str,
+    scores: dict[str, dict[str, float]],
+    seconds: dict[str, float | None],
+    seeds: int,
+) -> dict[str, Any]:
+    error = scores.get(results["primary"], {}).get("median")
+    row: dict[str, Any] = {"scene": scene, "spp": spp, "method": method, "error": error, "metrics": scores}
+    return row | {"seconds": seconds, "seeds": seeds, "pareto": False}
+
+
+def _median(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def _mean(values: list[float], geometric: bool) -> float:
+    if not geometric:
+        return float(np.mean(values))
+    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))
+
+
+def as_csv(results: dict[str, Any]) -> str:
+    """One line a cell."""
+    names = list(results["metrics"])
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(["scene", "spp", "method", "seed", "spp used", *(f"{key} s" for key in _SECONDS), *names, "absent"])
+    for cell in results["cells"]:
+        seconds = cell["seconds"] or {}
+        line = [cell["scene"], cell["spp"], cell["method"], cell["seed"], cell["spp used"]]
+        line += [seconds.get(key) for key in _SECONDS] + [cell["metrics"].get(name) for name in names]
+        writer.writerow([*("" if item is None else item for item in line), cell["absent"] or ""])
+    return text.getvalue()

@@ -1,0 +1,120 @@
+"""Temporal stability: how much a method's image changes with the noise alone.
+
+    python -m ngpt.evaluation.stability DIR
+
+DIR is a folder of results with pictures of all seeds (images = "all", configs/eval-stability.toml). A still scene
+rendered with a new seed for each frame should not move; what does move flickers. Writes DIR/stability.json, a table
+DIR/stability.md, and for each scene and method DIR/stability/SCENE-SPP-METHOD.png, the picture of a rolling shutter:
+each band of rows is of another seed, so flicker shows as steps between bands, bias does not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.evaluation.results import write_text
+from ngpt.evaluation.run import picture_path
+from ngpt.evaluation.stacks import write_json
+from ngpt.io.exr import read_image
+from ngpt.measure.metrics import EPSILON, check_size
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.report.png import encode_png
+from ngpt.system.console import Console
+from ngpt.system.files import atomic_output
+
+
+def flicker_and_bias(images: np.ndarray, reference: np.ndarray, share: float = 0.001) -> dict[str, float]:
+    """The two parts of relMSE over seeds, of images (N, H, W, 3), without the worst 0.1 % of the pixels of each.
+
+    ``flicker``  mean of v / (r² + 1e-3), v the sample variance over the N images
+    ``bias``     mean of ((m - r)² - v / N) / (r² + 1e-3), m the mean image; what its own noise adds to the square is
+                 taken off, so it is near 0 (of either sign) for an unbiased method
+    Their sum is the expected relMSE. Raises NgptError for fewer than two images, and for another size.
+    """
+    if len(images) < 2:
+        raise NgptError(f"{len(images)} image: stability needs those of at least 2 seeds")
+    check_size(images[0], reference)
+    scale = reference.astype(np.float64) ** 2 + EPSILON
+    mean, variance = images.mean(axis=0, dtype=np.float64), images.var(axis=0, ddof=1, dtype=np.float64)
+    parts = {"flicker": variance / scale, "bias": ((mean - reference) ** 2 - variance / len(images)) / scale}
+    result = {}
+    for name, part in parts.items():
+        values = np.sort(part.mean(axis=-1), axis=None)
+        result[name] = float(values[: values.size - int(share * values.size)].mean())
+    return result
+
+
+def rolling_shutter(images: np.ndarray) -> np.ndarray:
+    """One image (H, W, 3) of N (N, H, W, 3): rows in N bands from top to bottom, band i of image i."""
+    height = images.shape[1]
+    band = np.arange(height) * len(images) // height
+    return images[band, np.arange(height)]
+
+
+def study(out: Path) -> list[dict[str, Any]]:
+    """Writes what the module's description says and returns the rows of stability.json."""
+    try:
+        results = json.loads((out / "results.json").read_text())
+    except (OSError, ValueError) as error:
+        raise NgptError(f"{out / 'results.json'}: cannot be read: {error}; run eval.py first") from error
+    seeds = range(results["settings"]["seeds"])
+    rows = []
+    (out / "stability").mkdir(exist_ok=True)
+    for row in results["summary"]:
+        scene, spp, method = row["scene"], row["spp"], row["method"]
+        if scene is None:
+            continue
+        paths = [out / picture_path(scene, spp, method, seed) for seed in seeds]
+        missing = next((path for path in paths if not path.is_file()), None)
+        if missing:
+            raise NgptError(f'{missing}: no such picture; set images = "all" in the configuration, and run it again')
+        images = np.stack([read_image(path) for path in paths])
+        reference = read_image(out / results["scenes"][scene]["reference"]["image"])
+        path = out / "stability" / f"{scene}-{spp}-{method}.png"
+        with atomic_output(path, overwrite=True) as temporary:
+            temporary.write_bytes(encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
+        rows.append({"scene": scene, "spp": spp, "method": method, **flicker_and_bias(images, reference)})
+    write_json(out / "stability.json", rows)
+    write_text(out / "stability.md", table(rows, len(seeds)))
+    return rows
+
+
+def table(rows: list[dict[str, Any]], seeds: int) -> str:
+    """Markdown: flicker and bias of each method, the steadiest bold."""
+    methods = list(dict.fromkeys(row["method"] for row in rows))
+    lines = [f"Flicker / bias, the two parts of relMSE (trimmed), over {seeds} seeds; the steadiest in bold.", ""]
+    lines += ["| scene | spp | " + " | ".join(f"`{m}`" for m in methods) + " |", "|---|--:|" + "--:|" * len(methods)]
+    cells = {(row["scene"], row["spp"], row["method"]): row for row in rows}
+    for scene, spp in dict.fromkeys((row["scene"], row["spp"]) for row in rows):
+        found = {m: cells[scene, spp, m] for m in methods if (scene, spp, m) in cells}
+        least = min(row["flicker"] for row in found.values())
+        texts = []
+        for method in methods:
+            row = found.get(method)
+            text = f"{row['flicker']:.4f} / {row['bias']:.4f}" if row else ""
+            texts.append(f"**{text}**" if row and row["flicker"] == least else text)
+        lines.append(f"| {scene} | {spp} | " + " | ".join(texts) + " |")
+    return "\n".join(lines) + "\n"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, metavar="DIR")
+    args = parser.parse_args()
+    try:
+        study(args.folder)
+    except NgptError as error:
+        Console().error(error)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""Reconstructions as ONNX files that any renderer can run."""

@@ -1,0 +1,155 @@
+"""A network of ours as ONNX: raw buffers of a renderer in, the image out. CONTRACT.md is for those who run it."""
+
+import json
+import logging
+import warnings
+from functools import partial
+from pathlib import Path
+
+import onnx
+import onnx.compose
+import torch
+
+from ngpt.classical.controlvariates import SWEEPS
+from ngpt.errors import NgptError
+from ngpt.export import stages
+from ngpt.export.text import IR_VERSION, OPSET, finish, parse
+from ngpt.network import features
+from ngpt.network.model import WINDOW, Reconstructor
+from ngpt.network.unet import Convolution
+from ngpt.network.weights import load_weights
+from ngpt.version import __version__
+
+PRECISIONS = ("float32", "float16")
+
+
+def network_model(weights: str | Path, name: str, precision: str = "float32") -> onnx.ModelProto:
+    """The graph of the weights in that file; ``name`` is what its metadata call it.
+
+    ``precision`` is that of the convolutions but the last; what surrounds them is float32 always. float16 is for GPUs:
+    ONNX Runtime's CPU provider computes it in float32, with conversions, which hides overflows and takes longer.
+
+    Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
+    """
+    model, header = _load(weights)
+    config = model.config
+    text = stages.before(config).replace("$ALIGNMENT", str(model.alignment))
+    before = parse(text, stages.FUNCTIONS + stages.CONTROL_VARIATES)
+    passed_on = [output.name for output in before.graph.output if output.name != "channels"]
+    body = onnx.compose.add_prefix(network_body(model, precision), "network/")
+    after = onnx.compose.add_prefix(parse(stages.after(config), stages.FUNCTIONS), "after/", rename_outputs=False)
+    model_proto = onnx.compose.merge_models(before, body, [("channels", "network/channels")])
+    links = [("network/prediction", "after/prediction"), *((name, f"after/{name}") for name in passed_on)]
+    model_proto = onnx.compose.merge_models(model_proto, after, links, name="reconstruction")
+    return finish(model_proto, metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))})
+
+
+def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
+    """The graph that tells what the tiles of an image share, for the model of these weights."""
+    model, _ = _load(weights)
+    graph = parse(stages.alone(model.config), stages.FUNCTIONS)
+    return finish(graph, {"version": __version__, "method": name, "statistics": ", ".join(stages.STATISTICS)})
+
+
+def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
+    """What a host may want to know, by key; CONTRACT.md explains them."""
+    inputs = stages.layers(model.config)
+    return {
+        "version": __version__,
+        "method": name,
+        "inputs": ", ".join(inputs),
+        "layout": "NCHW, float32, row 0 on top, scene-linear",
+        "gradient": "forward: dx[y, x] = I[y, x + 1] - I[y, x], last column 0; dy alike",
+        "normal": "camera space, +x right, +y up, +z toward the viewer",
+        "alignment": str(model.alignment),
+        "overlap": str(overlap(model)),
+        "overlap with base": str(overlap(model, given_base=True)),
+        "bytes per pixel": str(bytes_per_pixel(model)),
+        "statistics": ", ".join(stages.STATISTICS),
+        "precision": precision,
+        "base": model.config.base,
+    }
+
+
+def overlap(model: Reconstructor, given_base: bool = False) -> int:
+    """Pixels that a tile must see on each side beyond those it is for, a multiple of the alignment.
+
+    What the network sees, and before it what the control variates and the smoothing of their weights do.
+    """
+    reach = max(model.network.radius, WINDOW // 2 if model.config.quiet else 0)
+    if model.config.base and not given_base:
+        reach += SWEEPS + 2
+    return -(-reach // model.alignment) * model.alignment
+
+
+def bytes_per_pixel(model: Reconstructor) -> int:
+    """What a run takes at most for each pixel, beside the image's layers; measured in tests/network/test_run_onnx.py.
+
+    The head reads the longest list of tensors there is; it exists as the list, as one tensor, and about once more in
+    units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor. ONNX Runtime's
+    arena, without which a run takes twice as long, gets half as much again and more.
+    """
+    listed = next(model.network.head.parameters()).shape[1]
+    return 7 * (3 * listed + 6 * features.channels(model.config.inputs))
+
+
+def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
+    model, header = load_weights(weights)
+    if model.config.base not in ("", "wcv"):
+        raise NgptError(
+            f"{weights}: the network starts from '{model.config.base}', for which there is no graph; train with 'wcv'"
+        )
+    return model, header
+
+
+class _Half(torch.nn.Module):
+    """The network in float16, but for its head, which predicts logarithms."""
+
+    def __init__(self, network: torch.nn.Module):
+        super().__init__()
+        self.network = network.half()
+        self.network.head.float()
+
+    def forward(self, channels: torch.Tensor) -> torch.Tensor:
+        return self.network(channels.half())
+
+
+def network_body(model: Reconstructor, precision: str = "float32") -> onnx.ModelProto:
+    """The network proper, ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
+    for module in model.network.modules():
+        if isinstance(module, Convolution):
+            # Normalised once and for all, rather than in each run of the graph.
+            weight = module.weight().detach()
+            if precision == "float16" and module is not model.network.head.convolution:
+                weight = weight.half()
+            module.weight = partial(_same, weight)  # type: ignore[method-assign]
+    a = model.alignment
+    # Sizes that are not special: the exporter takes 0 and 1 for constants.
+    example = torch.zeros(2, features.channels(model.config.inputs), 5 * a, 7 * a)
+    tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
+    # It would tell everyone that torchvision is not installed, which is not needed.
+    logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        program = torch.onnx.export(
+            model.network if precision == "float32" else _Half(model.network),
+            (example,),
+            dynamo=True,
+            opset_version=OPSET,
+            dynamic_shapes=({0: tiles, 2: a * rows, 3: a * columns},),
+            input_names=["channels"],
+            output_names=["prediction"],
+            verbose=False,
+        )
+    assert program is not None
+    proto = program.model_proto
+    proto.ir_version = IR_VERSION
+    # The exporter's notes on where each node comes from, paths of this machine among them, are no one else's business.
+    for item in (*proto.graph.node, *proto.graph.value_info, *proto.graph.input, *proto.graph.output, proto.graph):
+        del item.metadata_props[:]
+    del proto.graph.value_info[:]
+    return proto
+
+
+def _same(weight: torch.Tensor) -> torch.Tensor:
+    return weight

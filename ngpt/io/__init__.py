@@ -1,0 +1,1 @@
+"""OpenEXR: headers, files, and the layers of a stack in them, under any renderer's names."""

@@ -1,0 +1,234 @@
+"""Gradient stacks and results in OpenEXR files: `read` and `write`.
+
+Layers go by their names, those of the contract or of other renderers (``ngpt.io.aliases``). All else that a file
+holds, layers the toolkit does not know included, passes through as ``ngpt.io.openexr`` describes.
+"""
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+
+from ngpt.errors import NgptError
+from ngpt.io.aliases import Found, Resolution, resolve
+from ngpt.io.isolated import read_exr_isolated
+from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.layers import LAYERS, RGB
+from ngpt.stack import GradientStack
+from ngpt.version import __version__
+
+__all__ = [
+    "ExrImage",
+    "ExrPart",
+    "StackSource",
+    "pass_through",
+    "read",
+    "read_exr",
+    "read_image",
+    "with_channels",
+    "write",
+    "write_exr",
+]
+
+# Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
+_STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
+    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
+}  # fmt: skip
+_HALF_MAX = 65504.0
+_HALF_NORMAL_MIN = 2.0**-14
+
+
+@dataclass(frozen=True)
+class StackSource:
+    """The file a stack was read from, and where in it the layers are."""
+
+    image: ExrImage
+    resolution: Resolution
+
+
+def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None, isolated: bool = False) -> GradientStack:
+    """Reads a gradient stack, or any render with an image in it.
+
+    Layers are found by their names in the contract or in other renderers (``ngpt.io.aliases``). ``layers`` maps names
+    of the contract to names in the file: ``{"albedo": "ViewLayer.Denoising Albedo"}``. Half and uint channels are
+    converted to float32; layers the toolkit does not know stay in ``stack.source`` and come back on writing. In a
+    result file primal is the kept input, so that reconstructing a result gives the result again.
+
+    ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
+    for files of strangers (``ngpt.io.isolated``).
+
+    Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place.
+    """
+    image = read_exr_isolated(path) if isolated else read_exr(path)
+    resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path))
+    arrays = {name: _gather(image.parts[found.part], found.channels) for name, found in resolution.items()}
+    main = image.parts[resolution["primal"].part]
+    attributes = {name: value for name, value in main.header.items() if name not in _STRUCTURE}
+    stack = GradientStack(arrays, attributes, StackSource(image, resolution), str(path))
+    for name, found in resolution.items():
+        here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
+        if not np.array_equal(here, there):
+            raise NgptError(
+                f"{path}: layer '{name}' starts at pixel {_corner(there)} but 'primal' at {_corner(here)}; "
+                "render them with one data window"
+            )
+    return stack
+
+
+def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
+    """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
+
+    That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
+    ``read`` takes for the primal.
+    """
+    part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
+    if all(name in part.channels for name in RGB):
+        return _gather(part, RGB)
+    return read(path, isolated=isolated)["primal"]
+
+
+def write(
+    path: str | os.PathLike,
+    image: np.ndarray | GradientStack,
+    like: GradientStack | None = None,
+    overwrite: bool = False,
+) -> Path:
+    """Writes a stack, a result or an image, and returns its path.
+
+    A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
+    removed), or else as one scanline part, compressed with ZIP, primal in the root R G B.
+
+    A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
+    of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
+    the one that holds primal, or show something else in its root, then it stays as it is and a new part goes in front.
+    Alpha is copied into the root if the file has it elsewhere.
+
+    Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
+    below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` alone is written as float R G B.
+    """
+    if isinstance(image, GradientStack):
+        if like is not None:
+            raise NgptError(f"{path}: `like` goes with an image, not with a stack; pass one of the two")
+        result, _, main = _image_of(image, str(path))
+    elif like is not None:
+        pixels = GradientStack.from_arrays(path=str(path), primal=image)["primal"]
+        if pixels.shape != like["primal"].shape:
+            raise NgptError(
+                f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {like.path} is "
+                f"{like.width}x{like.height}; results are written at the size of their stack"
+            )
+        result, main = _with_result(*_image_of(like, str(path))[:2], pixels), 0
+    else:
+        result, _, main = _image_of(GradientStack.from_arrays(path=str(path), primal=image), str(path))
+    result.parts[main].header["ngpt:version"] = __version__
+    return write_exr(path, result, overwrite)
+
+
+def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
+    """Returns a stack that was made, not read, with further channels, (H, W) each, to be written beside its layers.
+
+    They go by names outside the contract, ``diagnostics.discarded`` for one, and are carried along as such channels of
+    a file are. ``pass_through`` reads them.
+    """
+    stack.require("primal", why="carrying further channels")
+    part, found = ExrPart("", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {}), {}
+    for name in stack.names:
+        prefix = "" if name in ("primal", "alpha") else f"{name}."
+        found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
+        _scatter(part, found[name].channels, stack[name], half=False)
+    part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
+    return GradientStack(stack.layers, stack.attributes, StackSource(ExrImage([part]), found), stack.path)
+
+
+def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
+    """The channels that a stack carries along beside the layers of the contract: name -> (H, W), as in the file."""
+    if stack.source is None:
+        return {}
+    known = {(found.part, channel) for found in stack.source.resolution.values() for channel in found.channels}
+    return {
+        name: channel
+        for i, part in enumerate(stack.source.image.parts)
+        for name, channel in part.channels.items()
+        if (i, name) not in known
+    }
+
+
+def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
+    """Returns the channels ``names`` as one array (H, W, C) float32."""
+    return np.stack([part.channels[name].astype(np.float32) for name in names], axis=-1)
+
+
+def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, int]:
+    """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes."""
+    if stack.source is None:
+        stack.require("primal", why=f"writing {path}")
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        image, resolution, main = ExrImage([ExrPart("", header, {})]), {}, 0
+    else:
+        image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
+        resolution = dict(stack.source.resolution)
+        main = resolution["primal"].part
+        size = next(iter(image.parts[main].channels.values())).shape
+        if (stack.height, stack.width) != size:
+            raise NgptError(
+                f"{path}: the stack is {stack.width}x{stack.height} but {stack.path}, which it was read from, is "
+                f"{size[1]}x{size[0]}; make a new stack of its layers with GradientStack.from_arrays"
+            )
+    header = {name: value for name, value in image.parts[main].header.items() if name in _STRUCTURE}
+    image.parts[main] = replace(image.parts[main], header={**header, **stack.attributes})
+    for name in stack.names:
+        values, half = stack[name], False
+        if name in resolution:
+            part, names = image.parts[resolution[name].part], resolution[name].channels
+            if np.array_equal(_gather(part, names).view(np.uint32), values.view(np.uint32)):
+                continue
+            half = _is_half(part, names) and not LAYERS[name].float_on_disk
+        else:
+            prefix = "" if name in ("primal", "alpha") else f"{name}."
+            part, names = image.parts[main], tuple(prefix + suffix for suffix in LAYERS[name].channels)
+            resolution[name] = Found(main, names, name)
+        _scatter(part, names, values, half)
+    return image, resolution, main
+
+
+def _with_result(image: ExrImage, resolution: Resolution, pixels: np.ndarray) -> ExrImage:
+    """Returns the file with ``pixels`` (H, W, 3) float32 as the root of its first part, the input as primal.R/G/B."""
+    primal, alpha = resolution["primal"], resolution.get("alpha")
+    source, parts = image.parts[primal.part], image.parts
+    root, kept = ("R", "G", "B"), ("primal.R", "primal.G", "primal.B")
+    shows_another = primal.channels not in (root, kept) and any(name in source.channels for name in root)
+    if primal.part != 0 or shows_another:
+        parts = [part if part.name else replace(part, name="source") for part in parts]
+        name = "ngpt"
+        while any(part.name == name for part in parts):
+            name += " result"
+        header = {key: value for key, value in source.header.items() if key not in ("channels", "lineOrder", "tiles")}
+        header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "name": name}
+        parts = [ExrPart(name, header, {}), *parts]
+    channels = parts[0].channels
+    half = _is_half(source, primal.channels)
+    channels.update(zip(kept, [source.channels[name] for name in primal.channels], strict=True))
+    if alpha:
+        channels.setdefault("A", image.parts[alpha.part].channels[alpha.channels[0]])
+    _scatter(parts[0], root, pixels, half)
+    return ExrImage(parts)
+
+
+def _scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
+    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float."""
+    if half:
+        peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+        half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
+    for index, name in enumerate(names):
+        part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)
+
+
+def _is_half(part: ExrPart, names: tuple[str, ...]) -> bool:
+    return all(part.channels[name].dtype == np.float16 for name in names)
+
+
+def _corner(window: tuple[np.ndarray, np.ndarray]) -> str:
+    return f"({window[0][0]}, {window[0][1]})"

@@ -1,0 +1,85 @@
+"""OpenEXR files from strangers, decoded in a process of their own: what crashes or stalls the decoder stays there.
+
+The other process reads the file and writes it anew, without compression, to a folder that only this user can look into;
+here that copy is read. It has less memory than this one, a limit on time, and its death is an NgptError.
+
+    python -P -m ngpt.io.isolated FILE COPY BYTES         the other process
+"""
+
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+import OpenEXR
+
+from ngpt.errors import NgptError
+from ngpt.io.header import read_headers
+from ngpt.io.openexr import ExrImage, read_exr, regular_file, write_exr
+
+# Beside what its pixels take, twice over: Python, NumPy and the stacks of OpenEXR's threads.
+_BASE = 2**31
+_SECONDS = 30.0  # and as long as 10 MB/s take
+_REFUSED = 3
+
+
+def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
+    """What ``read_exr`` returns, but for the header of mipmaps, of which tiles with one level are left.
+
+    Raises NgptError where ``read_exr`` does, and where the decoder crashes, runs out of memory or takes too long.
+    """
+    path = Path(path)
+    with regular_file(path) as file:
+        size = sum(header.bytes for header in read_headers(file, str(path)))
+    with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
+        copy = Path(folder) / "copy.exr"
+        # -P: a folder of strangers' files may hold a numpy.py, and might be the current one.
+        command = [sys.executable, "-P", "-m", "ngpt.io.isolated", str(path), str(copy), str(_BASE + 3 * size)]
+        environment = os.environ | {"PYTHONPATH": os.pathsep.join(p for p in map(os.path.abspath, sys.path) if p)}
+        seconds = _SECONDS + size / 10e6
+        try:
+            done = subprocess.run(command, capture_output=True, env=environment, timeout=seconds)
+        except subprocess.TimeoutExpired:
+            raise NgptError(f"{path}: not decoded after {seconds:.0f} s; it may be damaged: copy it again") from None
+        if done.returncode == _REFUSED:
+            raise NgptError(done.stdout.decode(errors="surrogateescape"))
+        if done.returncode:
+            raise NgptError(f"{path}: decoding it failed ({_cause(done)}); it is damaged or an attack: do not use it")
+        image = read_exr(copy)
+        told = json.loads(done.stdout)
+    for part, (compression, order) in zip(image.parts, told, strict=True):
+        part.header.update(compression=OpenEXR.Compression(compression), lineOrder=OpenEXR.LineOrder(order))
+    return image
+
+
+def _cause(done: subprocess.CompletedProcess) -> str:
+    if done.returncode < 0:
+        return f"killed by {signal.Signals(-done.returncode).name}"
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    return " ".join(lines[-1].split())[:200] if lines else f"exit status {done.returncode}"
+
+
+def _main(path: str, copy: str, limit: str) -> int:
+    own = resource.getrlimit(resource.RLIMIT_AS)[1]
+    most = int(limit) if own == resource.RLIM_INFINITY else min(int(limit), own)
+    resource.setrlimit(resource.RLIMIT_AS, (most, own))
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    try:
+        image = read_exr(path)
+        told = [(int(part.header["compression"]), int(part.header["lineOrder"])) for part in image.parts]
+        for part in image.parts:
+            part.header.update(compression=OpenEXR.NO_COMPRESSION, lineOrder=OpenEXR.INCREASING_Y)
+        write_exr(copy, image)
+    except NgptError as error:
+        sys.stdout.buffer.write(os.fsencode(str(error).replace(copy, path)))
+        return _REFUSED
+    print(json.dumps(told))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main(*sys.argv[1:]))

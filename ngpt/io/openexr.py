@@ -1,0 +1,270 @@
+"""OpenEXR files, verbatim.
+
+What a file holds passes through a read and a write unharmed: parts, channels of every type, attributes of every type
+that Python's OpenEXR knows, data and display windows, tiles, line order. The exceptions:
+
+- Lossy compression (PXR24, B44, B44A, DWAA, DWAB) becomes ZIP, since a second pass through it would damage the image
+  once more, and gradients, variances and depth for the first time.
+- Of mipmaps and ripmaps the full-size level is kept.
+- Attributes that are empty lists are dropped, and a rational is reduced (48/2 becomes 24/1).
+
+Deep images and subsampled channels are refused. OpenEXR holds whole files in memory, and hands over the readable parts
+of a damaged file as if there were no others; here a damaged file is an error. While a file is read, what other threads
+print to stdout or stderr is lost, since OpenEXR's own messages have to be kept out of there.
+"""
+
+import contextlib
+import io
+import math
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+from fractions import Fraction
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+import OpenEXR
+
+from ngpt.errors import NgptError
+from ngpt.io.header import PartHeader, read_headers
+from ngpt.system.files import atomic_output
+
+_LOSSY = (
+    OpenEXR.PXR24_COMPRESSION,
+    OpenEXR.B44_COMPRESSION,
+    OpenEXR.B44A_COMPRESSION,
+    OpenEXR.DWAA_COMPRESSION,
+    OpenEXR.DWAB_COMPRESSION,
+)
+_PIXEL_TYPES = (np.float16, np.float32, np.uint32)
+_ATTRIBUTE_TYPES = (
+    str,
+    OpenEXR.Bytes,
+    OpenEXR.Compression,
+    OpenEXR.Envmap,
+    OpenEXR.KeyCode,
+    OpenEXR.LineOrder,
+    OpenEXR.OpaqueAttribute,
+    OpenEXR.PreviewImage,
+    OpenEXR.Storage,
+    OpenEXR.TileDescription,
+    OpenEXR.TimeCode,
+)
+_FLOAT_MAX = float(np.finfo(np.float32).max)
+
+
+@dataclass(frozen=True)
+class ExrPart:
+    """One part: its name ("" if it has none), its header as OpenEXR gives it, and its channels as (H, W) arrays."""
+
+    name: str
+    header: dict[str, Any]
+    channels: dict[str, np.ndarray]
+
+
+@dataclass(frozen=True)
+class ExrImage:
+    """An OpenEXR file, verbatim."""
+
+    parts: list[ExrPart]
+
+
+def read_exr(path: str | os.PathLike) -> ExrImage:
+    """Reads a file with all that is in it.
+
+    Its size is checked before its pixels are decoded (``ngpt.io.header``). Raises NgptError if it is not there, no
+    regular file, damaged, too large, deep or subsampled, and if it changes while it is read.
+    """
+    path = Path(path)
+    with regular_file(path) as file:
+        before = _state(file)
+        headers = read_headers(file, str(path))
+        for header in headers:
+            if header.deep:
+                raise NgptError(
+                    f"{path}: {header.label} is a deep image; flatten it first, or render without deep output"
+                )
+            for name, (_, step) in header.channels.items():
+                if step != (1, 1):
+                    raise NgptError(
+                        f"{path}: channel '{name}' of {header.label} is subsampled {step[0]}x{step[1]}; "
+                        "save the image as R G B at full size"
+                    )
+        try:
+            parts = _decode(file, path, headers)
+        finally:
+            # Whatever else went wrong is then no wonder.
+            if _state(file) != before:
+                raise NgptError(f"{path}: changed while it was read; wait until its writer is done, and read it again")
+    return ExrImage(
+        [
+            ExrPart(part.name(), dict(part.header), {name: channel.pixels for name, channel in part.channels.items()})
+            for part in parts
+        ]
+    )
+
+
+def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False) -> Path:
+    """Writes ``image`` to ``path``, complete or not at all, and returns the path.
+
+    Channels are float16, float32 or uint32 arrays (H, W) in any memory layout. Attributes are str, int (32 bit), float
+    (stored with 32 bit), fractions.Fraction, lists of str or float, tuples and arrays as OpenEXR reads them, and
+    OpenEXR's own types. Raises NgptError for anything the file could not give back.
+    """
+    if Path(path).suffix.lower() != ".exr":
+        raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
+    parts = [_writable(part, str(path)) for part in image.parts]
+    with atomic_output(path, overwrite) as temporary, open(temporary, "r+b") as file:
+        name = _numbered(file)
+        try:
+            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
+            raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
+    return Path(path)
+
+
+@contextlib.contextmanager
+def regular_file(path: Path) -> Iterator[BinaryIO]:
+    """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
+    try:
+        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+    except FileNotFoundError:
+        raise NgptError(f"{path}: not found; check the name") from None
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
+        if isinstance(error, IsADirectoryError):
+            raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
+        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
+    with file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise NgptError(f"{path}: is a pipe or a device, no file; save the image to disk first")
+        try:
+            yield file
+        except OSError as error:
+            raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _numbered(file: BinaryIO) -> str:
+    """A name for an open file: its own may belong to another by now, or be one that OpenEXR cannot encode."""
+    return f"/dev/fd/{file.fileno()}"
+
+
+def _state(file: BinaryIO) -> tuple[int, int]:
+    status = os.fstat(file.fileno())
+    return status.st_size, status.st_mtime_ns
+
+
+def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
+    """The parts as OpenEXR reads them; raises NgptError unless they hold all that ``headers`` tell."""
+    name = _numbered(file)
+    # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
+    printed = io.StringIO()
+    try:
+        with contextlib.redirect_stdout(printed), _without_native_stderr():
+            parts = OpenEXR.File(name, separate_channels=True).parts
+    except MemoryError as error:
+        size = sum(header.bytes for header in headers) / 2**20
+        raise NgptError(f"{path}: out of memory: its channels take {size:.0f} MiB; free some, or cut it up") from error
+    except Exception as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
+        raise NgptError(f"{path}: cannot be read ({reason}); it may be damaged: render or copy it again") from error
+    # What the two readers of a header disagree on is what the limits do not hold for.
+    expected = [({*header.channels}, {header.size[::-1]}) for header in headers]
+    got = [({*part.channels}, {channel.pixels.shape for channel in part.channels.values()}) for part in parts]
+    if got != expected:
+        warning = printed.getvalue().partition("Warning: ")[2].replace(name, path.name).splitlines()
+        reason = f" ({warning[0]})" if warning else ""
+        raise NgptError(f"{path}: damaged or incomplete{reason}; render or copy it again")
+    return parts
+
+
+@contextlib.contextmanager
+def _without_native_stderr() -> Iterator[None]:
+    """Keeps what OpenEXR's C core writes to file descriptor 2 from the user: it comes again as an exception."""
+    try:
+        kept = os.dup(2)
+    except OSError:  # the process has no stderr
+        yield
+        return
+    null = os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(null, 2)
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)
+        os.close(null)
+
+
+def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:
+    """Returns header, channels and name of an OpenEXR.Part that is written faithfully."""
+    header = {}
+    for name, value in part.header.items():
+        # OpenEXR makes `channels` itself, believes a `chunkCount` that no longer holds, and cannot write empty lists.
+        if name in ("channels", "chunkCount") or (isinstance(value, list) and not value):
+            continue
+        header[name] = _attribute(name, value, path)
+    if header.get("compression") in _LOSSY:
+        header["compression"] = OpenEXR.ZIP_COMPRESSION
+    if "tiles" in header:
+        # The writer leaves the smaller levels of a mipmap out, and then nobody can read the file.
+        tiles = OpenEXR.TileDescription()
+        tiles.xSize, tiles.ySize = header["tiles"].xSize, header["tiles"].ySize
+        header["tiles"] = tiles
+    linear = {channel.name: channel.pLinear for channel in part.header.get("channels", ())}
+    channels = {}
+    for name, pixels in part.channels.items():
+        dtype = pixels.dtype.newbyteorder("=")
+        if dtype not in _PIXEL_TYPES or pixels.ndim != 2:
+            raise NgptError(
+                f"{path}: channel '{name}' is {pixels.dtype} {pixels.shape}; "
+                "OpenEXR stores (height, width) arrays of float16, float32 or uint32"
+            )
+        # OpenEXR takes no notice of strides and byte order: it would write garbage.
+        channels[name] = OpenEXR.Channel(np.ascontiguousarray(pixels, dtype), 1, 1, bool(linear.get(name, False)))
+    return header, channels, part.name
+
+
+def _attribute(name: str, value: Any, path: str) -> Any:
+    """Returns ``value`` in a form that OpenEXR stores as it is; others it wraps, drops or transposes in silence."""
+    value = _plain(value)
+    if not _fits(value):
+        raise NgptError(
+            f"{path}: attribute '{name}' = {' '.join(str(value).split())} ({type(value).__name__}) "
+            "does not fit an OpenEXR header; store it as a string"
+        )
+    return value
+
+
+def _plain(value: Any) -> Any:
+    """Returns NumPy scalars as Python's, and arrays in memory order."""
+    if isinstance(value, tuple | list):
+        return type(value)(_plain(item) for item in value)
+    if isinstance(value, np.generic):
+        return value.item()
+    return np.ascontiguousarray(value) if isinstance(value, np.ndarray) else value
+
+
+def _fits(value: Any) -> bool:
+    """Says whether OpenEXR can store ``value`` with no more loss than rounding to 32-bit float."""
+    match value:
+        case int():
+            return -(2**31) <= value < 2**31
+        case float():
+            return not math.isfinite(value) or abs(value) <= _FLOAT_MAX
+        case Fraction():
+            return _fits(value.numerator) and _fits(value.denominator)
+        case tuple():
+            return all(map(_fits, value))
+        case list():
+            return all(isinstance(item, str) for item in value) or all(
+                isinstance(item, float) and _fits(item) for item in value
+            )
+        case np.ndarray():
+            floating = value.dtype in (np.float32, np.float64)
+            vector = value.shape in ((2,), (3,)) and (floating or value.dtype == np.int32)
+            matrix = value.shape in ((3, 3), (4, 4)) and floating
+            return vector or matrix or (value.shape == (1,) and value.dtype == np.float64)
+    return isinstance(value, _ATTRIBUTE_TYPES)

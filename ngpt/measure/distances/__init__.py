@@ -1,0 +1,1 @@
+"""Perceptual distances in PyTorch, for training and for E-LPIPS as a metric."""

@@ -1,0 +1,265 @@
+"""Runs our networks by ONNX Runtime: without PyTorch, in tiles within a given memory, on the processor asked for.
+
+export/CONTRACT.md tells what the files expect; this is the host that comes with ngpt.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+from collections.abc import Callable, Mapping
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.network import combine
+from ngpt.network.exposure import statistics
+
+# MiB that the network may use beside the image's own layers.
+MEMORY = 2048
+# What a network may start from, "" for nothing.
+BASES = ("", "l2", "cv", "wcv")
+DEVICES = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "directml": "DmlExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+}
+
+Progress = Callable[[int, int], None]
+
+
+class Cancelled(NgptError):
+    """A reconstruction was ended by the caller's ``stop``."""
+
+
+class _OutOfMemory(NgptError):
+    """ONNX Runtime could not get the memory for a run."""
+
+
+class Network:
+    """A network's file, loaded; thread-safe.
+
+    ``path``     model.onnx, as ``python -m export`` writes it
+    ``device``   one of ``DEVICES``; "auto" is "cpu"
+    ``threads``  of the CPU, 0 for as many as it has cores
+
+    Raises NgptError for a file that is none of ours, and for a device that cannot be used: there is no other that is
+    taken in silence.
+    """
+
+    def __init__(self, path: str | Path, device: str = "auto", threads: int = 0):
+        self.path, self.device, self.threads = Path(path), "cpu" if device == "auto" else device, threads
+        self.session = self._session(self.path)
+        metadata = self.session.get_modelmeta().custom_metadata_map
+        try:
+            self.inputs = tuple(metadata["ngpt.inputs"].split(", "))
+            self.alignment = int(metadata["ngpt.alignment"])
+            self.base = metadata["ngpt.base"]
+            self.overlap = int(metadata["ngpt.overlap with base" if self.base else "ngpt.overlap"])
+            self.bytes = int(metadata["ngpt.bytes per pixel"])
+        except (KeyError, ValueError) as error:
+            raise NgptError(
+                f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
+            ) from error
+        self._check()
+
+    def _check(self) -> None:
+        """Raises NgptError unless the metadata make sense, and are those of the graph beside them."""
+        for name, value, most in (("alignment", self.alignment, 2**12), ("overlap", self.overlap, 2**12)):
+            if not (name == "overlap" or value) or not 0 <= value <= most:
+                raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
+        if self.bytes < 1 or self.base not in BASES:
+            raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
+        own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
+        graph = {given.name for given in self.session.get_inputs()}
+        # Those that a host may leave out have a value in the graph.
+        optional = {given.name for given in self.session.get_overridable_initializers()}
+        if not graph <= own <= graph | optional:
+            raise NgptError(
+                f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, its metadata tell of "
+                f"{', '.join(sorted(own))}; export it anew"
+            )
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The layers of a stack that its inputs are, or are made of."""
+        return tuple(name for name in self.inputs if name not in combine.IMAGES)
+
+    def reconstruct(
+        self,
+        layers: Mapping[str, np.ndarray],
+        base: np.ndarray | None = None,
+        *,
+        memory: int = MEMORY,
+        batch: int = 1,
+        progress: Progress = lambda done, total: None,
+        stop: Callable[[], bool] = lambda: False,
+    ) -> np.ndarray:
+        """The image (H, W, 3) float32, scene-linear, without direct emission.
+
+        ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
+        ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
+        ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5. Where the
+                      machine has less to give, they shrink by themselves
+        ``batch``     tiles in one run, which fills GPUs
+        ``progress``  called with (tiles done, tiles)
+        ``stop``      asked before each run whether to end, which raises ``Cancelled``
+
+        Raises NgptError where ``memory``, or what the machine has of it, does not hold the smallest tile.
+        """
+        memory = min(memory, free_address_space() // 2)
+        while True:
+            try:
+                return self._reconstruct(layers, base, memory, batch, progress, stop)
+            except _OutOfMemory as error:
+                memory = self._less(layers["primal"].shape[:2], memory, batch, error)
+
+    def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
+        """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
+        _, (rows, columns) = self.plan(*size, memory, batch)
+        (*_, (_, low)), (*_, (_, narrow)) = (self._cuts(n) for n in size)
+        used, least = (area * self.bytes * batch / 2**20 for area in (rows * columns, low * narrow))
+        less = max(int(used / 2), math.ceil(least))
+        if less >= used:
+            raise error
+        return less
+
+    def _reconstruct(
+        self,
+        layers: Mapping[str, np.ndarray],
+        base: np.ndarray | None,
+        memory: int,
+        batch: int,
+        progress: Progress,
+        stop: Callable[[], bool],
+    ) -> np.ndarray:
+        names = (*self.inputs, "base") if self.base else self.inputs
+        layers = layers if base is None else {**layers, "base": base}
+        missing = [name for name in names if name not in layers]
+        if missing:
+            raise NgptError(f"network {self.path} needs layers {', '.join(missing)}, which are not given")
+        height, width = layers["primal"].shape[:2]
+        tiles, (rows, columns) = self.plan(height, width, memory, batch)
+        shared = statistics(layers)
+        image = np.empty((height, width, 3), np.float32)
+        progress(0, len(tiles))
+        for first in range(0, len(tiles), batch):
+            if stop():
+                raise Cancelled(f"network {self.path}: stopped after {first} of {len(tiles)} tiles")
+            group = tiles[first : first + batch]
+            windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
+            feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
+            results = self._run(self.session, feed | {"statistics": shared})
+            for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
+                part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]
+                image[inner_y, inner_x] = np.moveaxis(part, 0, -1)
+            progress(min(first + batch, len(tiles)), len(tiles))
+        return image
+
+    def plan(self, height: int, width: int, memory: int, batch: int = 1) -> tuple[list[tuple], tuple[int, int]]:
+        """Tiles (rows, columns, top, left) and their common size (height, width): the least work within ``memory``.
+
+        ``rows`` and ``columns`` are what a tile is for, ``top`` and ``left`` where it begins.
+        """
+        most = memory * 2**20 // (self.bytes * batch)
+        best: tuple | None = None
+        down, across = (self._cuts(n) for n in (height, width))
+        for ys, tall in down:
+            fitting = [(xs, wide) for xs, wide in across if tall * wide <= most]
+            if fitting:
+                xs, wide = fitting[0]
+                work = len(ys) * len(xs) * tall * wide
+                if best is None or work < best[0]:
+                    best = work, ys, xs, tall, wide
+        if best is None:
+            needed = -(-down[-1][1] * across[-1][1] * self.bytes * batch // 2**20)
+            raise NgptError(
+                f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed; "
+                "allow more (--memory, ulimit -v)"
+            )
+        _, ys, xs, tall, wide = best
+        return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
+
+    def _cuts(self, length: int) -> list[tuple[list[tuple[slice, int]], int]]:
+        """Ways to cut a side, coarsest first: what each piece is for and where it begins, and how long all are."""
+        cuts: list[tuple[list[tuple[slice, int]], int]] = []
+        for count in range(1, max(1, length // self.alignment) + 1):
+            step = -(-length // (count * self.alignment)) * self.alignment
+            # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment.
+            size = min(step + 2 * self.overlap + length % self.alignment, length)
+            starts = range(0, length, step)
+            pieces = [(slice(n, min(n + step, length)), min(max(n - self.overlap, 0), length - size)) for n in starts]
+            if not cuts or size < cuts[-1][1]:
+                cuts.append((pieces, size))
+        return cuts
+
+    def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
+        try:
+            result = session.run(None, feed)[0]
+        except Exception as error:
+            if isinstance(error, MemoryError) or "allocate memory" in str(error) or "bad_alloc" in str(error):
+                raise _OutOfMemory(
+                    f"network {self.path}: out of memory with the smallest tiles; free some, or give it more"
+                ) from error
+            raise NgptError(f"network {self.path}: ONNX Runtime cannot run it: {one_line(error)}") from error
+        expected = (len(feed["primal"]), 3, *feed["primal"].shape[2:])
+        if result.shape != expected:
+            raise NgptError(f"network {self.path}: gives {result.shape} where {expected} is due; export it anew")
+        return result
+
+    def _session(self, path: Path):
+        if not path.is_file():
+            raise NgptError(f"{path}: no such file; `python -m export` writes it")
+        return _session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
+
+
+@lru_cache(maxsize=8)
+def _session(path: str, _modified: int, device: str, threads: int):
+    """The session of a file; made again when the file has changed."""
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise NgptError("ONNX Runtime is not installed: pip install onnxruntime") from error
+    if device not in DEVICES:
+        raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
+    provider, available = DEVICES[device], onnxruntime.get_available_providers()
+    if provider not in available:
+        have = [name for name, provider in DEVICES.items() if provider in available]
+        raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    # What goes wrong comes as an exception; in the log it would stand a second time.
+    options.log_severity_level = 4
+    try:
+        session = onnxruntime.InferenceSession(path, options, providers=[provider])
+    except Exception as error:
+        raise NgptError(f"{path}: ONNX Runtime cannot load it: {one_line(error)}") from error
+    if session.get_providers()[0] != provider:
+        raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
+    return session
+
+
+def free_address_space() -> int:
+    """MiB that this process may still map, far more than any machine has where no limit (``ulimit -v``) is set."""
+    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
+    try:
+        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    except OSError:  # not Linux
+        used = 0
+    return 2**40 if limit == resource.RLIM_INFINITY else max(0, limit - used) // 2**20
+
+
+def planes(layer: np.ndarray) -> np.ndarray:
+    """(H, W, C) as (C, H, W), contiguous."""
+    return np.ascontiguousarray(np.moveaxis(layer, -1, 0), np.float32)
+
+
+def one_line(error: Exception) -> str:
+    return " ".join(str(error).split())[:300]

@@ -1,0 +1,89 @@
+"""Neural reconstruction of one stack: the backend of the methods ``ngpt`` and ``ngpt-fast``."""
+
+import os
+from functools import lru_cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngpt.errors import NgptError
+from ngpt.network import features, padding
+from ngpt.network.model import Reconstructor
+from ngpt.network.transfer import signed_exp
+from ngpt.network.weights import load_weights
+from ngpt.repair import Repaired
+from ngpt.training.examples import layers_of
+
+# Padded pixels of a tile's side. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
+TILE = 640
+
+
+def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE) -> np.ndarray:
+    """The image (H, W, 3) float32, scene-linear, without direct emission, by the weights of that file.
+
+    ``device`` is one of PyTorch's, or "auto": a GPU where there is one. Tiles overlap by what the network sees, so that
+    their size does not change the result. Raises NgptError for weights that cannot be read, and layers they need.
+    """
+    model = _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
+    held = {"primal", *data.features}
+    held |= {"dx", "dy"} if data.dx is not None else set()
+    held |= data.known_variances().keys()
+    missing = [name for name in model.config.needs if name not in held]
+    if missing:
+        raise NgptError(f"weights {path} need layers {', '.join(missing)}, which the stack lacks")
+    layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
+    return reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
+
+
+@torch.inference_mode()
+def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
+    """What ``model(layers)`` returns, computed tile by tile of at most ``tile`` padded pixels' side.
+
+    Exposure and bounds are those of the whole image. Layers may lie on another device than the model.
+    """
+    height, width = layers["primal"].shape[-2:]
+    device = next(model.parameters()).device
+    scaled, exposure = features.normalised({name: layers[name] for name in model.config.layers})
+    low, high = model.bounds(scaled["primal"])
+    pads = padding.pads(height, width, model.alignment)
+    padded = padding.pad(features.completed(scaled, model.config.inputs), pads)
+    rows, columns = padded["primal"].shape[-2:]
+    logarithm = padded["primal"].new_empty(len(padded["primal"]), 3, rows, columns)
+    spans = (_spans(length, tile, model.alignment, model.network.radius) for length in (rows, columns))
+    for (y, y_around), (x, x_around) in product(*spans):
+        part = {name: layer[..., y_around, x_around].to(device) for name, layer in padded.items()}
+        inner = np.s_[..., _within(y, y_around), _within(x, x_around)]
+        logarithm[..., y, x] = model.predict(part)[inner].to(logarithm.device)
+    image = padding.crop(logarithm, pads)
+    return signed_exp(torch.minimum(torch.maximum(image, low), high)) * exposure
+
+
+def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:
+    """What each tile is for, and what it needs to see for that; all divisible by ``alignment``."""
+    margin = -(-radius // alignment) * alignment
+    if length <= tile:
+        return [(slice(0, length), slice(0, length))]
+    step = max(tile - 2 * margin, alignment) // alignment * alignment
+    return [
+        (slice(a, min(a + step, length)), slice(max(a - margin, 0), min(a + step + margin, length)))
+        for a in range(0, length, step)
+    ]
+
+
+def _within(inner: slice, outer: slice) -> slice:
+    return slice(inner.start - outer.start, inner.stop - outer.start)
+
+
+@lru_cache(maxsize=4)
+def _model(path: str, _modified: int, device: str) -> Reconstructor:
+    """The model of a file; read again when the file has changed."""
+    model, _ = load_weights(path)
+    if device == "auto":
+        device = "cuda" if torch.cuda.is_available() else "cpu"
+    try:
+        return model.to(device)
+    except (RuntimeError, AssertionError) as error:
+        raise NgptError(f"device '{device}': cannot be used: {' '.join(str(error).split())[:200]}") from error

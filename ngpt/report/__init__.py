@@ -1,0 +1,1 @@
+"""Pictures and pages: tone mapping, PNG, and the self-contained HTML report."""

@@ -1,0 +1,163 @@
+"""The report of an evaluation: from the results folder of ``eval.py`` to one HTML file."""
+
+import json
+import math
+import os
+from collections.abc import Sequence
+from pathlib import Path
+
+from ngpt.errors import NgptError
+from ngpt.io.exr import read_image
+from ngpt.report.page import Entry, Overview, Scene, write_report
+
+FORMAT = 1
+ROOM = (
+    54 * 1280 * 720
+)  # pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes
+
+
+def write_evaluation_report(folder: str | os.PathLike, output: str | os.PathLike, *, overwrite: bool = False) -> Path:
+    """Writes the report of ``folder``/results.json to ``output`` and returns its path.
+
+    Tables and plots hold every cell; pictures of the first seed are shown for as many sample counts, from the lowest
+    on, as fit into ROOM, and the page says which those are. A method without a picture is named with its reason.
+
+    Raises NgptError if the folder has no results that can be read, or none with a picture.
+    """
+    folder = Path(folder)
+    results = _results(folder)
+    cells = [cell for cell in results["cells"] if cell["image"]]
+    counts = sorted({cell["spp"] for cell in cells})
+    shown = _fitting(results, cells, counts)
+    scenes = []
+    for name in results["scenes"]:
+        for spp in shown:
+            here = [cell for cell in results["cells"] if (cell["scene"], cell["spp"]) == (name, spp)]
+            if any(cell["image"] for cell in here):
+                scenes.append(_scene(folder, results, name, spp, here))
+    if not scenes:
+        raise NgptError(f"{folder / 'results.json'}: no cell has a picture, so there is nothing to show")
+    versions = results["metadata"].get("versions", {})
+    footer = {"date": results["date"], **{key: str(value) for key, value in versions.items()}}
+    footer |= {
+        key: str(results["metadata"][key]) for key in ("cpu", "threads", "commit") if results["metadata"].get(key)
+    }
+    footer["pictures"] = f"first seed; {', '.join(map(str, shown))} spp of {', '.join(map(str, counts))}"
+    overview = Overview(_tables(results), _plots(folder, results), _formulas(results))
+    title, command = results["title"], results["command"]
+    return write_report(output, title, scenes, command=command, footer=footer, overview=overview, overwrite=overwrite)
+
+
+def _results(folder: Path) -> dict:
+    path = folder / "results.json"
+    try:
+        results = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise NgptError(f"{path}: cannot be read ({error}); run eval.py with --out {folder} first") from error
+    if not isinstance(results, dict) or results.get("format") != FORMAT:
+        raise NgptError(f"{path}: is not of format {FORMAT}; run the eval.py of this version again")
+    return results
+
+
+def _fitting(results: dict, cells: list[dict], counts: list[int]) -> list[int]:
+    """The sample counts whose pictures fit into ROOM, at least one; high counts are left out first: they look alike."""
+    taken, shown = 0, list[int]()
+    for spp in counts:
+        drawn = {(cell["scene"], cell["method"]) for cell in cells if cell["spp"] == spp}
+        names = [name for name, _ in drawn] + list({name for name, _ in drawn})  # a reference each
+        taken += sum(math.prod(results["scenes"][name]["size"]) for name in names)
+        if shown and taken > ROOM:
+            break
+        shown.append(spp)
+    return shown
+
+
+def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) -> Scene:
+    scene = results["scenes"][name]
+    entries, absent = [], []
+    for method in results["methods"]:
+        mine = [cell for cell in cells if cell["method"] == method]
+        pictured = next((cell for cell in mine if cell["image"]), None)
+        if pictured is None:
+            why = results["methods"][method]["absent"] or next((c["absent"] for c in mine if c["absent"]), "no result")
+            absent.append(f"{method} ({why})")
+            continue
+        seconds = _row(results, name, spp, method)["seconds"]["total"]
+        metrics: dict[str, float | Sequence[float]] = {}
+        for metric in results["metrics"]:
+            values = [_value(cell["metrics"].get(metric)) for cell in mine if not cell["absent"]]
+            metrics[metric] = values[0] if len(values) == 1 else values
+        entries.append(Entry(method, read_image(folder / pictured["image"]), seconds, metrics))
+    # The first metric is the one of the captions, and the one the best method is chosen by.
+    for entry in entries:
+        entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))
+    reference = scene["reference"] or {"image": None}
+    image = read_image(folder / reference["image"]) if reference["image"] else None
+    facts = [
+        f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of gradients; times are render and method"
+    ]
+    # Of references from elsewhere the number of samples may not be known.
+    samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
+    facts += [samples] if image is not None else ["no reference"]
+    facts += ["without " + ", ".join(absent)] if absent else []
+    return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries)
+
+
+def _value(value: float | None) -> float:
+    return math.nan if value is None else value
+
+
+def _row(results: dict, scene: str | None, spp: int, method: str) -> dict:
+    """The row of the summary; without numbers where there is none."""
+    for row in results["summary"]:
+        if (row["scene"], row["spp"], row["method"]) == (scene, spp, method):
+            return row
+    return {"metrics": {}, "seconds": {"total": None}, "pareto": False}
+
+
+def _tables(results: dict) -> dict[str, list[list[str]]]:
+    """The primary metric of all methods and sample counts: one table for the mean, one for each scene."""
+    counts = sorted({row["spp"] for row in results["summary"]})
+    tables = {}
+    for scene in [None, *results["scenes"]]:
+        rows = [["method", *(f"{spp} spp" for spp in counts)]]
+        for method in results["methods"]:
+            found = [_row(results, scene, spp, method) for spp in counts]
+            if any(row["metrics"] for row in found):
+                rows.append([method, *(_cell(row, results["primary"]) for row in found)])
+        note = "median (lowest to highest) over seeds, seconds in all; ● on the Pareto front"
+        if len(rows) > 1:
+            tables[f"{results['primary']}, {scene or 'geometric mean over scenes'}: {note}"] = rows
+    absent = {(cell["scene"], cell["method"], cell["absent"]) for cell in results["cells"] if cell["absent"]} | {
+        (name, "all", scene["absent"]) for name, scene in results["scenes"].items() if scene["absent"]
+    }
+    if absent:
+        tables["Absent"] = [["scene", "method", "why"], *map(list, sorted(absent))]
+    return tables
+
+
+def _cell(row: dict, metric: str) -> str:
+    value = row["metrics"].get(metric)
+    if not value or value["median"] is None:
+        return "-"
+    text = f"{value['median']:.4g}"
+    if None not in (value.get("low"), value.get("high")) and value["low"] != value["high"]:
+        text += f" ({value['low']:.3g} to {value['high']:.3g})"
+    if row["seconds"] and row["seconds"].get("total") is not None:
+        text += f", {row['seconds']['total']:.3g} s"
+    return text + (" ●" if row.get("pareto") else "")
+
+
+def _plots(folder: Path, results: dict) -> dict[str, str]:
+    plots = {}
+    for kind, files in results["plots"].items():
+        for name, file in files.items():
+            try:
+                plots[f"{kind}: {name}"] = (folder / file).read_text(encoding="utf-8")
+            except OSError as error:
+                raise NgptError(f"{folder / file}: cannot be read ({error.strerror}); run eval.py again") from error
+    return plots
+
+
+def _formulas(results: dict) -> dict[str, str]:
+    return {name: f"{metric['formula']} ({metric['better']} is better)" for name, metric in results["metrics"].items()}

@@ -1,0 +1,1 @@
+"""What makes a network: data sets, examples, losses, the trainer."""

@@ -1,0 +1,52 @@
+"""What a network costs, before one trains it."""
+
+from typing import Any
+
+import torch
+
+from ngpt.network import features, padding
+from ngpt.network.model import Reconstructor, parameters
+from ngpt.network.unet import Convolution
+from ngpt.training.settings import Settings
+
+
+def per_pixel(model: Reconstructor) -> tuple[float, float]:
+    """For each pixel of the (padded) image: multiplications, and numbers that go in and out of convolutions."""
+    size, macs, numbers = 8 * model.alignment, 0, 0
+
+    def count(module: Any, args: tuple, output: torch.Tensor) -> None:
+        nonlocal macs, numbers
+        weight = module.v if isinstance(module, Convolution) else module.weight
+        # Of a transposed 2x2 kernel with stride 2 each output pixel sees one tap, of any other all of them.
+        taps = weight.shape[0] if getattr(module, "kind", "") == "unpool" else weight[0].numel()
+        macs += taps * output.numel()
+        numbers += args[0].numel() + output.numel()
+
+    kinds = (Convolution, torch.nn.Conv2d)
+    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds)]
+    with torch.no_grad():
+        device = next(model.parameters()).device
+        model.network(torch.zeros(1, features.channels(model.config.inputs), size, size, device=device))
+    for hook in hooks:
+        hook.remove()
+    return macs / size**2, numbers / size**2
+
+
+def cost(settings: Settings) -> str:
+    """A few lines on parameters, multiplications and memory; nothing is trained."""
+    model, run = Reconstructor(settings.model), settings.run
+    macs, numbers = per_pixel(model)
+    pixels = run.batch * (settings.data.crop + 2 * padding.MARGIN) ** 2
+    # Backward costs twice as much as forward.
+    step = 3 * macs * pixels
+    activations = numbers * pixels * (2 if run.precision == "bfloat16" else 4)
+    # Weights, gradients, two moments, and the average.
+    states = parameters(model) * 4 * (5 if settings.optimizer.ema else 4)
+    lines = {
+        "parameters": f"{parameters(model):,}",
+        "cost per pixel": f"{macs / 1e3:,.1f} thousand multiplications, {macs * 1280 * 720 / 1e9:,.1f} G at 1280x720",
+        "cost per step": f"{step / 1e9:,.0f} G multiplications, forward and backward, batch {run.batch}",
+        "whole run": f"{step * run.steps / 1e15:,.2f} P multiplications, {run.steps:,} steps",
+        "memory": f"about {(activations + states) / 2**30:.2f} GiB while training",
+    }
+    return "\n".join(f"{name:<16}{value}" for name, value in lines.items())

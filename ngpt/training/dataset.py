@@ -1,0 +1,210 @@
+"""Training sets: a folder of shards with a manifest, read crop by crop.
+
+    data = Dataset("DIR")
+    crop = data[0]
+    crop.stack(0), crop.reference        # a GradientStack, (H, W, 3)
+
+``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+from ngpt.system.records import Shape, check, read_json
+from ngpt.training.shards import INPUTS, TENSORS, Shard
+
+FORMAT, VERSION = "ngpt-dataset", 1
+MANIFEST = "manifest.json"
+_CROP: Shape = {"spp": [int], "seconds": {str: (int, float)}}
+_ENTRY: Shape = {"file": str, "sha256": str, "bytes": int, "scene": str, "crops": [_CROP], "failures": list}
+_MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
+
+
+@dataclass(frozen=True)
+class Crop:
+    """One crop; cheap: pixels are read when they are asked for.
+
+    ``scene`` names the scene, ``spp`` are the samples per pixel of its inputs.
+    """
+
+    shard: Shard
+    index: int
+    scene: str
+    spp: tuple[int, ...]
+
+    @property
+    def inputs(self) -> int:
+        """The number of inputs."""
+        return len(self.spp)
+
+    def stack(self, k: int) -> GradientStack:
+        """Input ``k``, with all layers of a rendered stack; every value is finite."""
+        if not 0 <= k < self.inputs:
+            raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
+        layers = {name: self.shard.input(name, self.index, k) for name in INPUTS}
+        layers["primal"] = layers.pop("indirect") + layers["direct"]
+        for name in [name for name in layers if name.endswith("_se")]:
+            layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
+        attributes = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
+        return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}")
+
+    @property
+    def reference(self) -> np.ndarray:
+        """(H, W, 3) float32, the converged image, emission seen directly included."""
+        return self.shard.crop("reference_indirect", self.index) + self.reference_direct
+
+    @property
+    def reference_direct(self) -> np.ndarray:
+        """(H, W, 3) float32, that emission alone."""
+        return self.shard.crop("reference_direct", self.index)
+
+
+class Dataset:
+    """The crops of a training set, in the order of its manifest.
+
+    Opens the manifest only; a shard is checked and mapped into memory when one of its crops is read, and anew in each
+    process that an instance is sent to. Raises NgptError with the file and what is wrong with it: shards that are
+    missing, are not those that the manifest tells the checksum of, or hold other tensors.
+    """
+
+    def __init__(self, folder: str | Path):
+        self.folder = Path(folder)
+        self.manifest = read_manifest(self.folder)
+        self._places: list[tuple[dict, int]] = []
+        for entry in self.manifest["shards"]:
+            self._places += [(entry, i) for i in range(len(entry["crops"]))]
+        self._open: dict[str, Shard] = {}
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """Names of the scenes that have crops, each once."""
+        return tuple(dict.fromkeys(entry["scene"] for entry, _ in self._places))
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> Crop:
+        if not -len(self) <= index < len(self):
+            raise IndexError(f"{self.folder}: crop {index} of {len(self)}")
+        entry, place = self._places[index]
+        if entry["file"] not in self._open:
+            self._open[entry["file"]] = _checked(self.folder / entry["file"], entry)
+        crop = entry["crops"][place]
+        return Crop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]))
+
+    def __iter__(self) -> Iterator[Crop]:
+        return (self[i] for i in range(len(self)))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_open": {}}
+
+
+def read_manifest(folder: Path) -> dict[str, Any]:
+    """The manifest of the training set in ``folder``; raises NgptError where there is none of this version."""
+    path = folder / MANIFEST
+    if not path.is_file():
+        raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen")
+    manifest = read_json(path)
+    if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
+        raise NgptError(f"{path}: is not the manifest of a training set")
+    if manifest.get("version") != VERSION:
+        raise NgptError(f"{path}: is of version {manifest.get('version')}, this ngpt reads version {VERSION}")
+    check(manifest, _MANIFEST, str(path))
+    for entry in manifest["shards"]:
+        name = PurePosixPath(entry["file"])
+        if name.is_absolute() or ".." in name.parts or "\0" in entry["file"]:
+            raise NgptError(f"{path}: lists {entry['file']!r}, which is not in its folder; do not trust this file")
+    return manifest
+
+
+def checksum(path: Path) -> str:
+    """The sha256 of a file, as hexadecimal digits."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+def problems(folder: Path) -> list[str]:
+    """Everything that is wrong with a training set, one line each: files, checksums, shapes, counts, numbers."""
+    found = []
+    manifest = read_manifest(folder)
+    for entry in manifest["shards"]:
+        try:
+            shard = _checked(folder / entry["file"], entry)
+        except NgptError as error:
+            found.append(str(error))
+            continue
+        for name in shard.names if entry["crops"] else ():
+            bad = int(np.sum(~np.isfinite(shard.tensor(name))))
+            if bad:
+                found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
+    listed = {entry["file"] for entry in manifest["shards"]}
+    on_disk = {path.relative_to(folder).as_posix() for path in (folder / "shards").glob("[!.]*.safetensors")}
+    found += [
+        f"{folder / name}: is not in the manifest; run python -m data_gen again" for name in sorted(on_disk - listed)
+    ]
+    return found
+
+
+def _checked(path: Path, entry: dict[str, Any]) -> Shard:
+    """The shard of a manifest's entry; raises NgptError unless it is that one, and has the tensors that crops need."""
+    # Not Path.is_file, which raises where a name is longer than names may be.
+    if not os.path.isfile(path):
+        raise NgptError(f"{path}: is missing; remove it from the manifest by running python -m data_gen again")
+    if (digest := checksum(path)) != entry["sha256"]:
+        told = entry["sha256"][:12]
+        raise NgptError(
+            f"{path}: its sha256 is {digest[:12]}..., the manifest says {told}...; copy it again or remove it"
+        )
+    shard, crops = Shard(path), entry["crops"]
+    if not crops:
+        return shard
+    missing = [name for name in TENSORS if name not in shard.names]
+    if missing:
+        raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
+    shape = shard.shape("indirect")
+    if len(shape) != 5 or 0 in shape or any(len(crop["spp"]) != shape[1] for crop in crops):
+        raise NgptError(f"{path}: tensor 'indirect' is {shape}, and its crops have {len(crops[0]['spp'])} inputs")
+    inputs, height, width = shape[1:4]
+    for name in TENSORS:
+        expected: tuple[int, ...] = (len(crops), height, width, 3)
+        if name == "spp":
+            expected = (len(crops), inputs)
+        elif name in INPUTS:
+            expected = (len(crops), inputs, height, width, INPUTS[name])
+        if shard.shape(name) != expected:
+            raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
+        if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):
+            raise NgptError(f"{path}: tensor '{name}' is of type {shard.type(name)}; it must be of (half) floats")
+    return shard
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """What ``ngpt info`` says of a training set; ``problems`` is empty where all of it is in order."""
+    data = Dataset(folder)
+    entries = data.manifest["shards"]
+    crops = [crop for entry in entries for crop in entry["crops"]]
+    seconds: dict[str, float] = {}
+    for crop in crops:
+        for part, value in crop["seconds"].items():
+            seconds[part] = seconds.get(part, 0.0) + value
+    return {
+        "training set": str(folder),
+        "crops": len(data),
+        "planned": data.manifest["planned"],
+        "failed": sum(len(entry["failures"]) for entry in entries),
+        "scenes": len(data.scenes),
+        "shards": len(entries),
+        "megabytes": round(sum(entry["bytes"] for entry in entries) / 1e6, 1),
+        "seconds": {part: round(value, 1) for part, value in seconds.items()},
+        "problems": problems(folder),
+    }

@@ -1,0 +1,229 @@
+"""Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+import torch
+from torch.utils.data import Dataset as TorchDataset
+
+from ngpt.errors import NgptError
+from ngpt.io.exr import read
+from ngpt.methods import METHODS
+from ngpt.network import combine, features, padding
+from ngpt.network.model import ModelConfig
+from ngpt.repair import Repaired, repair
+from ngpt.stack import GradientStack
+from ngpt.training.augment import Augmentation, Layers, quieter
+
+# Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
+JITTER = 7
+
+
+class Crop(Protocol):
+    """One view with a reference and several inputs; what ``ngpt.training.dataset`` gives, and ``StackFolder``."""
+
+    scene: str
+    inputs: int
+    spp: tuple[int, ...]
+
+    def stack(self, k: int) -> GradientStack: ...
+
+    @property
+    def reference(self) -> np.ndarray: ...
+
+    @property
+    def reference_direct(self) -> np.ndarray: ...
+
+
+class StackCrop:
+    """The stacks of one folder and the reference they share."""
+
+    def __init__(self, folder: Path, stacks: list[Path], reference: Path):
+        self.scene, self.inputs = folder.name, len(stacks)
+        self._stacks, self._reference = stacks, reference
+        self.spp = tuple(int(read(str(path)).attributes.get("ngpt:spp", 0)) for path in stacks)
+
+    def stack(self, k: int) -> GradientStack:
+        return read(str(self._stacks[k]))
+
+    @property
+    def reference(self) -> np.ndarray:
+        return read(str(self._reference))["primal"]
+
+    @property
+    def reference_direct(self) -> np.ndarray:
+        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
+        most = self._stacks[int(np.argmax(self.spp))]
+        for path in (self._reference, most):
+            stack = read(str(path))
+            if "direct" in stack:
+                return stack["direct"]
+        return np.zeros_like(stack["primal"])
+
+
+class StackFolder(Sequence[StackCrop]):
+    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
+
+    Raises NgptError where a folder has stacks without a reference, or sizes differ.
+    """
+
+    def __init__(self, folder: str | Path):
+        self._crops = []
+        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
+            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
+            reference = view / "reference.exr"
+            if not stacks:
+                continue
+            if not reference.is_file():
+                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
+            self._crops.append(StackCrop(view, stacks, reference))
+        if not self._crops:
+            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
+
+    def __len__(self) -> int:
+        return len(self._crops)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        return self._crops[index]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
+
+
+def open_crops(folder: str | Path) -> Iterable[Any]:
+    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
+    path = Path(folder)
+    if not path.is_dir():
+        raise NgptError(
+            f"{folder}: no such folder; make a dataset with: python -m data_gen --config ... --out {folder}"
+        )
+    if (path / "manifest.json").is_file():
+        from ngpt.training.dataset import Dataset
+
+        return Dataset(path)
+    return StackFolder(path)
+
+
+def layers_of(data: Repaired, config: ModelConfig) -> Layers:
+    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W)."""
+    arrays: dict[str, np.ndarray] = {"primal": data.image, **data.features}
+    if data.dx is not None:
+        arrays |= {"dx": data.dx, "dy": data.dy}
+    for name, variance in data.known_variances().items():
+        # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
+        arrays[name.replace("_var", "_se")] = np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))
+    if config.base:
+        arrays["base"] = base_image(data, config)
+    arrays |= combine.images(data, arrays.get("base"), config.layers)
+    return {name: torch.from_numpy(np.array(arrays[name].transpose(2, 0, 1), order="C")) for name in config.layers}
+
+
+def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:
+    """The reconstruction the network starts from, (H, W, 3), without direct emission."""
+    method = METHODS[config.base]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return method.run(data, **method.options).astype(np.float32, copy=False)
+
+
+class Mixture(Sequence[Any]):
+    """Several sequences of crops as one; they may grow while they are read, as streams do."""
+
+    def __init__(self, *parts: Any):
+        self.parts = parts
+
+    def __len__(self) -> int:
+        return sum(len(part) for part in self.parts)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        for part in self.parts:
+            if index < len(part):
+                return part[index]
+            index -= len(part)
+        raise IndexError(index)
+
+
+class Examples(TorchDataset):
+    """Endless training examples, each a function of its index and the seed: whoever asks, and when.
+
+    Example ``i`` is one crop with one of its inputs (or one more, ``Augmentation.quieter``), at random, normalised,
+    augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the
+    middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
+    What was read and prepared once is kept in memory, up to ``cache`` bytes.
+    """
+
+    def __init__(
+        self,
+        crops: Sequence[Any],
+        config: ModelConfig,
+        augmentation: Augmentation,
+        size: int,
+        seed: int,
+        cache: int = 0,
+    ):
+        self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
+        self._cache: dict[tuple[int, int], Layers] = {}
+        self._free = cache
+
+    def __len__(self) -> int:
+        return 2**62
+
+    def __getitem__(self, index: int) -> Layers:
+        rng = np.random.default_rng((self.seed, index))
+        # Uniform over crops, whatever the number of their inputs.
+        which = int(rng.integers(len(self.crops)))
+        crop = self.crops[which]
+        k = int(rng.integers(crop.inputs + bool(self.augmentation.quieter)))
+        layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
+        layers = features.completed(layers, self.config.inputs)
+        top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
+        padded = padding.pad(layers, (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left))
+        edge = padding.MARGIN + JITTER
+        padded["target"] = padded["target"][..., edge:-edge, edge:-edge]
+        return {name: layer.contiguous() for name, layer in padded.items()}
+
+    def _layers(self, which: int, k: int) -> Layers:
+        if (which, k) in self._cache:
+            return self._cache[which, k]
+        crop = self.crops[which]
+        stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
+        layers = layers_of(repair(stack), self.config)
+        target = (crop.reference - crop.reference_direct).transpose(2, 0, 1)
+        layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
+        size = sum(layer.numel() * layer.element_size() for layer in layers.values())
+        if size <= self._free:
+            self._cache[which, k], self._free = layers, self._free - size
+        return layers
+
+    def _quieter(self, which: int) -> GradientStack:
+        """The input of that crop with most samples, as of many more."""
+        crop = self.crops[which]
+        low, high = np.log(self.augmentation.quieter)
+        factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
+        return quieter(crop.stack(int(np.argmax(crop.spp))), crop.reference, crop.reference_direct, factor)
+
+    def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
+        height, width = layers["primal"].shape[-2:]
+        if height < self.size or width < self.size:
+            raise NgptError(
+                f"a crop is {width}x{height}, smaller than the {self.size} pixels of an example; lower 'crop'"
+            )
+        y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
+        return {name: layer[..., y : y + self.size, x : x + self.size] for name, layer in layers.items()}
+
+
+def _scaled(layers: Layers) -> Layers:
+    batch = {name: layer[None] for name, layer in layers.items()}
+    target = batch.pop("target")
+    scaled, exposure = features.normalised(batch)
+    return {name: layer[0] for name, layer in (scaled | {"target": target / exposure}).items()}
+
+
+def split(crops: Sequence[Any], validation: tuple[str, ...]) -> tuple[list[Any], list[Any]]:
+    """Training and validation crops; whole scenes of which the name starts with one of ``validation`` are kept out."""
+    held = [crop.scene.startswith(tuple(validation)) if validation else False for crop in crops]
+    return [c for c, out in zip(crops, held, strict=True) if not out], [
+        c for c, out in zip(crops, held, strict=True) if out
+    ]

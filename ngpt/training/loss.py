@@ -1,0 +1,98 @@
+"""What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it."""
+
+import math
+from dataclasses import dataclass, fields
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ngpt.errors import NgptError
+from ngpt.measure.distances import perceptual
+from ngpt.measure.distances.perceptual import PerceptualDistance
+from ngpt.training import pixelwise
+
+KINDS = (*perceptual.KINDS, "l1")
+
+
+@dataclass(frozen=True)
+class LossSettings:
+    """The table [loss] of a configuration.
+
+    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg", or
+                     "l1" for none
+    ``evaluations``  draws of the random transforms that are averaged in each step
+    ``scales``       largest downscaling among the transforms; NGPT trains with 2
+    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``
+                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0
+    ``backbone``, ``weights``  files of E-LPIPS (docs/losses.md); "" looks for the backbone in PyTorch's cache
+    """
+
+    kind: str = "structural"
+    evaluations: int = 3
+    scales: int = 2
+    l1: float = 0.01
+    gradient: float = 0.01
+    relative: float = 0.0
+    logarithmic: float = 0.0
+    huber: float = 0.0
+    pyramid: float = 0.0
+    backbone: str = ""
+    weights: str = ""
+
+
+class Loss:
+    """Call it with prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
+
+    Returns the weighted sum and its parts, by name, before weighting.
+    """
+
+    def __init__(self, settings: LossSettings):
+        self.settings = settings
+        self._distance: PerceptualDistance | None = None
+        if settings.kind in perceptual.KINDS:
+            self._distance = PerceptualDistance(
+                settings.kind, settings.evaluations, settings.scales, settings.backbone, settings.weights
+            )
+
+    def __call__(
+        self, prediction: Tensor, target: Tensor, generator: torch.Generator
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        s, parts = self.settings, {}
+        total = prediction.new_zeros(())
+        if self._distance is not None:
+            parts["perceptual"] = self._distance(prediction, target, generator)
+            total = total + parts["perceptual"]
+        for name, weight, function in (
+            # Alone, L1 is the loss, and its weight would only scale the learning rate.
+            ("l1", s.l1 if s.kind != "l1" else 1.0, pixelwise.l1),
+            ("gradient", s.gradient, pixelwise.gradient_l1),
+            ("relative", s.relative, pixelwise.relative),
+            ("logarithmic", s.logarithmic, pixelwise.logarithmic),
+            ("huber", s.huber, pixelwise.huber),
+            ("pyramid", s.pyramid, pixelwise.pyramid),
+        ):
+            if weight:
+                parts[name] = function(prediction, target)
+                total = total + weight * parts[name]
+        return total, parts
+
+
+def make_loss(settings: dict[str, Any]) -> Loss:
+    """The loss of a table [loss]. Raises NgptError for unknown keys and kinds, negative weights, and missing files."""
+    known = {f.name: f for f in fields(LossSettings)}
+    for name, value in settings.items():
+        if name not in known:
+            raise NgptError(f"[loss]: unknown key '{name}'; there are: {', '.join(known)}")
+        default = known[name].default
+        wanted = (int, float) if isinstance(default, float) else type(default)
+        if not isinstance(value, wanted) or isinstance(value, bool):
+            raise NgptError(f"[loss]: {name} = {value!r}: must be like {default!r}")
+        if isinstance(value, int | float) and not 0 <= value < math.inf:
+            raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")
+    result = LossSettings(**settings)
+    if result.kind not in KINDS:
+        raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join(KINDS)}")
+    if result.evaluations < 1 or result.scales < 1:
+        raise NgptError("[loss]: evaluations and scales must be at least 1")
+    return Loss(result)

@@ -1,0 +1,66 @@
+"""Losses that compare pixel by pixel, in tone-mapped or relative radiance."""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+from ngpt.measure.distances.perceptual import tone_mapped
+from ngpt.network.transfer import signed_log, srgb
+
+# Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
+_SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
+
+
+def l1(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean |R(p) - R(t)|."""
+    return (tone_mapped(prediction) - tone_mapped(target)).abs().mean()
+
+
+def gradient_l1(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean |R(Δp) - R(Δt)| of the differences along x, plus that along y; 0 for a single row or column.
+
+    Both images' differences are taken within the image, so that none compares with nothing.
+    """
+    total = prediction.new_zeros(())
+    for axis in (-1, -2):
+        if prediction.shape[axis] > 1:
+            total = total + l1(prediction.diff(dim=axis), target.diff(dim=axis))
+    return total
+
+
+def relative(prediction: Tensor, target: Tensor, epsilon: float = 1e-2) -> Tensor:
+    """Mean |p - t| / (|p| + |t| + ε), in [0, 1): as much for dark pixels as for bright ones."""
+    return ((prediction - target).abs() / (prediction.abs() + target.abs() + epsilon)).mean()
+
+
+def huber(prediction: Tensor, target: Tensor, epsilon: float = 1e-2, knee: float = 0.5) -> Tensor:
+    """Mean of Huber's function of e = (p - t) / √(p² + ε): e² / 2 up to the knee, straight beyond it.
+
+    In its gradient √(p² + ε) counts as a constant. Where the target is noisy by less than the knee, the least of it is
+    at the mean of what the target may be, so that noise of mean 0 does no harm [Lehtinen et al. 2018, "Noise2Noise",
+    section 3.3]; fireflies of the target, which squares alone would chase, count by their number.
+    """
+    error = ((prediction - target) / (prediction.detach().square() + epsilon).sqrt()).abs()
+    return torch.where(error < knee, error.square() / 2, knee * (error - knee / 2)).mean()
+
+
+def logarithmic(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean |ln(1 + |p|) sgn p - ln(1 + |t|) sgn t|."""
+    return (signed_log(prediction) - signed_log(target)).abs().mean()
+
+
+def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean |p - t| of display-encoded images at 4 resolutions and 3 exposures, in [0, 1].
+
+    What a viewer sees of an error depends on how wide it is: eyes average fine noise away, above all that of colours,
+    and not what a patch is off by [Andersson et al. 2020, "FLIP", section 4.1, with boxes for their filters]. SSIM of
+    the structural distance takes patches' means off. Each resolution has half the pixels of the last, rounded up.
+    """
+    total = prediction.new_zeros(())
+    for exposure in _EXPOSURES:
+        a, b = (srgb(tone_mapped(exposure * image.clamp(min=0)).clamp(max=1)) for image in (prediction, target))
+        for scale in range(_SCALES):
+            if scale:
+                a, b = (avg_pool2d(image, 2, ceil_mode=True) for image in (a, b))
+            total = total + (a - b).abs().mean()
+    return total / (_SCALES * len(_EXPOSURES))

@@ -1,0 +1,34 @@
+"""Learning rates as functions of the step, and the average of the weights."""
+
+import math
+
+import torch
+from torch import nn
+
+from ngpt.training.settings import OptimizerSettings
+
+
+def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
+    """The learning rate of step 0 .. steps - 1.
+
+    paper    grows by a constant factor from 1e-4 of the rate to all of it at ``warmup``, is constant until ``flat``,
+             then halves in every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]
+    cosine   grows linearly until ``warmup``, then falls as half a cosine to 1 % at the last step
+    """
+    rate = settings.learning_rate
+    if settings.schedule == "paper":
+        if step < settings.warmup:
+            return rate * 1e-4 ** (1 - step / settings.warmup)
+        return rate * 0.5 ** (max(0, step - settings.flat) / settings.half_life)
+    if step < settings.warmup:
+        return rate * (step + 1) / settings.warmup
+    done = (step - settings.warmup) / max(1, steps - 1 - settings.warmup)
+    return rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
+
+
+@torch.no_grad()
+def update_average(average: nn.Module, model: nn.Module, decay: float, step: int) -> None:
+    """average <- d average + (1 - d) model, with d growing to ``decay`` so that first weights are soon forgotten."""
+    decay = min(decay, (1 + step) / (10 + step))
+    for mean, value in zip(average.parameters(), model.parameters(), strict=True):
+        mean.lerp_(value, 1 - decay)

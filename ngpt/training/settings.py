@@ -1,0 +1,187 @@
+"""The settings of a training run, as TOML files hold them: ``configs/*.toml``."""
+
+import dataclasses
+import tomllib
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+from ngpt.errors import NgptError
+from ngpt.network.model import ModelConfig
+from ngpt.system.records import check, read_toml
+from ngpt.training.augment import Augmentation
+
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class DataSettings:
+    """Where examples come from.
+
+    ``folders``     datasets (``python -m data_gen``) or folders of stacks with references; all are mixed
+    ``validation``  beginnings of the names of scenes that are kept out of training
+    ``crop``        pixels of an example's side
+    ``workers``     processes that prepare examples; 0 prepares them in between
+    ``cache``       MiB of memory, for each of these, to keep what was prepared in
+    """
+
+    folders: tuple[str, ...] = ()
+    validation: tuple[str, ...] = ()
+    crop: int = 128
+    workers: int = 0
+    cache: int = 2048
+
+
+@dataclass(frozen=True)
+class OptimizerSettings:
+    """Adam and its schedule (``ngpt.training.schedule``); defaults are NGPT's.
+
+    ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
+    ``warmup``, ``flat``  steps until the learning rate is reached, and until which it stays ("paper")
+    ``half_life``  steps in which it then halves ("paper")
+    ``clip``       largest norm of the gradient; 0 does not clip
+    ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps none
+    """
+
+    learning_rate: float = 5e-4
+    betas: tuple[float, float] = (0.9, 0.99)
+    schedule: str = "paper"
+    warmup: int = 10_000
+    flat: int = 50_000
+    half_life: int = 70_000
+    clip: float = 0.0
+    ema: float = 0.0
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How long, how precise, how often.
+
+    ``steps``, ``batch``  length of the run, and examples per step over all processes
+    ``precision``  of the network's body: "float32" or "bfloat16"
+    ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
+    ``log``, ``save``, ``validate``  every so many steps
+    ``views``      validation inputs looked at each time, spread over all of them
+    """
+
+    steps: int = 600_000
+    batch: int = 20
+    precision: str = "float32"
+    seed: int = 0
+    minutes: float = 0.0
+    log: int = 100
+    save: int = 1000
+    validate: int = 1000
+    views: int = 64
+
+
+@dataclass(frozen=True)
+class Settings:
+    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``; ``initial`` names weights to start from."""
+
+    model: ModelConfig
+    data: DataSettings = field(default_factory=DataSettings)
+    augmentation: Augmentation = field(default_factory=Augmentation)
+    loss: dict[str, Any] = field(default_factory=dict)
+    optimizer: OptimizerSettings = field(default_factory=OptimizerSettings)
+    run: RunSettings = field(default_factory=RunSettings)
+    initial: str = ""
+
+    def to_dict(self) -> dict[str, Any]:
+        """What JSON holds, and ``from_dict`` reads."""
+        return dataclasses.asdict(self)
+
+
+_TABLES: dict[str, type] = {
+    "model": ModelConfig,
+    "data": DataSettings,
+    "augmentation": Augmentation,
+    "optimizer": OptimizerSettings,
+    "run": RunSettings,
+}
+
+
+def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # type: ignore[assignment]
+    """The settings of a TOML file, after ``changes`` of the form "run.steps=100".
+
+    Raises NgptError for a file that cannot be read, and unknown or ill-typed keys.
+    """
+    values = read_toml(path)
+    for change in changes:
+        _change(values, change)
+    return from_dict(values, str(path))
+
+
+def from_dict(values: dict[str, Any], path: str) -> Settings:
+    """Settings of nested dicts; ``path`` is for messages."""
+    check(values, {"model": dict}, path)
+    known: dict[str, Any] = {}
+    for name, value in values.items():
+        if name in _TABLES:
+            known[name] = _table(_TABLES[name], value, f"{path}: [{name}]")
+        elif name in ("loss", "initial"):
+            check(value, dict if name == "loss" else str, f"{path}: '{name}'")
+            known[name] = value
+        else:
+            raise NgptError(f"{path}: unknown '{name}'; there may be: {', '.join([*_TABLES, 'loss', 'initial'])}")
+    settings = Settings(**known)
+    _check(settings, path)
+    return settings
+
+
+def _check(settings: Settings, path: str) -> None:
+    for value, name, allowed in (
+        (settings.run.precision, "run.precision", ("float32", "bfloat16")),
+        (settings.optimizer.schedule, "optimizer.schedule", ("paper", "cosine")),
+    ):
+        if value not in allowed:
+            raise NgptError(f"{path}: {name} = '{value}': choose one of: {', '.join(allowed)}")
+    for name in ("steps", "batch", "log", "save", "validate"):
+        if getattr(settings.run, name) < 1:
+            raise NgptError(f"{path}: run.{name} = {getattr(settings.run, name)}: must be at least 1")
+    if not 0 <= settings.optimizer.ema < 1:
+        raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
+
+
+def _table(kind: type[T], values: Any, where: str) -> T:
+    """A dataclass of a table, with lists made tuples, and types checked against the defaults'."""
+    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
+    if not isinstance(values, dict):
+        raise NgptError(f"{where}: must be a table, not {values!r}")
+    for name, value in values.items():
+        if name not in fields:
+            raise NgptError(f"{where}: unknown key '{name}'; there are: {', '.join(fields)}")
+        default = fields[name].default
+        if default is not dataclasses.MISSING and not _fits(value, default):
+            raise NgptError(f"{where}: {name} = {value!r}: must be like {default!r}")
+    converted = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    try:
+        return kind(**converted)
+    except (TypeError, NgptError) as error:
+        raise NgptError(f"{where}: {error}") from error
+
+
+def _fits(value: Any, default: Any) -> bool:
+    if isinstance(default, bool) or isinstance(value, bool):
+        return isinstance(value, bool) and isinstance(default, bool)
+    if isinstance(default, float):
+        return isinstance(value, int | float)
+    if isinstance(default, tuple):
+        return isinstance(value, list | tuple)
+    return isinstance(value, type(default))
+
+
+def _change(values: dict[str, Any], change: str) -> None:
+    name, equals, text = change.partition("=")
+    if not equals:
+        raise NgptError(f"--set {change}: give it as table.key=value, for example run.steps=1000")
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text  # a string without quotes, as people type it in a shell
+    *tables, key = name.strip().split(".")
+    for table in tables:
+        values = values.setdefault(table, {})
+        if not isinstance(values, dict):
+            raise NgptError(f"--set {change}: '{table}' is not a table")
+    values[key] = value

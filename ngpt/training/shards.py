@@ -1,0 +1,145 @@
+"""Shards of a training set: one safetensors file for a few crops of one scene, complete or not there at all.
+
+Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
+
+    indirect, direct            primal - direct and direct: kept apart, or half floats would lose what a lamp outshines
+    dx, dy, albedo, normal, depth
+    primal_se, dx_se, dy_se     standard errors: variances of small numbers would underflow in half floats
+    reference_indirect, reference_direct    (N, H, W, 3)
+    spp                         (N, K) samples per pixel, int32
+
+A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured crop by crop, and of floats elsewhere.
+The header's metadata holds the record of the shard as JSON under "ngpt".
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+from ngpt.system.files import atomic_output
+from ngpt.system.records import check, parse_json
+
+# Tensors of the inputs and their channels.
+INPUTS = {"indirect": 3, "direct": 3, "dx": 3, "dy": 3, "albedo": 3, "normal": 3, "depth": 1}
+INPUTS |= {"primal_se": 3, "dx_se": 3, "dy_se": 3}
+REFERENCES = ("reference_indirect", "reference_direct")
+TENSORS = (*INPUTS, *REFERENCES, "spp")
+
+# Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
+MAX_LOSS = 1e-3
+
+
+@dataclass(frozen=True)
+class CropData:
+    """One crop as it was rendered: K finite stacks, and the converged image with and of directly seen emission."""
+
+    stacks: Sequence[GradientStack]
+    spp: Sequence[int]
+    reference: np.ndarray
+    reference_direct: np.ndarray
+
+    def tensors(self) -> dict[str, np.ndarray]:
+        inputs = [_input_tensors(stack) for stack in self.stacks]
+        tensors = {name: np.stack([i[name] for i in inputs]) for name in INPUTS}
+        tensors["reference_indirect"] = self.reference - self.reference_direct
+        tensors["reference_direct"] = self.reference_direct
+        tensors["spp"] = np.array(self.spp, np.int32)
+        return tensors
+
+
+def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
+    tensors = {"indirect": stack["primal"] - stack["direct"]}
+    for name in INPUTS:
+        if name.endswith("_se"):
+            tensors[name] = np.sqrt(stack[name.removesuffix("_se") + "_var"])
+        elif name != "indirect":
+            tensors[name] = stack[name]
+    return tensors
+
+
+def smallest_float(tensor: np.ndarray) -> np.ndarray:
+    """``tensor`` (N, ...) in half floats where that is safe for each of its N entries, else in floats."""
+    if tensor.dtype.kind != "f":
+        return tensor
+    with np.errstate(over="ignore"):
+        half = tensor.astype(np.float16)
+    for exact, rounded in zip(tensor.astype(np.float64), half, strict=True):
+        if not np.isfinite(rounded).all() or np.abs(exact - rounded).sum() > MAX_LOSS * np.abs(exact).sum():
+            return tensor.astype(np.float32)
+    return half
+
+
+def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]) -> None:
+    """Writes a shard, and the record of how it came about; it may hold no crop at all, when all have failed.
+
+    A shard that is there already is kept: it is the same one but for the times in its record, made by a worker that was
+    faster, or was lost before it said so; and its checksum may be in the manifest by now.
+    Raises NgptError for numbers that are not finite, naming the tensor, and when the file cannot be written.
+    """
+    from safetensors.numpy import save
+
+    each = [crop.tensors() for crop in crops]
+    tensors = {name: smallest_float(np.stack([t[name] for t in each])) for name in TENSORS} if each else {}
+    for name, tensor in tensors.items():
+        if not np.isfinite(tensor).all():
+            raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
+    data = save(tensors, {"ngpt": json.dumps(record)})
+    try:
+        with atomic_output(path) as temporary:
+            temporary.write_bytes(data)
+    except NgptError:
+        if not path.is_file():
+            raise
+
+
+class Shard:
+    """A shard opened for reading; tensors are mapped into memory and read piece by piece."""
+
+    def __init__(self, path: Path):
+        try:
+            from safetensors import SafetensorError, safe_open
+        except ModuleNotFoundError as error:
+            raise NgptError("training sets need safetensors; `pip install 'ngpt-recon[train]'`") from error
+        self.path = path
+        if not path.is_file():
+            raise NgptError(f"{path}: no such shard; make it again: python -m data_gen")
+        try:
+            self._file = safe_open(path, framework="np")
+        except (OSError, SafetensorError) as error:
+            raise NgptError(f"{path}: cannot be read as a shard: {error}; make it again or remove it") from error
+        metadata = self._file.metadata() or {}
+        if "ngpt" not in metadata:
+            raise NgptError(f"{path}: is no shard of a training set (its header has no 'ngpt' record)")
+        self.record: dict[str, Any] = parse_json(metadata["ngpt"], f"{path}: its record")
+        check(self.record, dict, f"{path}: its record")
+        self.names = tuple(self._file.keys())
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        return tuple(self._file.get_slice(name).get_shape())
+
+    def type(self, name: str) -> str:
+        """As safetensors calls it, "F16"."""
+        return self._file.get_slice(name).get_dtype()
+
+    def tensor(self, name: str) -> np.ndarray:
+        return self._file.get_tensor(name)
+
+    def crop(self, name: str, crop: int) -> np.ndarray:
+        """Tensor ``name`` of one crop, float32 (integers as they are)."""
+        return _single(self._file.get_slice(name)[crop : crop + 1][0])
+
+    def input(self, name: str, crop: int, k: int) -> np.ndarray:
+        """Tensor ``name`` of one input of one crop, float32."""
+        return _single(self._file.get_slice(name)[crop : crop + 1, k : k + 1][0, 0])
+
+
+def _single(array: np.ndarray) -> np.ndarray:
+    return array.astype(np.float32) if array.dtype.kind == "f" else array

@@ -1,0 +1,306 @@
+"""The training loop: resumable bit for bit, stoppable at any moment.
+
+What a step does is a function of the settings, the seed and the step's number, and everything else that it changes
+(weights, their average, Adam's moments) is in the checkpoint: a run that was killed and resumed ends with the same
+weights as one that was not, on the same device with the same number of threads and processes.
+"""
+
+import copy
+import json
+import math
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils.data import DataLoader
+
+from ngpt.errors import NgptError
+from ngpt.network import padding, weights
+from ngpt.network.model import Reconstructor, parameters
+from ngpt.network.transfer import signed_exp
+from ngpt.system.console import print_line
+from ngpt.system.files import atomic_output
+from ngpt.system.records import check
+from ngpt.training.distributed import Processes
+from ngpt.training.examples import JITTER, Examples
+from ngpt.training.schedule import learning_rate, update_average
+from ngpt.training.settings import Settings, from_dict
+from ngpt.training.validation import validate, views
+from ngpt.version import __version__
+
+Loss = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, dict[str, Tensor]]]
+
+# Logarithms beyond this are cut before exp: 4.9e8 times the typical radiance, far above anything one wants to learn.
+LIMIT = 20.0
+
+
+def show(text: str) -> None:
+    """Prints a line at once: logs are looked at while they grow."""
+    print_line(text, sys.stdout)
+
+
+class Trainer:
+    """One run in the folder ``out``, new or continued.
+
+    ``crops`` and ``held_out`` are for training and validation, ``loss`` takes scene-linear prediction and target
+    (N, 3, H, W) and a generator of the step's random numbers. Files in ``out``: ``checkpoint.safetensors``,
+    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``. ``cache`` keeps
+    what was read in memory: crops must stay what they are. Where they do not, as in a stream, no two runs are alike.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        crops: Sequence[Any],
+        held_out: Sequence[Any],
+        loss: Loss,
+        out: str | Path,
+        processes: Processes | None = None,
+        say: Callable[[str], None] = show,
+        cache: bool = True,
+    ):
+        if not len(crops):
+            raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
+        self.settings, self.loss, self.out, self.say = settings, loss, Path(out), say
+        self.processes = processes or Processes()
+        self.device = self.processes.device
+        torch.manual_seed(settings.run.seed)
+        self.model = Reconstructor(settings.model).to(self.device)
+        if settings.initial:
+            self._start_from(settings.initial)
+        self.average = copy.deepcopy(self.model) if settings.optimizer.ema else self.model
+        self.optimizer = torch.optim.Adam(self.model.parameters(), betas=settings.optimizer.betas, eps=1e-8)
+        self.step, self.seconds = 0, 0.0
+        self.held_out = views(held_out, settings.run.views)
+        self.examples = Examples(
+            crops,
+            settings.model,
+            settings.augmentation,
+            settings.data.crop,
+            settings.run.seed,
+            settings.data.cache << 20 if cache else 0,
+        )
+        if (settings.data.crop + 2 * padding.MARGIN) % self.model.alignment:
+            raise NgptError(
+                f"data.crop = {settings.data.crop}: crop + {2 * padding.MARGIN} must be divisible by "
+                f"{self.model.alignment}, the network's coarsest pixel"
+            )
+        if settings.run.batch % self.processes.count:
+            raise NgptError(
+                f"run.batch = {settings.run.batch}: must be a multiple of the {self.processes.count} processes"
+            )
+        self._stop = False
+        # The number of the signal that ended it, if one did.
+        self.signal: int | None = None
+
+    @property
+    def checkpoint(self) -> Path:
+        return self.out / "checkpoint.safetensors"
+
+    def resume(self) -> None:
+        """Continues from the checkpoint in ``out``; raises NgptError if it belongs to another model."""
+        tensors, header = weights.read_tensors(self.checkpoint)
+        if header.get("kind") != "checkpoint":
+            raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
+        check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{self.checkpoint}: its header")
+        before = from_dict(header["settings"], str(self.checkpoint))
+        if before.model != self.settings.model:
+            raise NgptError(f"{self.checkpoint}: was trained with another [model]; give the run another folder")
+        parts: dict[str, dict[str, Tensor]] = {"model": {}, "adam1": {}, "adam2": {}}
+        for name, tensor in tensors.items():
+            part, _, rest = name.partition("/")
+            parts.setdefault(part, {})[rest] = tensor
+        weights.fill(self.model, parts["model"], str(self.checkpoint))
+        if self.average is not self.model:
+            weights.fill(self.average, parts.get("average", parts["model"]), str(self.checkpoint))
+        for moment in ("adam1", "adam2"):
+            weights.check_fit(dict(self.model.named_parameters()), parts[moment], str(self.checkpoint))
+        self.step, self.seconds = header["step"], header["seconds"]
+        for name, p in self.model.named_parameters():
+            first, second = (parts[moment][name].to(self.device) for moment in ("adam1", "adam2"))
+            step = torch.tensor(float(self.step))
+            self.optimizer.state[p] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
+        # What was logged after the checkpoint will be logged again.
+        _keep_lines(self.out / "log.jsonl", self.step)
+
+    def run(self) -> bool:
+        """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
+
+        Raises NgptError when the loss or its gradient is not finite any more; the batch is saved then.
+        """
+        run, start, before = self.settings.run, time.monotonic(), self.seconds
+        batches = self._batches()
+        previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            while self.step < run.steps and not self._stop:
+                entry = self._train(next(batches))
+                self.step += 1
+                self.seconds = before + time.monotonic() - start
+                last = self.step == run.steps
+                if self.step % run.log == 0 or last:
+                    self._log(entry | {"seconds": round(self.seconds, 1)})
+                if (self.step % run.validate == 0 or last) and self.held_out:
+                    self.validate()
+                if self.step % run.save == 0 and not last:
+                    self.save()
+                out_of_time = run.minutes and time.monotonic() - start > 60 * run.minutes
+                self._stop = self.processes.any(self._stop or bool(out_of_time))
+        finally:
+            for s, handler in previous.items():
+                signal.signal(s, handler)
+        self.save()
+        return self.step >= run.steps
+
+    def save(self) -> None:
+        """Writes checkpoint and weights; whatever interrupts this, the previous ones stay whole."""
+        if self.processes.rank:
+            return
+        tensors = {f"model/{name}": t for name, t in self.model.state_dict().items()}
+        if self.average is not self.model:
+            tensors |= {f"average/{name}": t for name, t in self.average.state_dict().items()}
+        for name, p in self.model.named_parameters():
+            state = self.optimizer.state.get(p) or {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
+            tensors |= {f"adam1/{name}": state["exp_avg"], f"adam2/{name}": state["exp_avg_sq"]}
+        header = {"kind": "checkpoint", "step": self.step, "seconds": self.seconds, "version": __version__}
+        weights.write_tensors(self.checkpoint, tensors, header | {"settings": self.settings.to_dict()}, overwrite=True)
+        provenance = {
+            "step": self.step,
+            "hours": round(self.seconds / 3600, 3),
+            "device": str(self.device),
+            "parameters": parameters(self.model),
+            "version": __version__,
+            "torch": torch.__version__,
+            "settings": published(self.settings),
+        }
+        weights.save_weights(self.out / "weights.safetensors", self.average, provenance, overwrite=True)
+
+    def validate(self) -> None:
+        """Logs the scores of the averaged weights on the views held out, and draws some."""
+        if self.processes.rank == 0:
+            picture = self.out / f"validation-{self.step:07d}.png"
+            scores = validate(self.average, self.held_out, picture, self.settings.run.precision)
+            self._log({"relMSE": scores.network, "relMSE primal": scores.primal, "relMSE base": scores.base})
+        self.model.train()
+
+    def _train(self, batch: dict[str, Tensor]) -> dict[str, float]:
+        """One step; returns what is worth logging."""
+        self.model.train()
+        run, settings = self.settings.run, self.settings.optimizer
+        batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
+        target = batch.pop("target")
+        generator = torch.Generator(self.device)
+        generator.manual_seed(weights.random_state(run.seed, self.step * self.processes.count + self.processes.rank))
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=run.precision == "bfloat16"):
+            logarithm = self.model.predict(batch)
+        edge = padding.MARGIN + JITTER
+        prediction = signed_exp(logarithm[..., edge:-edge, edge:-edge].clamp(-LIMIT, LIMIT))
+        total, parts = self.loss(prediction, target, generator)
+        self.optimizer.zero_grad(set_to_none=True)
+        total.backward()
+        self.processes.average_gradients(self.model)
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip or math.inf)
+        if not torch.isfinite(total) or not torch.isfinite(norm):
+            self._give_up(batch | {"target": target}, float(total.detach()), float(norm))
+        rate = learning_rate(settings, self.step, run.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.step()
+        if self.average is not self.model:
+            update_average(self.average, self.model, settings.ema, self.step)
+        values = {"loss": float(total.detach()), "gradient norm": float(norm), "learning rate": rate}
+        return values | {f"loss {name}": float(part.detach()) for name, part in parts.items()}
+
+    def _batches(self) -> Iterator[dict[str, Tensor]]:
+        """The batches from the current step on; those of this process."""
+        run, processes = self.settings.run, self.processes
+        size = run.batch // processes.count
+        first = self.step * run.batch
+        indices = (
+            [first + i * run.batch + processes.rank * size + j for j in range(size)]
+            for i in range(run.steps - self.step)
+        )
+        workers = self.settings.data.workers
+        yield from DataLoader(
+            self.examples,
+            batch_sampler=indices,  # type: ignore[arg-type]
+            num_workers=workers,
+            persistent_workers=bool(workers),
+            pin_memory=self.device.type == "cuda",
+        )
+
+    def _give_up(self, batch: dict[str, Tensor], total: float, norm: float) -> None:
+        path = self.out / f"bad-batch-{self.step:07d}.safetensors"
+        weights.write_tensors(path, batch, {"kind": "batch", "step": self.step}, overwrite=True)
+        raise NgptError(
+            f"step {self.step}: the loss is {total:.3g} and its gradient's norm {norm:.3g}; the batch is in {path}, "
+            f"the weights before it in {self.checkpoint}; lower the learning rate, set optimizer.clip, or use float32"
+        )
+
+    def _start_from(self, path: str) -> None:
+        model, _ = weights.load_weights(path)
+        if model.config != self.settings.model:
+            raise NgptError(f"{path}: is another [model] than the run's: {model.config}")
+        self.model.load_state_dict(model.state_dict())
+
+    def _interrupt(self, number: int = signal.SIGINT, *_: Any) -> None:
+        self.say("stopping after this step; run the same command again to continue")
+        self._stop, self.signal = True, int(number)
+
+    def _log(self, values: dict[str, float]) -> None:
+        if self.processes.rank:
+            return
+        # NaN is not JSON; what is not there is left out.
+        values = {"step": self.step} | {k: v for k, v in values.items() if not math.isnan(v)}
+        path = self.out / "log.jsonl"
+        try:
+            with open(path, "a") as file:
+                file.write(json.dumps(values) + "\n")
+        except OSError as error:
+            raise NgptError(
+                f"{path}: cannot be written: {error.strerror}; the same command continues from the last checkpoint"
+            ) from error
+        self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
+        self._board(values)
+
+    def _board(self, values: dict[str, float]) -> None:
+        """The same for TensorBoard, where it is installed."""
+        if not hasattr(self, "_writer"):
+            try:
+                from torch.utils.tensorboard import SummaryWriter
+            except ImportError:
+                self._writer = None
+            else:
+                self._writer = SummaryWriter(str(self.out / "tensorboard"), purge_step=self.step)
+        if self._writer is not None:
+            for name, value in values.items():
+                if name != "step":
+                    self._writer.add_scalar(name, value, self.step)
+
+
+def published(settings: Settings) -> dict[str, Any]:
+    """The settings as they go into files that are given away: names of folders and files, not where they lie."""
+    values = settings.to_dict()
+    values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
+    values["initial"] = Path(settings.initial).name
+    values["loss"] = {k: Path(v).name if k in ("backbone", "weights") else v for k, v in settings.loss.items()}
+    return values
+
+
+def _keep_lines(path: Path, step: int) -> None:
+    """Drops what a log says of steps after ``step``, and a last line that was cut short."""
+    if not path.is_file():
+        return
+    lines = []
+    for line in path.read_text().splitlines():
+        try:
+            if json.loads(line)["step"] <= step:
+                lines.append(line)
+        except ValueError:
+            continue
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_text("".join(f"{line}\n" for line in lines))

@@ -1,0 +1,76 @@
+"""How good a network is on views it does not train on, in numbers and pictures."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.network.model import Reconstructor
+from ngpt.repair import repair
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.report.png import encode_png
+from ngpt.system.files import atomic_output
+from ngpt.training.examples import base_image, layers_of
+
+# Rows of the picture of a validation.
+_PICTURES = 6
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Geometric means, over the views, of the trimmed relMSE without direct emission.
+
+    ``primal``, ``base``  of the input and of what the network starts from (NaN without)
+    ``network``           of its result
+    """
+
+    primal: float
+    base: float
+    network: float
+
+
+def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
+    """At most ``count`` of all (crop, input), evenly spread."""
+    every = [(crop, k) for crop in crops for k in range(crop.inputs)]
+    if len(every) <= count:
+        return every
+    return [every[int(i * len(every) / count)] for i in range(count)]
+
+
+@torch.no_grad()
+def validate(
+    model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
+) -> Scores:
+    """Scores over views (crop, input); with ``picture``, rows of input, result and reference of some, as a PNG."""
+    model.eval()
+    device = next(model.parameters()).device
+    primal, base, network, rows = [], [], [], []
+    shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
+    for index, (crop, k) in enumerate(views):
+        data = repair(crop.stack(k))
+        reference = crop.reference - crop.reference_direct
+        layers = {name: layer[None].to(device) for name, layer in layers_of(data, model.config).items()}
+        with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
+            image = model(layers)[0].permute(1, 2, 0).float().cpu().numpy()
+        primal.append(relmse_trimmed(data.image, reference))
+        network.append(relmse_trimmed(image, reference))
+        if model.config.base:
+            base.append(relmse_trimmed(base_image(data, model.config), reference))
+        if picture and index in shown:
+            stops = auto_exposure(reference)
+            rows.append(np.hstack([to_srgb8(i, stops) for i in (data.image, image, reference)]))
+    if picture and rows:
+        # Folders of stacks may hold views of different sizes; those that do not fit are left out.
+        rows = [row for row in rows if row.shape == rows[0].shape]
+        with atomic_output(picture, overwrite=True) as temporary:
+            temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
+    return Scores(_mean(primal), _mean(base), _mean(network))
+
+
+def _mean(values: list[float]) -> float:
+    """The geometric mean, NaN of nothing; errors of 0 count as 1e-12."""
+    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-12))))) if values else float("nan")

@@ -1,0 +1,364 @@
+"""The commands: what they write, what they say, what their exit status means."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.cli import main
+from ngpt.stack import GradientStack
+
+
+@pytest.fixture
+def stack_file(tmp_path, noisy_stack):
+    """Writes the noisy stack under a name, and returns its path."""
+    stack, clean = noisy_stack
+
+    def write(name="s.exr", **layers):
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True, parents=True)
+        ngpt.write(path, stack.replace(**layers))
+        ngpt.write(path.with_name("clean.png.exr"), clean, overwrite=True)
+        return str(path)
+
+    return write
+
+
+def one_line_error(capfd):
+    out, err = capfd.readouterr()
+    assert err.startswith("ngpt: error: ") and err.count("\n") == 1, err
+    assert out == ""
+    return err
+
+
+def test_denoise_one_file(tmp_path, stack_file, capsys):
+    source, target = stack_file(), tmp_path / "out.exr"
+    assert main(["denoise", source, "-o", str(target), "--method", "l2"]) == 0
+    assert np.array_equal(ngpt.read_image(target), ngpt.denoise(ngpt.read(source), "l2"))
+    assert np.array_equal(ngpt.read(target)["primal"], ngpt.read(source)["primal"])  # nothing is lost
+    assert "l2" in capsys.readouterr().err
+
+
+def test_denoise_reports_as_json(tmp_path, stack_file, capsys):
+    primal = ngpt.read(stack_file("x.exr"))["primal"].copy()
+    primal[2, 3] = np.nan
+    source = stack_file("y.exr", primal=primal)
+    reference = str(tmp_path / "clean.png.exr")
+    assert main(["denoise", source, "--method", "l1", "--alpha", "0.3", "--ref", reference, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    (file,) = report["files"]
+    assert report["ok"] and file["method"] == "l1" and file["repaired"] == 1 and file["untrusted"] == 4
+    assert file["output"].endswith("y_denoised.exr") and os.path.exists(file["output"])
+    assert 0 < file["metrics"]["relMSE"] < 0.01
+
+
+def test_denoise_folders_and_patterns(tmp_path, stack_file):
+    for name in ("a/1.exr", "a/2.exr", "b/3.exr"):
+        stack_file(name)
+    for path in tmp_path.rglob("clean*"):
+        path.unlink()
+    out = tmp_path / "out"
+    assert main(["denoise", str(tmp_path / "a"), str(tmp_path / "b" / "*.exr"), "-o", str(out), "-q"]) == 0
+    assert sorted(os.listdir(out)) == ["1.exr", "2.exr", "3.exr"]
+    # Results beside their stacks are not taken for stacks the next time.
+    assert main(["denoise", str(tmp_path / "a"), "-q"]) == 0
+    assert main(["denoise", str(tmp_path / "a"), "-q", "--force"]) == 0
+    assert sorted(os.listdir(tmp_path / "a")) == ["1.exr", "1_denoised.exr", "2.exr", "2_denoised.exr"]
+
+
+def test_denoise_does_what_it_can_and_says_what_it_could_not(tmp_path, stack_file, capsys):
+    good, bad = stack_file("good.exr"), tmp_path / "bad.exr"
+    bad.write_bytes(b"not an image")
+    out = tmp_path / "out"
+    assert main(["denoise", good, str(bad), "-o", str(out), "--json"]) == 1
+    captured = capsys.readouterr()
+    report = json.loads(captured.out)
+    assert not report["ok"] and "not an OpenEXR file" in report["files"][1]["error"]
+    assert os.listdir(out) == ["good.exr"]
+    assert "1 of 2 stacks were not reconstructed" in captured.err
+
+
+def test_nothing_is_overwritten_without_force(tmp_path, stack_file, capfd):
+    source, target = stack_file(), tmp_path / "out.exr"
+    target.write_text("precious")
+    assert main(["denoise", source, "-o", str(target)]) == 2
+    assert "--force" in one_line_error(capfd) and target.read_text() == "precious"
+    assert main(["denoise", source, "-o", str(target), "--force", "-q"]) == 0
+    assert ngpt.read_image(target).shape == (17, 24, 3)
+
+
+def test_layers_by_other_names(tmp_path, noisy_stack):
+    stack, _ = noisy_stack
+    from ngpt.io.exr import ExrImage, ExrPart, write_exr
+
+    channels = {}
+    for prefix, name in (("noisy.", "primal"), ("gx.", "dx"), ("gy.", "dy")):
+        channels |= {f"{prefix}{c}": stack[name][..., i].copy() for i, c in enumerate("RGB")}
+    source, target = tmp_path / "s.exr", tmp_path / "out.exr"
+    write_exr(source, ExrImage([ExrPart("", {}, channels)]))
+    layers = ["--layer", "primal=noisy", "--layer", "dx=gx", "--layer", "dy=gy"]
+    assert main(["denoise", str(source), "-o", str(target), "--method", "l2", "-q", *layers]) == 0
+    assert np.array_equal(ngpt.read_image(target), ngpt.denoise(stack, "l2"))
+
+
+def test_diff_says_whether_images_agree(tmp_path, rng, capsys):
+    image = rng.random((6, 5, 3)).astype(np.float32)
+    a, b = str(ngpt.write(tmp_path / "a.exr", image)), str(ngpt.write(tmp_path / "b.exr", image + 0.1))
+    assert main(["diff", a, a]) == 0
+    assert "agree" in capsys.readouterr().out
+    assert main(["diff", a, b, "--json"]) == 1
+    report = json.loads(capsys.readouterr().out)
+    assert not report["agree"] and report["metrics"]["MSE"] == pytest.approx(0.01, rel=1e-4)
+    assert main(["diff", a, b, "--tolerance", "100"]) == 0
+    image[0, 0] = np.nan
+    c = str(ngpt.write(tmp_path / "c.exr", image))
+    assert main(["diff", c, a]) == 1  # where they can be compared they are equal, but they do not agree
+
+
+def test_diff_judges_the_result_of_a_result_file(tmp_path, stack_file):
+    source, target = stack_file(), tmp_path / "out.exr"
+    main(["denoise", source, "-o", str(target), "-q"])
+    assert main(["diff", str(target), source]) == 1
+    assert main(["diff", str(target), str(target)]) == 0
+
+
+def test_info_on_a_file(stack_file, capsys):
+    assert main(["info", stack_file(albedo=np.full((17, 24, 3), 0.25)), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["size"] == [24, 17] and report["layers"]["albedo"]["mean"] == 0.25
+    assert report["methods"] == ["primal", "l2", "l1"] or set(report["methods"]) >= {"primal", "l2", "l1"}
+    assert "depth" in report["missing"]
+    assert main(["info", stack_file("t.exr")]) == 0
+    assert "channels dx.R dx.G dx.B" in capsys.readouterr().out
+
+
+def test_info_prints_the_aliases(capsys):
+    assert main(["info", "--aliases"]) == 0
+    assert "Denoising Albedo" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["denoise", "missing.exr"], "missing.exr: not found"),
+        (["denoise", "{dir}"], "no .exr files to denoise there"),
+        (["denoise", "{dir}/*.exr"], "no .exr files to denoise there"),
+        (["denoise", "{text}", "-o", "{dir}/o.exr"], "notes.exr: not an OpenEXR file"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l1"], "method 'l1' needs layers 'dx' and 'dy'"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx=gx"], "fits no layer"),
+        (["denoise", "{plain}", "-o", "{dir}/o.png"], "let the name end in .exr"),
+        (["denoise", "{plain}", "-o", "{dir}/no/o.exr"], "does not exist; create it first"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx"], "'dx' is not of the form NAME=VALUE"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l3"], "invalid choice: 'l3'"),
+        (["denoise", "{plain}", "{plain2}", "-o", "{text}"], "is a file; the results of 2 stacks need a folder"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--ref", "{small}"], "5x4 and 2x1"),
+        (["diff", "{plain}", "{small}"], "5x4 and 2x1"),
+        (["diff", "{plain}", "missing.exr"], "missing.exr: not found"),
+        (["info", "missing.exr"], "missing.exr: not found"),
+        (["render", "diffuse", "--size", "0x5"], "'0x5' is not a size"),
+        (["render", "diffuse", "--spp", "0"], "'0' is not a whole number of 1 or more"),
+        (["render", "diffuse", "-o", "{dir}/s.png"], "let the name end in .exr"),
+        (["frobnicate"], "invalid choice: 'frobnicate'"),
+        ([], "required: VERB"),
+    ],
+)
+def test_bad_input_is_one_line_and_leaves_nothing(tmp_path, arguments, message, capfd):
+    files = tmp_path / "files"
+    files.mkdir()
+    names = {"dir": tmp_path / "out", "text": files / "notes.exr", "plain": files / "p.exr", "plain2": files / "q.exr"}
+    names["dir"].mkdir()
+    names["text"].write_text("no image")
+    for name in ("plain", "plain2"):
+        ngpt.write(names[name], np.ones((4, 5, 3)))
+    names["small"] = ngpt.write(files / "small.exr", np.ones((1, 2, 3)))
+    before = sorted(files.iterdir())
+    try:
+        status = main([argument.format(**names) for argument in arguments])
+    except SystemExit as stop:
+        status = stop.code
+    assert status not in (0, None)
+    assert message in one_line_error(capfd)
+    assert list(names["dir"].iterdir()) == [] and sorted(files.iterdir()) == before
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 2)])
+def test_tiny_images_are_reconstructed(tmp_path, rng, size):
+    layers = {name: rng.random((*size, 3)) for name in ("primal", "dx", "dy")}
+    source = ngpt.write(tmp_path / "s.exr", GradientStack.from_arrays(**layers))
+    for method in ("l2", "l1"):
+        assert main(["denoise", str(source), "-o", str(tmp_path / f"{method}.exr"), "-m", method, "-q"]) == 0
+
+
+def test_damaged_file_in_a_process_of_its_own(tmp_path, stack_file):
+    source = stack_file()
+    data = Path(source).read_bytes()
+    damaged = tmp_path / "damaged.exr"
+    damaged.write_bytes(data[: len(data) // 2])
+    run = subprocess.run([sys.executable, "-m", "ngpt", "denoise", damaged], capture_output=True, text=True)
+    assert run.returncode == 1 and run.stdout == ""
+    assert run.stderr.startswith("ngpt: error: ") and "damaged" in run.stderr and run.stderr.count("\n") == 1
+    assert sorted(os.listdir(tmp_path)) == ["clean.png.exr", "damaged.exr", "s.exr"]
+
+
+def test_denoising_imports_neither_torch_nor_mitsuba(stack_file):
+    code = (
+        "import sys; from ngpt.cli import main; main(sys.argv[1:]);"
+        "heavy = {'torch', 'mitsuba', 'drjit', 'skimage'} & set(sys.modules); sys.exit(str(heavy) if heavy else 0)"
+    )
+    run = subprocess.run([sys.executable, "-c", code, "denoise", stack_file(), "-q"], capture_output=True, text=True)
+    assert run.returncode == 0, run.stderr
+
+
+def test_render_denoise_diff(renderer, tmp_path, capsys):
+    stack, ref, out = (str(tmp_path / name) for name in ("s.exr", "ref.exr", "out.exr"))
+    assert main(["render", "diffuse", "-o", stack, "--spp", "16", "--size", "128x96", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["layers"][:4] == ["primal", "direct", "dx", "dy"]
+    # No terminal here: plain lines, first and last among them.
+    assert "render diffuse: 0/16 spp\n" in captured.err and "render diffuse: 16/16 spp" in captured.err
+    assert main(["render", "diffuse", "-o", ref, "--spp", "512", "--sampler", "primal", "--size", "128x96", "-q"]) == 0
+    assert main(["denoise", stack, "-o", out, "--method", "l1", "-q"]) == 0
+    errors = []
+    for image in (stack, out):
+        assert main(["diff", image, ref, "--json"]) == 1
+        errors.append(json.loads(capsys.readouterr().out)["metrics"]["relMSE"])
+    assert errors[1] < errors[0] / 3
+
+
+def test_render_errors(renderer, tmp_path, capfd, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "s.xml").write_text('<scene version="3.0.0"><shape type="nonsense"/></scene>')
+    (tmp_path / "moving.xml").write_text(
+        '<scene version="3.0.0"><sensor type="perspective"><animation name="to_world"/></sensor></scene>'
+    )
+    for arguments, message in (
+        (["render", "s.xml"], '"nonsense" not found'),
+        (["render", "t.xml"], "t.xml: no such file"),
+        (["render", "diffuse", "--variant", "scalar_rgb"], "'scalar_rgb' is not one"),
+        (["render", "diffuse", "--sampler", "best"], "unknown sampler 'best'"),
+        (["render", "diffuse", "--size", "30000x30000"], "pass --memory"),
+        (["render", "t.xml", "--spp", "9999999999"], "9999999999 samples per pixel"),
+        (["render", "diffuse", "-o", "no/s.exr"], "the folder no does not exist"),
+        (["info", "moving.xml"], "animated transforms"),
+        (["render", "moving.xml"], "animated transforms"),
+        (["demo", "--scene", "attic"], "no built-in scene is called 'attic'"),
+    ):
+        assert main(arguments) == 2
+        assert message in one_line_error(capfd)
+    assert sorted(os.listdir(tmp_path)) == ["moving.xml", "s.xml"]
+    for option in (["--time", "0"], ["--time", "-3"], ["--spp", "-1"], ["--memory", "0"], ["--seed", "-1"]):
+        with pytest.raises(SystemExit) as exit:
+            main(["render", "diffuse", *option])
+        assert exit.value.code == 2
+        assert f"argument {option[0]}: '{option[1]}' is not a" in one_line_error(capfd)
+
+
+def test_render_for_a_given_time(renderer, tmp_path, capsys):
+    stack = str(tmp_path / "s.exr")
+    assert main(["render", "diffuse", "-o", stack, "--time", "1", "--size", "16x12", "--diagnostics", "--json"]) == 0
+    captured = capsys.readouterr()
+    assert json.loads(captured.out)["spp"] == ngpt.read(stack).attributes["ngpt:spp"] > 1
+    assert "render diffuse: 0/1 s\n" in captured.err and "render diffuse: 1/1 s" in captured.err
+    assert main(["info", stack, "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["diagnostics"]["discarded"] == {"mean": 0.0, "max": 0.0, "pixels above 0": 0}
+    assert report["other channels"] == []
+
+
+def test_lines_of_progress_tell_the_time_left(capsys, monkeypatch):
+    import ngpt.system.console as console
+
+    clock = iter((0.0, 1.0, 8.0, 30.0))
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with console.Console().progress("render", "spp") as update:
+        for done in (0, 25, 100):
+            update(done, 100)
+    lines = capsys.readouterr().err.splitlines()
+    assert lines == ["render: 0/100 spp", "render: 25/100 spp, 8.0 s, about 24 s left", "render: 100/100 spp, 30.0 s"]
+
+
+@pytest.mark.parametrize("presses", [1, 2])
+def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path, presses):
+    # In a process of its own, with a sampler that presses the keys once the first pass is done.
+    code = (
+        "import data_gen.paths.camera as c, os, signal, sys, time\n"
+        "def end_pass(film, *block):\n"
+        "    presses = int(sys.argv[1]) if film._pass else 0\n"
+        "    old(film, *block)\n"
+        # Any thread may get a signal, at its leisure, and two that are pending count as one.
+        "    for _ in range(presses): os.kill(os.getpid(), signal.SIGINT); time.sleep(0.5)\n"
+        "old, c.GradientFilm.end_pass = c.GradientFilm.end_pass, end_pass\n"
+        # Whoever started the tests in the background had Ctrl-C ignored by everything in them.
+        "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
+        "from ngpt.cli import main; sys.exit(main(sys.argv[2:]))"
+    )
+    code = f"from data_gen.backend import use_variant; use_variant()\n{code}"
+    target = tmp_path / "s.exr"
+    arguments = ["render", "diffuse", "-o", str(target), "--size", "8x8", "--spp", "100000000", "--sampler", "primal"]
+    run = subprocess.run([sys.executable, "-c", code, str(presses), *arguments], capture_output=True, text=True)
+    assert run.returncode == 130, run.stderr
+    assert "press Ctrl-C again to discard" in run.stderr and "Traceback" not in run.stderr
+    if presses == 1:
+        spp = ngpt.read(target).attributes["ngpt:spp"]
+        assert spp > 1 and f"holds the {spp} samples per pixel done by then" in run.stderr
+    else:
+        assert os.listdir(tmp_path) == [] and "error: interrupted" in run.stderr
+
+
+def test_ctrl_c_is_ignored_where_whoever_started_it_said_so():
+    from ngpt.cli.render import stop_on_ctrl_c
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_on_ctrl_c() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_rendering_without_llvm_says_what_to_install(tmp_path):
+    # In a process of its own: this one has loaded the library already.
+    code = "import data_gen.llvm as l, sys; l._PATTERNS = (); from ngpt.cli import main; sys.exit(main(sys.argv[1:]))"
+    environment = {name: value for name, value in os.environ.items() if name != "DRJIT_LIBLLVM_PATH"}
+    run = subprocess.run(
+        [sys.executable, "-c", code, "render", "diffuse", "-o", str(tmp_path / "s.exr")],
+        capture_output=True,
+        text=True,
+        env=environment,
+    )
+    assert run.returncode == 2 and os.listdir(tmp_path) == []
+    assert "libllvm19" in run.stderr and run.stderr.count("\n") == 1
+
+
+def test_demo(renderer, tmp_path, capsys):
+    folder = tmp_path / "demo"
+    arguments = ["demo", "-o", str(folder), "--scene", "diffuse", "--spp", "16", "--reference-spp", "256"]
+    assert main([*arguments, "--size", "48x32", "-q"]) == 0
+    written = {path.name for path in folder.iterdir()}
+    assert {"report.html", "diffuse_stack.exr", "diffuse_ref.exr", "diffuse_l1.exr", "diffuse_l2.exr"} <= written
+    html = (folder / "report.html").read_text()
+    assert "diffuse" in html and "relMSE" in html
+    rows = {line.split()[1]: float(line.split()[2]) for line in capsys.readouterr().out.splitlines()[1:]}
+    assert rows["l1"] < rows["primal"] / 3
+    assert main([*arguments, "-q"]) == 2  # the report is there already
+
+
+def test_interrupts_and_closed_pipes(stack_file, monkeypatch, capfd):
+    import ngpt.cli.denoise
+
+    def interrupt(*args):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ngpt.cli.denoise, "reconstruct", interrupt)
+    assert main(["denoise", stack_file()]) == 130
+    assert "interrupted" in one_line_error(capfd)
+    code = "from ngpt.cli import main; import sys; sys.exit(main(['info', '--aliases']))"
+    run = subprocess.run(f'{sys.executable} -c "{code}" | head -c 10', shell=True, capture_output=True, text=True)
+    assert run.stderr == ""

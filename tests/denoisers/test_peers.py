@@ -1,0 +1,157 @@
+"""Peers: they denoise what a path tracer gives, and say so when they cannot."""
+
+import sys
+import types
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+
+from ngpt.denoisers import nfor as nfor_module
+from ngpt.denoisers import nlm, oidn
+from ngpt.denoisers.nfor import nfor
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS, reconstruct
+from ngpt.network import combine
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+PEERS = [name for name, method in METHODS.items() if method.summary.startswith("peer")]
+
+
+@pytest.fixture
+def room(rng):
+    """A path-traced image, 40x30, of two walls with a texture that only the albedo tells; its stack and the truth."""
+    y, x = np.mgrid[0:30, 0:40]
+    light = 1 + 0.5 * np.cos(x / 9)[..., None] * np.array([1.0, 0.9, 0.8])
+    albedo = 0.2 + 0.6 * ((x // 3 + y // 3) % 2)[..., None] * np.ones(3)
+    normal = np.where((x < 20)[..., None], [1.0, 0, 0], [0, 0, 1.0])
+    clean = albedo * light
+    deviation = 0.3 * clean
+    stack = GradientStack.from_arrays(
+        primal=clean + rng.normal(0, 1, clean.shape) * deviation,
+        primal_var=deviation**2,
+        albedo=albedo,
+        normal=normal,
+        depth=np.ones((30, 40, 1)),
+    )
+    return stack, clean
+
+
+@pytest.mark.parametrize("name", PEERS)
+def test_noise_falls_and_texture_stays(room, name):
+    if METHODS[name].missing():
+        pytest.skip(METHODS[name].missing())
+    stack, clean = room
+    image = reconstruct(stack, name).image
+    error = lambda i: np.mean((i - clean) ** 2 / clean**2)  # noqa: E731
+    assert image.dtype == np.float32 and image.shape == clean.shape
+    assert error(image) < 0.35 * error(stack["primal"])
+    dark, bright = clean[..., 0] < 0.45, clean[..., 0] > 0.7
+    assert image[bright].mean() / image[dark].mean() == pytest.approx(
+        clean[bright].mean() / clean[dark].mean(), rel=0.1
+    )
+    assert image.mean() == pytest.approx(clean.mean(), rel=0.03)
+
+
+@pytest.mark.parametrize("name", ["nfor", "nlm"])
+def test_exposure_only_scales(room, name):
+    if METHODS[name].missing():
+        pytest.skip(METHODS[name].missing())
+    stack, _ = room
+    bright = stack.replace(primal=1000 * stack["primal"], primal_var=1e6 * stack["primal_var"])
+    assert reconstruct(bright, name).image == pytest.approx(1000 * reconstruct(stack, name).image, rel=1e-2)
+
+
+def test_nfor_fits_what_is_linear_in_the_features(rng):
+    feature = rng.random((24, 20, 1)).astype(np.float32)
+    clean = (2 + 3 * feature) * np.array([1.0, 0.5, 0.25])
+    variance = np.full_like(clean, 0.25)
+    image = clean + rng.normal(0, 0.5, clean.shape)
+    assert np.abs(nfor(image, variance, [feature]) - clean).max() < 0.4  # noise reaches 1.5
+    assert np.mean((nfor(image, variance, [feature]) - clean) ** 2) < 0.05 * 0.25
+
+
+def test_nfor_keeps_what_is_free_of_noise(rng):
+    image = rng.random((20, 22, 3)).astype(np.float32)
+    result = nfor(image, np.zeros_like(image), [np.ones((20, 22, 1), np.float32)])
+    assert np.abs(result - image).max() < 1e-4
+    unknown = nfor(image, np.full_like(image, np.nan), [np.ones((20, 22, 1), np.float32)])
+    assert np.isfinite(unknown).all()
+
+
+def test_nfor_does_not_smear_a_spot_of_light_over_the_dark():
+    """Seen on veach-mis: the reflection of a small lamp on a black plate, with a variance to match."""
+    image, variance = np.zeros((2, 30, 30, 3), np.float32)
+    image[15, 15:17], variance[15, 15:17] = 165, 88**2
+    feature = np.linspace(0, 1, 900, dtype=np.float32).reshape(30, 30, 1)
+    result = nfor(image, variance, [feature])
+    result[15, 15:17] = 0
+    assert np.abs(result).max() < 0.05
+
+
+@pytest.mark.parametrize("size", [(1, 1), (3, 50), (17, 5)])
+def test_nfor_takes_any_size(rng, size):
+    image = rng.random((*size, 3)).astype(np.float32)
+    result = nfor(image, np.full_like(image, 0.01), [rng.random((*size, 3)).astype(np.float32)])
+    assert result.shape == image.shape and np.isfinite(result).all()
+
+
+def test_nfor_sums_are_those_of_the_plain_double_loop(rng, monkeypatch):
+    monkeypatch.setattr(nfor_module, "RADIUS", 2)
+    monkeypatch.setattr(nfor_module, "_TILE", 4)
+    image = rng.random((7, 9, 3)).astype(np.float32)
+    variance = np.full_like(image, 0.05)
+    values = rng.random((7, 9, 5)).astype(np.float32)
+    weights = {(dy, dx): w for dy, dx, w in nfor_module._weights(image, variance, 1.0)}
+    expected = np.zeros_like(values)
+    for y in range(7):
+        for x in range(9):
+            for (dy, dx), w in weights.items():
+                if 0 <= y + dy < 7 and 0 <= x + dx < 9:
+                    expected[y, x] += w[y, x] * values[y + dy, x + dx]
+    assert nfor_module._gathered(values, image, variance, 1.0) == pytest.approx(expected, rel=1e-5)
+
+
+def test_oidn_is_given_what_is_best_for_it(room, monkeypatch):
+    """A fake records the call: features in their ranges, prefiltered ones called clean."""
+    calls = []
+    fake = types.ModuleType("mitsuba_oidn")
+    fake.Quality = types.SimpleNamespace(High="high", Balanced="balanced", Fast="fast")
+    fake.denoise = lambda color, **options: calls.append(options) or color
+    monkeypatch.setitem(sys.modules, "mitsuba_oidn", fake)
+    monkeypatch.setattr(oidn, "find_spec", lambda name: object())
+    monkeypatch.setattr(oidn, "_prefiltered", lambda name, layer: layer * 0.5)
+    stack, _ = room
+    stack = stack.replace(albedo=stack["albedo"] * 2)
+    for auxiliary in oidn.AUXILIARY:
+        reconstruct(stack, "oidn", auxiliary=auxiliary)
+    prefiltered, clean, noisy, none = calls
+    assert prefiltered["clean_aux"] and clean["clean_aux"] and not noisy["clean_aux"]
+    assert prefiltered["albedo"].max() == 0.5 and noisy["albedo"].max() == 1.0
+    assert "albedo" not in none and all(call["hdr"] for call in calls)
+    with pytest.raises(NgptError, match="auxiliary 'dirty': choose one of: prefiltered"):
+        reconstruct(stack, "oidn", auxiliary="dirty")
+    with pytest.raises(NgptError, match="quality 'best'"):
+        reconstruct(stack, "oidn", quality="best")
+
+
+@pytest.mark.parametrize("name", ["oidn", "nlm"])
+def test_an_absent_peer_says_what_to_install(room, monkeypatch, name):
+    for module in (oidn, nlm):
+        monkeypatch.setattr(module, "find_spec", lambda name: None)
+    with pytest.raises(NgptError, match=f"method '{name}'.*not installed: pip install 'ngpt-recon\\[peers\\]'"):
+        reconstruct(room[0], name)
+
+
+@pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
+def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
+    """As `--method oidn` has them, though the features are filtered once for both."""
+    data = repair(full_stack(40, 50))
+    base = 0.9 * data.image
+    images = combine.images(data, base, combine.IMAGES)
+    for name, image in (("denoised", data.image), ("denoised_base", base)):
+        expected = oidn.oidn(replace(data, image=image), "prefiltered", "high")
+        assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
+    assert combine.images(data, base, ("primal",)) == {} == combine.images(data, None, ("denoised_base",))

@@ -1,0 +1,280 @@
+"""Layer names: each producer's files, overrides, ambiguities, and what is refused."""
+
+import pytest
+
+from ngpt.errors import NgptError
+from ngpt.io.aliases import ALIASES, format_aliases, resolve
+from ngpt.layers import LAYERS
+
+
+def names(*layers: str) -> list[str]:
+    """Spells channel names out: names("dx.RGB", "A") are dx.R, dx.G, dx.B and A."""
+    channels = []
+    for layer in layers:
+        prefix, dot, suffixes = layer.rpartition(".")
+        channels += [f"{prefix}.{suffix}" for suffix in suffixes] if dot else list(layer)
+    return channels
+
+
+CYCLES = names(
+    "ViewLayer.Combined.RGBA",
+    "ViewLayer.Combined_key light.RGB",
+    "ViewLayer.Noisy Image.RGBA",
+    "ViewLayer.Depth.Z",
+    "ViewLayer.Normal.XYZ",
+    "ViewLayer.Vector.XYZW",
+    "ViewLayer.Diffuse Color.RGB",
+    "ViewLayer.Denoising Albedo.RGB",
+    "ViewLayer.Denoising Normal.XYZ",
+    "ViewLayer.Denoising Depth.Z",
+    "ViewLayer.CryptoObject00.rgba",
+)
+PRODUCERS = {
+    "Cycles": (
+        [("", CYCLES)],
+        {
+            "primal": ["ViewLayer.Noisy Image.R", "ViewLayer.Noisy Image.G", "ViewLayer.Noisy Image.B"],
+            "albedo": ["ViewLayer.Denoising Albedo.R", "ViewLayer.Denoising Albedo.G", "ViewLayer.Denoising Albedo.B"],
+            "normal": ["ViewLayer.Denoising Normal.X", "ViewLayer.Denoising Normal.Y", "ViewLayer.Denoising Normal.Z"],
+            "depth": ["ViewLayer.Denoising Depth.Z"],
+            "alpha": ["ViewLayer.Noisy Image.A"],
+        },
+    ),
+    "Cycles, older": (
+        [("", names("RenderLayer.Combined.RGBA", "RenderLayer.Depth.V", "RenderLayer.DiffCol.RGB"))],
+        {
+            "primal": names("RenderLayer.Combined.RGB"),
+            "albedo": names("RenderLayer.DiffCol.RGB"),
+            "depth": ["RenderLayer.Depth.V"],
+            "alpha": ["RenderLayer.Combined.A"],
+        },
+    ),
+    "Cycles, multi-part": (
+        [
+            ("ViewLayer.Depth", ["ViewLayer.Depth.V"]),
+            ("ViewLayer.Combined", names("ViewLayer.Combined.RGBA")),
+            ("ViewLayer.Denoising Albedo", list("RGB")),
+        ],
+        {
+            "primal": names("ViewLayer.Combined.RGB"),
+            "albedo": list("RGB"),
+            "depth": ["ViewLayer.Depth.V"],
+            "alpha": ["ViewLayer.Combined.A"],
+        },
+    ),
+    "Arnold": (
+        [("", names("RGBA", "RGBA_key.RGB", "Z", "N.XYZ", "P.XYZ", "denoise_albedo.RGB", "diffuse.RGB", "direct.RGB"))],
+        {
+            "primal": list("RGB"),
+            "albedo": names("denoise_albedo.RGB"),
+            "normal": names("N.XYZ"),
+            "depth": ["Z"],
+            "alpha": ["A"],
+        },
+    ),
+    "Arnold, multi-part": (
+        [("RGBA", list("RGBA")), ("N", list("XYZ")), ("Z", ["Z"]), ("diffuse_albedo", list("RGB"))],
+        {"primal": list("RGB"), "albedo": list("RGB"), "normal": list("XYZ"), "depth": ["Z"], "alpha": ["A"]},
+    ),
+    "RenderMan": (
+        [
+            (
+                "",
+                [
+                    *names("Ci.rgb", "albedo.rgb", "albedo_var.rgb", "normal.xyz", "diffuse.rgb", "mse.rgb"),
+                    "a",
+                    "zfiltered",
+                    "zfiltered_var",
+                    "sampleCount",
+                ],
+            )
+        ],
+        {
+            "primal": names("Ci.rgb"),
+            "albedo": names("albedo.rgb"),
+            "normal": names("normal.xyz"),
+            "depth": ["zfiltered"],
+            "alpha": ["a"],
+        },
+    ),
+    "V-Ray": (
+        [
+            (
+                "",
+                [
+                    *"RGBA",
+                    "diffuse.red",
+                    "diffuse.green",
+                    "diffuse.blue",
+                    *names("bump_normals.XYZ"),
+                    "other.noiseLevel",
+                ],
+            )
+        ],
+        {
+            "primal": list("RGB"),
+            "albedo": ["diffuse.red", "diffuse.green", "diffuse.blue"],
+            "normal": names("bump_normals.XYZ"),
+            "alpha": ["A"],
+        },
+    ),
+    "Mitsuba 3": (
+        [("", names("RGB", "img.RGBA", "albedo.RGB", "nn.XYZ", "dd.y.T", "position.XYZ", "uv.UV", "m2_nested.XYZ"))],
+        {
+            "primal": list("RGB"),
+            "albedo": names("albedo.RGB"),
+            "normal": names("nn.XYZ"),
+            "depth": ["dd.y.T"],
+        },
+    ),
+    "pbrt-v4": (
+        [("", names("RGB", "Albedo.RGB", "P.XYZ", "N.XYZ", "Ns.XYZ", "Variance.RGB", "RelativeVariance.RGB", "u"))],
+        {"primal": list("RGB"), "albedo": names("Albedo.RGB"), "normal": names("Ns.XYZ")},
+    ),
+    "ngpt": (
+        [("", names("RGBA", "primal.RGB", "dx.RGB", "dy.RGB", "direct.RGB", "dx_var.RGB", "depth.Z", "normal.XYZ"))],
+        {
+            "primal": names("primal.RGB"),
+            "direct": names("direct.RGB"),
+            "dx": names("dx.RGB"),
+            "dy": names("dy.RGB"),
+            "normal": names("normal.XYZ"),
+            "depth": ["depth.Z"],
+            "dx_var": names("dx_var.RGB"),
+            "alpha": ["A"],
+        },
+    ),
+}
+
+
+@pytest.mark.parametrize("producer", PRODUCERS)
+def test_each_producer_is_understood(producer):
+    parts, expected = PRODUCERS[producer]
+    found = resolve(parts)
+    assert {name: list(where.channels) for name, where in found.items()} == expected
+    for name, where in found.items():
+        assert set(where.channels) <= set(parts[where.part][1]), name
+
+
+def test_one_channel_with_two_names_is_not_ambiguous():
+    found = resolve([("beauty", list("RGB")), ("View.Z", ["Z"])])
+    assert found["depth"][:2] == (1, ("Z",))
+
+
+def test_parts_are_told_apart():
+    found = resolve(PRODUCERS["Arnold, multi-part"][0])
+    assert {name: where.part for name, where in found.items()} == {
+        "primal": 0, "normal": 1, "depth": 2, "albedo": 3, "alpha": 0,
+    }  # fmt: skip
+
+
+def test_normals_may_be_spelled_as_colours():
+    assert resolve([("", names("RGB", "normal.RGB"))])["normal"].channels == ("normal.R", "normal.G", "normal.B")
+
+
+def test_channel_order_is_canonical_whatever_the_order_in_the_file():
+    assert resolve([("", ["B", "G", "R", "dx.G", "dx.B", "dx.R"])])["dx"].channels == ("dx.R", "dx.G", "dx.B")
+
+
+TWO_VIEWS = [("", names("Near.Combined.RGBA", "Far.Combined.RGBA", "Near.Denoising Albedo.RGB", "Far.Depth.Z"))]
+
+
+def test_two_view_layers_are_ambiguous_until_an_override_settles_it():
+    with pytest.raises(NgptError) as caught:
+        resolve(TWO_VIEWS, path="shot.exr")
+    message = str(caught.value)
+    assert message.startswith("shot.exr: layer 'primal' could be any of ")
+    assert '"Near.Combined", "Far.Combined"' in message and '--layer primal="Near.Combined"' in message
+    found = resolve(TWO_VIEWS, {"primal": "Far.Combined"})
+    assert found["primal"].channels[0] == "Far.Combined.R"
+    assert found["alpha"].channels == ("Far.Combined.A",)
+    assert found["albedo"].name == "Near.Denoising Albedo"
+
+
+def test_an_ambiguous_feature_is_settled_by_its_own_override_only():
+    parts = [("", names("RGB", "a.Denoising Albedo.RGB", "b.Denoising Albedo.RGB"))]
+    with pytest.raises(NgptError, match="layer 'albedo' could be any of"):
+        resolve(parts)
+    with pytest.raises(NgptError, match="layer 'albedo' could be any of"):
+        resolve(parts, {"albedo": "Denoising Albedo"})
+    assert resolve(parts, {"albedo": "b.Denoising Albedo"})["albedo"].channels[1] == "b.Denoising Albedo.G"
+
+
+def test_a_whole_name_beats_a_tail():
+    found = resolve([("", names("RGB", "dx.RGB", "shadow.dx.RGB"))])
+    assert found["dx"].channels[0] == "dx.R"
+
+
+def test_of_two_eyes_the_one_that_holds_primal_counts():
+    found = resolve([("left", [*"RGBAZ", *names("albedo.RGB")]), ("right", [*"RGBAZ", *names("albedo.RGB")])])
+    assert {name: where.part for name, where in found.items()} == {"primal": 0, "albedo": 0, "depth": 0, "alpha": 0}
+    found = resolve([("left", [*"RGBAZ"]), ("right", [*"RGBAZ"])], {"primal": "right"})
+    assert {name: where.part for name, where in found.items()} == {"primal": 1, "depth": 1, "alpha": 1}
+
+
+def test_overrides_beat_aliases_and_match_tails():
+    parts = [("", [*names("RGB", "albedo.RGB", "View.Paint.RGB"), "distance"])]
+    found = resolve(parts, {"albedo": "Paint", "depth": "distance"})
+    assert found["albedo"].channels[0] == "View.Paint.R"
+    assert found["depth"].channels == ("distance",)
+
+
+@pytest.mark.parametrize(
+    ("overrides", "expected"),
+    [
+        ({"colour": "x"}, ["no layer is called 'colour'", "primal, direct, dx"]),
+        ({"albedo": "Paint"}, ['--layer albedo="Paint"', "fits no layer", '"root" (R G B)', '"N" (X Y Z)']),
+        ({"dx": "albed"}, ['--layer dx="albed"', "fits no layer"]),
+        ({"dx": "uv"}, ['--layer dx="uv"', "fits no layer with channels R G B", '"uv" (U V)']),
+    ],
+)
+def test_bad_overrides_name_what_the_file_holds(overrides, expected):
+    with pytest.raises(NgptError) as caught:
+        resolve([("", names("RGB", "N.XYZ", "uv.UV"))], overrides, "a.exr")
+    assert str(caught.value).startswith("a.exr: ") and "\n" not in str(caught.value)
+    for text in expected:
+        assert text in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        (names("RGB", "dx.RG"), "layer 'dx' is incomplete: 'dx' lacks channel B (it holds dx.R, dx.G)"),
+        (names("RGB", "normal.XZ"), "layer 'normal' is incomplete: 'normal' lacks channel Y"),
+        (names("RG"), "layer 'primal' is incomplete: 'root' lacks channel B"),
+        ([*names("RGB", "dy.RGB"), "dy.red"], "layer 'dy' has one channel twice, dy.R and dy.red"),
+        (names("N.XYZ", "fog.RGB"), 'the file holds "N" (X Y Z), "fog" (R G B); name it with --layer primal="NAME"'),
+        (["Y"], "holds luminance (channel Y) but no colour"),
+        (["Y", "A"], "holds luminance (channel Y) but no colour"),
+        ([], "no primal image"),
+    ],
+)
+def test_files_that_make_no_stack(channels, expected):
+    with pytest.raises(NgptError) as caught:
+        resolve([("", channels)], path="a.exr")
+    assert str(caught.value).startswith("a.exr: ") and expected in str(caught.value)
+
+
+def test_the_root_of_a_part_called_albedo_is_no_primal():
+    with pytest.raises(NgptError, match="no primal image"):
+        resolve([("albedo", list("RGB")), ("N", list("XYZ"))])
+    assert resolve([("albedo", list("RGB")), ("Combined", list("RGB"))])["primal"].part == 1
+
+
+def test_direct_lighting_of_other_renderers_is_not_ngpts_direct():
+    assert "direct" not in resolve([("", names("RGB", "direct.RGB"))])
+    assert "direct" in resolve([("", names("RGB", "direct.RGB", "dy.RGB"))])
+    assert "direct" in resolve([("", names("RGB", "direct.RGB"))], {"direct": "direct"})
+
+
+def test_variances_of_a_sample_are_not_taken_for_variances_of_the_mean():
+    assert "primal_var" not in resolve([("", names("RGB", "Variance.RGB", "Ci_var.RGB", "mse.RGB"))])
+
+
+def test_the_alias_table_is_complete_and_printed_in_full():
+    assert {alias.layer for alias in ALIASES} == set(LAYERS)
+    lines = format_aliases().splitlines()
+    assert len(lines) == len(ALIASES) + 1
+    assert any("Denoising Albedo" in line and "Cycles" in line and line.startswith("albedo") for line in lines)
+    for name in LAYERS:
+        assert next(alias.name for alias in ALIASES if alias.layer == name) == name, "canonical names come first"

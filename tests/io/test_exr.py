@@ -1,0 +1,323 @@
+"""Stacks and results in OpenEXR files: what is written is read again, and what is not ours passes through."""
+
+from itertools import pairwise
+
+import numpy as np
+import OpenEXR
+import pytest
+from exr_files import bits, comparable, noise, read_raw, same_bits, window, write_raw
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.io.exr import read, write
+from ngpt.layers import LAYERS
+from ngpt.stack import GradientStack
+
+LAYOUTS = {
+    "plain": lambda a: a,
+    "fortran": np.asfortranarray,
+    "reversed": lambda a: a[::-1, ::-1],
+    "cropped": lambda a: np.pad(a, ((1, 2), (3, 1), (0, 0)))[1:-2, 3:-1],
+    "channels first": lambda a: np.ascontiguousarray(a.transpose(2, 0, 1)).transpose(1, 2, 0),
+    "every other": lambda a: np.repeat(a, 2, axis=1)[:, ::2],
+    "read-only": lambda a: np.broadcast_to(a, a.shape),
+}
+LOSSLESS = ("NO", "RLE", "ZIPS", "ZIP", "PIZ")
+quick = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+
+
+@st.composite
+def layer_arrays(draw):
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    height, width = draw(st.integers(1, 9)), draw(st.integers(1, 9))
+    names = ["primal", *draw(st.lists(st.sampled_from(list(LAYERS)[1:]), unique=True))]
+    arrays = {}
+    for name in names:
+        dtype = draw(st.sampled_from([np.float16, np.float32]))
+        array = noise(rng, (height, width, len(LAYERS[name].channels)), dtype)
+        arrays[name] = LAYOUTS[draw(st.sampled_from(list(LAYOUTS)))](array)
+    return arrays
+
+
+@quick
+@given(arrays=layer_arrays())
+def test_a_stack_is_read_as_it_was_written(tmp_path, arrays):
+    attributes = {"ngpt:spp": 16, "ngpt:seed": str(2**63), "ngpt:seconds": 1.5, "ngpt:normalSpace": "camera"}
+    stack = GradientStack.from_arrays(attributes=attributes, **arrays)
+    path = write(tmp_path / "a.exr", stack, overwrite=True)
+    ((_, header, channels),) = read_raw(path)
+    for name, array in arrays.items():
+        for index, suffix in enumerate(LAYERS[name].channels):
+            stored = channels[suffix if name in ("primal", "alpha") else f"{name}.{suffix}"]
+            assert same_bits(stored, array[..., index].astype(np.float32)), (name, suffix)
+    assert header["type"] == OpenEXR.scanlineimage and header["compression"] == OpenEXR.ZIP_COMPRESSION
+    again = read(path)
+    expected = dict(arrays)
+    if not {"dx", "dy"} & arrays.keys():
+        expected.pop("direct", None)
+    assert set(again.names) == set(expected)
+    for name, array in expected.items():
+        assert same_bits(again[name], array.astype(np.float32)) and again[name].flags.c_contiguous
+    assert again.attributes == {**attributes, "ngpt:version": ngpt.__version__}
+
+
+@st.composite
+def files(draw):
+    """Parts for write_raw: a stack among layers, types, windows and attributes that ngpt knows nothing of."""
+    rng = np.random.default_rng(draw(st.integers(0, 2**32)))
+    height, width = draw(st.integers(1, 40)), draw(st.integers(1, 40))
+    header = {
+        "dataWindow": window(draw(st.integers(-50, 50)), draw(st.integers(-50, 50)), width, height),
+        "displayWindow": window(-3, -7, 64, 32),
+        "compression": getattr(OpenEXR, f"{draw(st.sampled_from(LOSSLESS))}_COMPRESSION"),
+        "lineOrder": draw(st.sampled_from([OpenEXR.INCREASING_Y, OpenEXR.DECREASING_Y])),
+        "pixelAspectRatio": 2.0,
+    }
+    if draw(st.booleans()):
+        header |= {"type": OpenEXR.tiledimage, "tiles": OpenEXR.TileDescription()}
+    types = {kind: draw(st.sampled_from([np.float16, np.float32])) for kind in ("root", "dx", "albedo", "unknown")}
+    channels = {name: noise(rng, (height, width), types["root"]) for name in "RGBA"}
+    channels |= {f"dx.{name}": noise(rng, (height, width), types["dx"]) for name in "RGB"}
+    channels |= {f"View.Denoising Albedo.{name}": noise(rng, (height, width), types["albedo"]) for name in "RGB"}
+    channels |= {
+        "id.ID": noise(rng, (height, width), np.uint32),
+        "fog.Q": noise(rng, (height, width), types["unknown"]),
+    }
+    attributes = {"owner": "me", "x:list": ["a", "b"], "ngpt:spp": 3, "worldToCamera": np.eye(4, dtype=np.float32)}
+    parts = [(channels, {**header, **attributes}, "beauty")]
+    if draw(st.booleans()):
+        other = {"displayWindow": header["displayWindow"], "pixelAspectRatio": 2.0, "dataWindow": window(5, 6, 4, 3)}
+        parts.append(({"mask": noise(rng, (3, 4), np.uint32)}, {**other, "comments": "second"}, "other"))
+    return parts
+
+
+@quick
+@given(parts=files())
+def test_all_else_passes_through_a_result(tmp_path, parts):
+    source = write_raw(tmp_path / "source.exr", *parts)
+    stack = read(source)
+    result = np.full((stack.height, stack.width, 3), 0.1, np.float32)
+    written = read_raw(write(tmp_path / "result.exr", result, like=stack, overwrite=True))
+    assert len(written) == len(parts)
+    root_type = parts[0][0]["R"].dtype
+    for index, ((name, header, channels), (_, old_header, old)) in enumerate(
+        zip(written, read_raw(source), strict=True)
+    ):
+        assert name == parts[index][2]
+        expected = dict(old)
+        if index == 0:
+            expected |= {f"primal.{suffix}": old[suffix] for suffix in "RGB"}
+            expected |= dict.fromkeys("RGB", np.full((stack.height, stack.width), 0.1, root_type))
+        assert set(channels) == set(expected)
+        for channel, pixels in expected.items():
+            assert same_bits(channels[channel], pixels), (name, channel)
+        assert header.pop("ngpt:version", None) == (ngpt.__version__ if index == 0 else None)
+        for derived in ("channels", "chunkCount"):
+            header.pop(derived, None), old_header.pop(derived, None)
+        assert {key: comparable(value) for key, value in header.items()} == {
+            key: comparable(value) for key, value in old_header.items()
+        }
+
+
+@quick
+@given(parts=files())
+def test_a_stack_that_was_read_is_written_as_it_was(tmp_path, parts):
+    source = write_raw(tmp_path / "source.exr", *parts)
+    written = read_raw(write(tmp_path / "copy.exr", read(source), overwrite=True))
+    for (_, _, channels), (_, _, old) in zip(written, read_raw(source), strict=True):
+        assert set(channels) == set(old) and all(same_bits(channels[name], old[name]) for name in old)
+
+
+def small(*names: str, dtype=np.float32, start: float = 0.0) -> dict[str, np.ndarray]:
+    """2x3 channels, all different."""
+    return {name: np.arange(6).reshape(2, 3).astype(dtype) + dtype(start + 10 * i) for i, name in enumerate(names)}
+
+
+RESULT = np.linspace(0.5, 2.0, 18, dtype=np.float32).reshape(2, 3, 3)
+ROOT = ("R", "G", "B")
+PRIMAL = ("primal.R", "primal.G", "primal.B")
+
+
+def test_a_result_of_a_result_keeps_the_first_primal(tmp_path):
+    source = write_raw(tmp_path / "0.exr", (small(*"RGBA", "dx.R", "dx.G", "dx.B", dtype=np.float16),))
+    paths = [source, tmp_path / "1.exr", tmp_path / "2.exr"]
+    for number, (before, after) in enumerate(pairwise(paths), start=1):
+        write(after, RESULT * number, like=read(before))
+    first, last = read(source), read(paths[2])
+    assert first.names == last.names
+    for name in first.names:
+        assert same_bits(first[name], last[name]), name
+    ((_, _, channels),) = read_raw(paths[2])
+    assert set(channels) == set(read_raw(paths[1])[0][2])
+    assert same_bits(channels["G"], (2 * RESULT[..., 1]).astype(np.float16))
+
+
+@pytest.mark.parametrize(
+    ("peak", "expected"),
+    [(65504.0, np.float16), (65505.0, np.float32), (1e12, np.float32), (1e-6, np.float32), (0.0, np.float16)],
+)
+def test_half_becomes_float_where_half_cannot_hold_the_result(tmp_path, peak, expected):
+    stack = read(write_raw(tmp_path / "a.exr", (small(*ROOT, dtype=np.float16),)))
+    image = np.zeros((2, 3, 3), np.float32)
+    image[0, 0, 0], image[1, 1] = -peak, np.nan
+    ((_, _, channels),) = read_raw(write(tmp_path / "b.exr", image, like=stack))
+    for index, name in enumerate(ROOT):
+        assert same_bits(channels[name], image[..., index].astype(expected))
+    assert all(channels[name].dtype == np.float16 for name in PRIMAL)
+
+
+def test_alpha_and_unknown_layers_are_untouched_by_name(tmp_path):
+    before = small(*ROOT, "A", "Z", "primal_var.R", "primal_var.G", "primal_var.B", "crypto.r", dtype=np.float16)
+    ((_, _, after),) = read_raw(write(tmp_path / "b.exr", RESULT, like=read(write_raw(tmp_path / "a.exr", (before,)))))
+    for name in ("A", "Z", "primal_var.G", "crypto.r"):
+        assert same_bits(after[name], before[name]), "even half, where the contract wants float, is left as it was"
+
+
+def test_cycles_files_get_a_root_to_look_at(tmp_path):
+    names = [f"View.Noisy Image.{suffix}" for suffix in "RGBA"] + [f"View.Combined.{suffix}" for suffix in "RGBA"]
+    before = small(*names, dtype=np.float16)
+    path = write(tmp_path / "b.exr", RESULT, like=read(write_raw(tmp_path / "a.exr", (before,))))
+    ((_, _, after),) = read_raw(path)
+    assert set(after) == {*names, *ROOT, *PRIMAL, "A"}
+    assert same_bits(after["R"], RESULT[..., 0].astype(np.float16))
+    assert same_bits(after["A"], before["View.Noisy Image.A"])
+    assert same_bits(after["primal.B"], before["View.Noisy Image.B"])
+    assert all(same_bits(after[name], before[name]) for name in names)
+
+
+def test_a_primal_in_a_later_part_puts_the_result_in_a_new_first_part(tmp_path):
+    parts = [
+        (small("Z"), {"compression": OpenEXR.PIZ_COMPRESSION}, "depth"),
+        (small(*"RGBA", start=100.0), {"owner": "me", "lineOrder": OpenEXR.DECREASING_Y}, "Combined"),
+    ]
+    stack = read(write_raw(tmp_path / "a.exr", *parts))
+    assert stack.attributes == {"owner": "me"} and stack["depth"][0, 1, 0] == 1.0
+    path = write(tmp_path / "b.exr", RESULT, like=stack)
+    after = read_raw(path)
+    assert [name for name, _, _ in after] == ["ngpt", "depth", "Combined"]
+    assert set(after[0][2]) == {*ROOT, "A", *PRIMAL}
+    assert same_bits(after[0][2]["B"], RESULT[..., 2])
+    for (channels, header, _), (_, new_header, new) in zip(parts, after[1:], strict=True):
+        assert set(new) == set(channels) and all(same_bits(new[name], channels[name]) for name in new)
+        assert {key: new_header[key] for key in header} == header
+    again = read(path)
+    assert all(same_bits(again[name], stack[name]) for name in stack.names) and again.names == stack.names
+    assert again.attributes == {"owner": "me", "ngpt:version": ngpt.__version__}
+    twice = read_raw(write(tmp_path / "c.exr", 2 * RESULT, like=again))
+    assert [name for name, _, _ in twice] == ["ngpt", "depth", "Combined"]
+    assert same_bits(twice[0][2]["B"], 2 * RESULT[..., 2]) and same_bits(
+        twice[0][2]["primal.R"], stack["primal"][..., 0]
+    )
+
+
+def test_a_root_that_is_not_the_primal_is_not_lost(tmp_path):
+    before = small(*ROOT, "noisy.R", "noisy.G", "noisy.B")
+    stack = read(write_raw(tmp_path / "a.exr", (before,)), {"primal": "noisy"})
+    after = read_raw(write(tmp_path / "b.exr", RESULT, like=stack))
+    assert [name for name, _, _ in after] == ["ngpt", "source"]
+    assert same_bits(after[0][2]["R"], RESULT[..., 0]) and same_bits(after[0][2]["primal.R"], before["noisy.R"])
+    assert set(after[1][2]) == set(before) and all(same_bits(after[1][2][name], before[name]) for name in before)
+
+
+def test_changed_and_added_layers_go_where_they_belong(tmp_path):
+    albedo = [f"View.Denoising Albedo.{suffix}" for suffix in "RGB"]
+    half = small(*ROOT, *albedo, "dx.R", "dx.G", "dx.B", "N.X", "N.Y", "N.Z", dtype=np.float16)
+    stack = read(write_raw(tmp_path / "a.exr", (half, {"ngpt:spp": 1, "owner": "me"})))
+    stack = stack.replace(albedo=stack["albedo"] / 64, dx=stack["dx"] + 1, dy=RESULT, alpha=RESULT[..., 0])
+    stack.attributes["ngpt:spp"] = 2
+    ((_, header, channels),) = read_raw(write(tmp_path / "b.exr", stack))
+    assert set(channels) == {*half, "dy.R", "dy.G", "dy.B", "A"}
+    assert same_bits(channels[albedo[1]], half[albedo[1]] / np.float16(64)), "colour keeps its type"
+    assert same_bits(channels["dx.B"], half["dx.B"].astype(np.float32) + 1), "gradients are float"
+    assert same_bits(channels["N.Y"], half["N.Y"])
+    assert same_bits(channels["dy.G"], RESULT[..., 1]) and same_bits(channels["A"], RESULT[..., 0])
+    assert header["ngpt:spp"] == 2 and header["owner"] == "me"
+
+
+def test_an_image_alone_is_float_rgb(tmp_path):
+    path = write(tmp_path / "a.exr", RESULT.astype(np.float64)[::-1])
+    ((_, header, channels),) = read_raw(path)
+    assert path == tmp_path / "a.exr" and set(channels) == set(ROOT)
+    assert same_bits(channels["G"], np.ascontiguousarray(RESULT[::-1, :, 1]))
+    assert header["ngpt:version"] == ngpt.__version__
+
+
+def test_a_result_of_a_stack_in_memory_holds_the_stack(tmp_path):
+    stack = GradientStack.from_arrays(primal=RESULT, dx=RESULT - 1, depth=RESULT[..., 0], attributes={"ngpt:spp": 8})
+    path = write(tmp_path / "a.exr", RESULT * 2, like=stack)
+    again = read(path)
+    assert again.names == ("primal", "dx", "depth") and again.attributes["ngpt:spp"] == 8
+    assert all(same_bits(again[name], stack[name]) for name in stack.names)
+    assert same_bits(read_raw(path)[0][2]["R"], 2 * RESULT[..., 0])
+
+
+def test_uint_channels_are_read_as_numbers(tmp_path):
+    channels = {name: np.array([[0, 7, 2**24]], np.uint32) for name in ROOT}
+    stack = read(write_raw(tmp_path / "a.exr", (channels,)))
+    assert np.array_equal(stack["primal"][0, :, 1], [0, 7, 2**24])
+    written = read_raw(write(tmp_path / "b.exr", stack["primal"], like=stack))[0][2]
+    assert written["R"].dtype == np.float32 and written["primal.R"].dtype == np.uint32
+
+
+def test_a_layer_override_reaches_the_stack(tmp_path):
+    path = write_raw(
+        tmp_path / "a.exr", (small(*ROOT, "Paint.R", "Paint.G", "Paint.B", "albedo.R", "albedo.G", "albedo.B"),)
+    )
+    assert read(path)["albedo"][0, 0, 0] == 60 and read(path, {"albedo": "Paint"})["albedo"][0, 0, 0] == 30
+    with pytest.raises(NgptError, match=r"a\.exr: --layer dx=\"grad\" fits no layer"):
+        read(path, {"dx": "grad"})
+
+
+def test_results_keep_the_bits_of_nan_and_negative_zero(tmp_path):
+    image = noise(np.random.default_rng(1), (5, 6, 3), np.float32)
+    channels = read_raw(write(tmp_path / "a.exr", image))[0][2]
+    assert np.array_equal(bits(np.stack([channels[name] for name in ROOT], -1)), bits(image))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "expected"),
+    [
+        (lambda stack: ("out.png", RESULT), "out.png: ngpt writes OpenEXR; let the name end in .exr"),
+        (lambda stack: ("out", stack), "let the name end in .exr"),
+        (lambda stack: ("out.exr", RESULT[:1], stack), "the result is 3x1 but the stack"),
+        (lambda stack: ("out.exr", RESULT[..., :2], stack), "out.exr: layer 'primal' has shape (2, 3, 2)"),
+        (lambda stack: ("out.exr", RESULT[..., 0]), "has shape (2, 3)"),
+        (lambda stack: ("out.exr", RESULT * 1j, stack), "is of type complex64"),
+        (lambda stack: ("out.exr", RESULT.astype(np.float64) * 1e300), "values that float32 cannot hold"),
+        (lambda stack: ("out.exr", stack, stack), "`like` goes with an image"),
+        (lambda stack: ("no/out.exr", RESULT, stack), "does not exist"),
+        (lambda stack: ("out.exr", GradientStack.from_arrays(dx=RESULT)), "out.exr needs layer 'primal'"),
+        (lambda stack: ("out.exr", stack.replace(primal=RESULT[:1])), "the stack is 3x1 but"),
+    ],
+)
+def test_what_cannot_be_written_leaves_no_file(tmp_path, arguments, expected):
+    stack = read(write_raw(tmp_path / "a.exr", (small(*ROOT),)))
+    name, *rest = arguments(stack)
+    with pytest.raises(NgptError) as caught:
+        write(tmp_path / name, *rest)
+    assert expected in str(caught.value) and "\n" not in str(caught.value)
+    assert [path.name for path in tmp_path.iterdir()] == ["a.exr"]
+
+
+def test_nothing_is_overwritten_unasked(tmp_path):
+    path = write(tmp_path / "a.exr", RESULT)
+    with pytest.raises(NgptError, match="exists already"):
+        write(path, RESULT * 2)
+    assert same_bits(read(path)["primal"], RESULT)
+    write(path, RESULT * 2, overwrite=True)
+    assert same_bits(read(path)["primal"], RESULT * 2)
+
+
+def test_layers_in_parts_of_other_size_or_place_are_refused(tmp_path):
+    shifted = {"dataWindow": window(5, 0, 3, 2)}
+    path = write_raw(tmp_path / "a.exr", (small(*ROOT), {}, "rgb"), (small("X", "Y", "Z"), shifted, "N"))
+    with pytest.raises(NgptError, match=r"layer 'normal' starts at pixel \(5, 0\) but 'primal' at \(0, 0\)"):
+        read(path)
+    larger = {name: np.zeros((4, 4), np.float32) for name in "XYZ"}
+    path = write_raw(
+        tmp_path / "b.exr", (small(*ROOT), {}, "rgb"), (larger, {"displayWindow": window(0, 0, 3, 2)}, "N")
+    )
+    with pytest.raises(NgptError, match=r"b\.exr: layer 'normal' is 4x4 but 'primal' is 3x2"):
+        read(path)

@@ -1,0 +1,60 @@
+"""Perceptual metrics: order, invariances, and that their parameters come from the reference."""
+
+import numpy as np
+import pytest
+
+from ngpt.measure import perceptual
+from ngpt.errors import NgptError
+
+
+@pytest.fixture
+def reference(rng):
+    y, x = np.mgrid[0:24, 0:32] / 8
+    return (np.stack([1 + np.sin(x + c) * np.cos(y) for c in range(3)], axis=-1) ** 3 + 0.05).astype(np.float32)
+
+
+def test_ssim_orders_noise_and_needs_its_window(reference, rng):
+    pytest.importorskip("skimage")
+    noise = rng.normal(0, 0.1, reference.shape)
+    assert perceptual.ssim(reference, reference) == pytest.approx(1)
+    assert 1 > perceptual.ssim(reference + noise, reference) > perceptual.ssim(reference + 3 * noise, reference)
+    with pytest.raises(NgptError, match="9x10; its window takes 11x11"):
+        perceptual.ssim(reference[:10, :9], reference[:10, :9])
+
+
+def test_flip_is_that_of_its_authors(reference, rng):
+    flip_evaluator = pytest.importorskip("flip_evaluator")
+    image = np.maximum(reference + rng.normal(0, 0.2, reference.shape), 0).astype(np.float32)
+    mean, errors = perceptual.flip(image, reference)
+    assert errors.shape == reference.shape[:2] and errors.mean() == pytest.approx(mean, rel=1e-4)
+    # Left to itself, FLIP takes its exposures from the reference by the same rule.
+    _, expected, parameters = flip_evaluator.evaluate(reference, image, "HDR", applyMagma=False)
+    assert mean == pytest.approx(expected, rel=1e-3)
+    start, stop, count = perceptual.flip_exposures(reference)
+    found = [parameters[name] for name in ("startExposure", "stopExposure", "numExposures")]
+    assert [start, stop, count] == pytest.approx(found, abs=0.01)  # its median of an even number is one of the two
+
+
+def test_flip_of_a_firefly_does_not_move_the_exposures(reference):
+    pytest.importorskip("flip_evaluator")
+    image = reference.copy()
+    image[3, 3] = 1e7
+    mean, errors = perceptual.flip(image, reference)
+    assert 0 < mean < 0.3 and errors[3, 3] > 0.1 and errors[-1, -1] < 1e-3
+
+
+def test_black_reference_and_sizes(reference):
+    assert perceptual.flip_exposures(0 * reference) == (0.0, 0.0, 2)
+    with pytest.raises(NgptError, match="different size"):
+        perceptual.flip(reference, reference[:-1])
+
+
+def test_elpips_without_weights_says_what_is_missing():
+    pytest.importorskip("torch")
+    with pytest.raises(NgptError, match="E-LPIPS needs its fitted weights"):
+        perceptual.make_elpips("", "")
+
+
+def test_what_is_missing_is_named(monkeypatch):
+    monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
+    assert "flip-evaluator" in perceptual.missing("FLIP") and "scikit-image" in perceptual.missing("SSIM")

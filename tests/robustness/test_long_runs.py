@@ -1,0 +1,126 @@
+"""Long runs: as much memory and time for the last file, crop or step as for the first."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+from processes import ENVIRONMENT, ROOT, make_work
+from reliability import record
+
+import ngpt
+
+# What a run may gain over its second half. Allocators keep some of what they once had, so it is never quite nothing.
+MIB = 16
+# What the last quarter may take longer than the one before the middle; machines are shared.
+SLOWER = 2.0
+
+# Printed by the process itself, one line each: seconds since its start, and MiB in memory.
+NOTE = """
+import gc, time
+def note():
+    resident = int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
+    print("note", time.perf_counter(), resident, flush=True)
+"""
+
+DENOISE = """
+import sys, ngpt.cli.denoise as verb
+from ngpt.cli import main
+one = verb.denoise_file
+def noted(*arguments):
+    try: return one(*arguments)
+    finally: note()
+verb.denoise_file = noted
+sys.exit(main(["denoise", sys.argv[1], "-o", sys.argv[2], "-q"]))
+"""
+
+GENERATE = """
+import sys
+from dataclasses import replace
+from pathlib import Path
+from data_gen.dataset import jobs
+from data_gen.dataset.config import read_config
+config = replace(
+    read_config(Path("configs/data-tiny.toml")), size=16, spp=(2, 2), inputs=1, reference_spp=2, crops_per_shard=8,
+    scenes=int(sys.argv[2]), crops=int(sys.argv[3]),
+)
+from data_gen.dataset import crops
+one = crops.make_crop
+def noted(*arguments):
+    try: return one(*arguments)
+    finally: note()
+crops.make_crop = noted
+jobs.generate(config, Path(sys.argv[1]), jobs.Serial())
+"""
+
+TRAIN = """
+import runpy, sys
+from ngpt.training.trainer import Trainer
+step, count = Trainer._train, 0
+def noted(self, batch):
+    global count
+    count += 1
+    if count % 10 == 0: note()
+    return step(self, batch)
+Trainer._train = noted
+sys.exit(runpy.run_path("train.py")["main"](sys.argv[1:]))
+"""
+
+
+def notes_of(code, *arguments):
+    """Seconds and MiB, after each of what a process does many of."""
+    command = [sys.executable, "-c", NOTE + code, *map(str, arguments)]
+    run = subprocess.run(command, capture_output=True, text=True, env=ENVIRONMENT, cwd=ROOT, check=False)
+    assert run.returncode == 0, run.stderr
+    lines = [line.split() for line in run.stdout.splitlines() if line.startswith("note ")]
+    return np.array([[float(seconds), float(mebibytes)] for _, seconds, mebibytes in lines])
+
+
+def judge(campaign, notes, each=1, slower=SLOWER):
+    """Fails if the second half gains memory, or the last quarter is slow."""
+    count = len(notes)
+    half, quarter = notes[count // 2 :], count // 4
+    slope = np.polyfit(np.arange(len(half)), half[:, 1], 1)[0] * len(half)
+    steps = np.diff(notes[:, 0])
+    ratio = float(np.median(steps[-quarter:]) / np.median(steps[quarter : 2 * quarter]))
+    worst = {
+        "MiB gained over the second half": round(float(slope), 2),
+        "MiB at its end": round(float(notes[-1, 1])),
+        "median time, last quarter by second": round(ratio, 2),
+    }
+    record(campaign, count * each, {"done": count * each}, worst=worst, seconds=round(float(np.ptp(notes[:, 0]))))
+    assert slope < MIB and ratio < slower, worst
+
+
+@pytest.mark.parametrize("count", [60, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+def test_many_stacks_in_one_call(tmp_path, count):
+    (tmp_path / "in").mkdir()
+    for i in range(6):
+        # Several sizes, since buffers are kept by size; and more files than contents, by links.
+        ngpt.write(tmp_path / f"{i}.exr", full_stack(40 + 7 * i, 72 - 5 * i, seed=i))
+    for i in range(count):
+        os.link(tmp_path / f"{i % 6}.exr", tmp_path / "in" / f"{i:04}.exr")
+    notes = notes_of(DENOISE, tmp_path / "in", tmp_path / "out")
+    assert len(list((tmp_path / "out").iterdir())) == len(notes) == count
+    judge("Stacks in one call of ngpt denoise", notes)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(7200)
+def test_many_small_crops(tmp_path):
+    """A day's generation in small: what a process hoards, it hoards by scenes and crops, not by pixels."""
+    pytest.importorskip("mitsuba")
+    scenes, crops = 10, 40
+    notes = notes_of(GENERATE, tmp_path / "out", scenes, crops)
+    assert len(notes) >= 0.9 * scenes * crops, "views that show nothing may fail"
+    judge("Small crops in one process of data_gen", notes)
+
+
+@pytest.mark.parametrize("steps", [150, pytest.param(5000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+def test_many_training_steps(tmp_path, steps):
+    job = make_work("train", tmp_path)
+    changes = {"run.steps": steps, "run.save": steps // 4, "run.validate": steps // 4, "run.log": 50}
+    arguments = job.arguments(tmp_path / "out", **changes)[2:]
+    judge("Training steps of a tiny network", notes_of(TRAIN, *arguments), each=10)

@@ -1,0 +1,211 @@
+"""No file that ngpt reads can run code: nothing in the project unpickles or evaluates, and hostile files show it."""
+
+import ast
+import os
+import pickle
+import struct
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.methods import WEIGHTS
+
+ROOT = Path(__file__).resolve().parents[2]
+SOURCES = sorted(
+    path
+    for part in ("ngpt", "data_gen", "export", "bench", "scripts", "train.py", "eval.py")
+    for path in ([ROOT / part] if part.endswith(".py") else (ROOT / part).rglob("*.py"))
+)
+MODULES = {"pickle", "cPickle", "_pickle", "dill", "cloudpickle", "joblib", "shelve", "marshal", "yaml", "pickletools"}
+# Names called on anything, whatever it was imported as.
+CALLS = {
+    "torch.load",
+    "torch.jit.load",
+    "torch.export.load",
+    "torch.package",
+    "torch.hub.load",
+    "hub.load_state_dict_from_url",
+}
+CALLS |= {"eval", "exec", "compile", "__import__", "np.load", "numpy.load", "pd.read_pickle"}
+# The one exception: a file whose checksum is torchvision's own, by the reader that takes nothing but tensors.
+ALLOWED = {("ngpt/measure/distances/backbones.py", "torch.load")}
+
+
+def offences(source, name):
+    """Places in a program that could turn a file into code, as "line: what"."""
+    for node in ast.walk(ast.parse(source)):
+        names = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+        yield from (f"{node.lineno}: import {n}" for n in names if n.split(".")[0] in MODULES or n in CALLS)
+        if not isinstance(node, ast.Call):
+            continue
+        called = ast.unparse(node.func)
+        options = {word.arg: word.value for word in node.keywords}
+        if "allow_pickle" in options:
+            yield f"{node.lineno}: allow_pickle"
+        tensors_only = isinstance(options.get("weights_only"), ast.Constant) and options["weights_only"].value is True
+        if called in CALLS and not ((name, called) in ALLOWED and tensors_only):
+            yield f"{node.lineno}: {called}"
+
+
+def test_nothing_in_the_project_unpickles_or_evaluates():
+    assert len(SOURCES) > 100
+    found = {path.relative_to(ROOT).as_posix(): path.read_text() for path in SOURCES}
+    assert {name: list(offences(text, name)) for name, text in found.items() if list(offences(text, name))} == {}
+
+
+TELLTALE = """import pickle
+from pickle import loads
+import joblib as j
+from torch import load
+torch.load(p)
+torch.load(p, weights_only=False)
+np.load(p)
+f(p, allow_pickle=True)
+import yaml.loader
+eval(x)"""
+
+
+@pytest.mark.parametrize("line", TELLTALE.splitlines())
+def test_the_search_finds_what_it_is_for(line):
+    assert list(offences(line, "ngpt/measure/distances/backbones.py" if "False" in line else "x.py"))
+
+
+class Payload:
+    def __reduce__(self):
+        return (os.mkdir, (os.environ["NGPT_PAYLOAD"],))
+
+
+def hostile(folder):
+    """Pickles under every name that is read, plain, zipped as PyTorch does it, and inside of arrays."""
+    data = pickle.dumps({"x": Payload()})
+    files = [folder / name for name in ("a.exr", "a.safetensors", "a.onnx", "a.toml", "a.pth")]
+    for path in files:
+        path.write_bytes(data)
+    with zipfile.ZipFile(folder / "zip.safetensors", "w") as archive:
+        archive.writestr("archive/data.pkl", data)
+        archive.writestr("archive/version", "3")
+    (folder / "magic.exr").write_bytes(b"\x76\x2f\x31\x01" + data)
+    (folder / "length.safetensors").write_bytes(struct.pack("<Q", len(data)) + data)
+    np.save(folder / "array.npy", np.array([Payload()], object), allow_pickle=True)
+    (folder / "npy.exr").write_bytes((folder / "array.npy").read_bytes())
+    for name in ("set", "set/shards"):
+        (folder / name).mkdir()
+    (folder / "set" / "manifest.json").write_bytes(data)
+    (folder / "set" / "shards" / "a.safetensors").write_bytes(data)
+    return sorted(
+        path for path in folder.rglob("*") if path.suffix in (".exr", ".safetensors", ".onnx", ".toml", ".pth")
+    )
+
+
+READ_ALL = """
+import sys
+from pathlib import Path
+seen = []
+def hook(event, arguments):
+    if event in ("pickle.find_class", "os.system", "os.exec", "os.mkdir") and armed:
+        seen.append((event, arguments))
+armed = False
+sys.addaudithook(hook)
+import ngpt, ngpt.io.isolated
+from full_stack import full_stack
+from data_gen.dataset.config import read_config
+from ngpt.training.dataset import Dataset
+from ngpt.training.loss import make_loss
+from ngpt.training.settings import read_settings
+from ngpt.network.weights import load_weights, read_tensors
+from ngpt.training.shards import Shard
+stack = full_stack(8, 8)
+readers = {
+    "read": ngpt.read, "read_image": ngpt.read_image, "Shard": Shard, "weights": load_weights,
+    "tensors": read_tensors, "settings": read_settings, "config": read_config,
+    "Dataset": lambda path: Dataset(path.parent.parent if path.parent.name == "shards" else path.parent),
+    "denoise": lambda path: ngpt.denoise(stack, "ngpt", weights=str(path)),
+    "loss": lambda path: make_loss({"kind": "elpips-squeeze", "backbone": str(path), "weights": str(path)}),
+}
+armed = True
+for path in map(Path, sys.argv[1:]):
+    for name, reader in readers.items():
+        try:
+            reader(path)
+        except ngpt.NgptError as error:
+            assert str(error), (name, path)
+        else:
+            raise SystemExit(f"{name} accepts {path}")
+print(len(sys.argv) - 1, seen)
+"""
+
+
+def test_hostile_files_run_nothing(tmp_path, monkeypatch):
+    """Every reader on every file, watched by Python's audit hooks: no class is looked up for a pickle, nothing runs."""
+    pytest.importorskip("torch")
+    marker = tmp_path / "code was run"
+    monkeypatch.setenv("NGPT_PAYLOAD", str(marker))
+    (tmp_path / "in").mkdir()
+    files = hostile(tmp_path / "in")
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "tests")])}
+    done = subprocess.run([sys.executable, "-c", READ_ALL, *files], env=environment, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.splitlines()[-1] == f"{len(files)} []" and not marker.exists()
+    pickle.loads((tmp_path / "in" / "a.exr").read_bytes())
+    assert marker.exists(), "the payload works"
+
+
+# ONNX files that users give
+
+
+def with_external_data(path, location):
+    """The shipped network with its largest tensor in another file; that tensor's bytes."""
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
+    tensor = max(model.graph.initializer, key=lambda t: len(t.raw_data))
+    data = tensor.raw_data
+    tensor.ClearField("raw_data")
+    tensor.data_location = onnx.TensorProto.EXTERNAL
+    for key, value in (("location", location), ("offset", "0"), ("length", str(len(data)))):
+        tensor.external_data.add(key=key, value=value)
+    path.write_bytes(model.SerializeToString())
+    return data
+
+
+@pytest.mark.parametrize("location", ["{parent}/secret.bin", "../secret.bin", "link.bin", "missing.bin"])
+def test_networks_that_refer_to_other_files_are_refused(tmp_path, location):
+    folder = tmp_path / "in"
+    folder.mkdir()
+    path = folder / "a.onnx"
+    (tmp_path / "secret.bin").write_bytes(with_external_data(path, location.format(parent=tmp_path)))
+    (folder / "link.bin").symlink_to("../secret.bin")
+    with pytest.raises(NgptError, match=r"a\.onnx: ONNX Runtime cannot load it"):
+        ngpt.denoise(full_stack(8, 8), "ngpt-fast", weights=str(path))
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "message"),
+    [
+        ("ngpt.alignment", "0", "its alignment is 0"),
+        ("ngpt.alignment", "-8", "its alignment is -8"),
+        ("ngpt.overlap with base", "1000000000", "its overlap is 1000000000"),
+        ("ngpt.bytes per pixel", "0", "0 bytes per pixel"),
+        ("ngpt.base", "../x", r"base '\.\./x'"),
+        ("ngpt.inputs", "primal, secret", "its metadata tell of base, primal, secret, statistics"),
+        ("ngpt.alignment", "many", "lacks the metadata"),
+    ],
+)
+def test_networks_whose_metadata_lie_are_refused(tmp_path, key, value, message):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
+    next(entry for entry in model.metadata_props if entry.key == key).value = value
+    path = tmp_path / "a.onnx"
+    path.write_bytes(model.SerializeToString())
+    with pytest.raises(NgptError, match=rf"a\.onnx: .*{message}"):
+        ngpt.denoise(full_stack(8, 8), "ngpt-fast", weights=str(path))

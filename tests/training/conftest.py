@@ -1,0 +1,10 @@
+"""Shared by the tests of training."""
+
+import pytest
+
+pytest.importorskip("torch")
+
+
+@pytest.fixture(autouse=True)
+def quietly(one_thread):
+    """All of them on one thread."""

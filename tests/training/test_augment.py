@@ -1,0 +1,137 @@
+"""Augmentation and padding keep the laws of the gradient domain."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from ngpt.errors import NgptError  # noqa: E402
+from ngpt.network import padding  # noqa: E402
+from ngpt.stack import GradientStack  # noqa: E402
+from ngpt.training import augment  # noqa: E402
+from ngpt.training.augment import Augmentation, quieter  # noqa: E402
+
+
+def differences(image):
+    dx, dy = torch.zeros_like(image), torch.zeros_like(image)
+    dx[..., :-1] = image[..., 1:] - image[..., :-1]
+    dy[..., :-1, :] = image[..., 1:, :] - image[..., :-1, :]
+    return dx, dy
+
+
+def example(height=9, width=13, seed=0):
+    """Layers whose differences are exact, over a height field whose normals follow from it."""
+    generator = torch.Generator().manual_seed(seed)
+    image = torch.rand(3, height, width, generator=generator)
+    dx, dy = differences(image)
+    depth = torch.rand(1, height, width, generator=generator)
+    return {
+        "primal": image, "dx": dx, "dy": dy, "target": image.clone(), "base": image.clone(),
+        "albedo": torch.rand(3, height, width, generator=generator), "depth": depth, "normal": slopes(depth),
+        "primal_se": image.clone(), "dx_se": dx.abs(), "dy_se": dy.abs(),
+    }  # fmt: skip
+
+
+def slopes(height):
+    """Normals of a height field toward the viewer, x right and y up, by central differences with wrap-around."""
+    x = (height.roll(-1, -1) - height.roll(1, -1)) / 2
+    y = (height.roll(1, -2) - height.roll(-1, -2)) / 2
+    n = torch.cat([-x, -y, torch.ones_like(height)])
+    return n / n.norm(dim=0)
+
+
+@pytest.mark.parametrize("name", ["flip_x", "flip_y", "transpose"])
+def test_geometry_is_an_involution_that_keeps_the_laws(name):
+    transform = getattr(augment, name)
+    before = example()
+    after = transform(before)
+    dx, dy = differences(after["primal"])
+    assert torch.allclose(after["dx"], dx) and torch.allclose(after["dy"], dy)
+    assert torch.allclose(after["dx_se"], dx.abs()) and torch.allclose(after["dy_se"], dy.abs())
+    assert torch.allclose(after["normal"], slopes(after["depth"]), atol=1e-6)
+    assert torch.equal(after["target"], after["primal"])
+    assert not torch.equal(after["primal"], before["primal"]) if name != "transpose" else True
+    twice = transform(after)
+    assert all(torch.allclose(twice[name], before[name]) for name in before)
+
+
+def test_colors_and_brightness_change_light_and_surfaces_alike():
+    before = example()
+    after = augment.scale(augment.color(before, np.array([2, 0, 1]), np.array([0.5, 1.0, 1.5])), 3)
+    dx, dy = differences(after["primal"])
+    assert torch.allclose(after["dx"], dx, atol=1e-6) and torch.allclose(after["dy"], dy, atol=1e-6)
+    assert torch.allclose(after["primal"][0], 1.5 * before["primal"][2])
+    assert torch.allclose(after["albedo"][2], 1.5 * before["albedo"][1])
+    assert torch.equal(after["normal"], before["normal"])
+
+
+def test_all_transforms_together_keep_the_differences():
+    rng = np.random.default_rng(1)
+    for _ in range(20):
+        after = Augmentation()(example(), rng)
+        dx, dy = differences(after["primal"])
+        assert torch.allclose(after["dx"], dx, rtol=1e-4, atol=1e-5)
+        assert torch.allclose(after["dy"], dy, rtol=1e-4, atol=1e-5)
+
+
+def test_factors_have_mean_one():
+    rng = np.random.default_rng(2)
+    layers = {"primal": torch.ones(3, 1, 1), "target": torch.ones(3, 1, 1)}
+    draws = torch.stack([Augmentation()(layers, rng)["primal"].flatten() for _ in range(4000)])
+    # Per-channel variance: E[c²] E[b²] - 1 = 1.5 e - 1 = 3.08 for c = 3 Dirichlet(1, 1, 1), b log-normal of sigma 1.
+    assert (draws.mean(0) - 1).abs().max() < 4 * (3.08 / 4000) ** 0.5
+
+
+def test_nothing_happens_when_everything_is_off():
+    off = Augmentation(geometry=False, colors=False, brightness=0, depth=(1, 1))
+    before = example()
+    after = off(before, np.random.default_rng(0))
+    assert all(torch.equal(after[name], before[name]) for name in before)
+
+
+def test_a_quieter_stack_has_a_part_of_the_noise():
+    """Errors and standard errors of all layers shrink alike, and the stack stays one."""
+    rng = np.random.default_rng(3)
+    light, direct = rng.random((6, 9, 3), np.float32), np.zeros((6, 9, 3), np.float32)
+    direct[2, 3] = 7
+    truth = {"primal": light + direct, "direct": direct}
+    truth |= {"dx": np.diff(light, axis=1, append=light[:, -1:]), "dy": np.diff(light, axis=0, append=light[-1:])}
+    noisy = {name: layer + rng.standard_normal((6, 9, 3), np.float32) for name, layer in truth.items()}
+    variances = {f"{name}_var": rng.random((6, 9, 3), np.float32) for name in ("primal", "dx", "dy")}
+    albedo = rng.random((6, 9, 3), np.float32)
+    stack = GradientStack.from_arrays(**noisy, **variances, albedo=albedo, attributes={"ngpt:spp": 4})
+    result = quieter(stack, light + direct, direct, 0.1)
+    for name, layer in truth.items():
+        assert np.allclose(result[name] - layer, 0.1 * (noisy[name] - layer), atol=1e-5)
+    for name, layer in variances.items():
+        assert np.allclose(result[name], 0.01 * layer)
+    assert np.array_equal(result["albedo"], albedo) and np.array_equal(stack["primal"], noisy["primal"])
+    bare = GradientStack.from_arrays(primal=noisy["primal"])
+    assert quieter(bare, light + direct, direct, 0.1).names == ("primal",)
+
+
+@pytest.mark.parametrize("factors", [(0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3)])
+def test_factors_of_noise_are_checked(factors):
+    with pytest.raises(NgptError, match="two factors"):
+        Augmentation(quieter=factors)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 4), (16, 24)])
+def test_padding_reflects_and_keeps_the_differences(size):
+    layers = {name: layer[None] for name, layer in example(*size).items()}
+    pads = padding.pads(*size, 8)
+    padded = padding.pad(layers, pads)
+    image = padded["primal"]
+    assert image.shape[-2] % 8 == 0 == image.shape[-1] % 8 and min(pads) >= padding.MARGIN
+    dx, dy = differences(image)
+    assert torch.allclose(padded["dx"][..., :-1], dx[..., :-1], atol=1e-6)
+    assert torch.allclose(padded["dy"][..., :-1, :], dy[..., :-1, :], atol=1e-6)
+    assert torch.allclose(padded["dx_se"][..., :-1], dx[..., :-1].abs(), atol=1e-6)
+    assert torch.equal(padding.crop(image, pads), layers["primal"])
+    assert torch.equal(padding.crop(padded["depth"], pads), layers["depth"])
+
+
+def test_padding_agrees_with_reflection_of_torch():
+    image = torch.rand(1, 3, 20, 30)
+    ours = padding.pad({"primal": image}, (3, 5, 7, 2))["primal"]
+    assert torch.equal(ours, torch.nn.functional.pad(image, (7, 2, 3, 5), mode="reflect"))

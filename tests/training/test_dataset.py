@@ -1,0 +1,229 @@
+"""The store of training sets, without a renderer: what is written is read back, and damage is named."""
+
+import hashlib
+import json
+import os
+import pickle
+
+import numpy as np
+import pytest
+
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+from ngpt.training.dataset import FORMAT, VERSION, Dataset, problems
+from ngpt.training.shards import MAX_LOSS, CropData, Shard, smallest_float, write_shard
+
+pytest.importorskip("safetensors")
+
+
+def crop_data(rng, scale=1.0, inputs=2, size=8):
+    def layers():
+        made = {name: scale * rng.random((size, size, 3)) for name in ("direct", "dx", "dy")}
+        made["primal"] = made["direct"] + scale * rng.random((size, size, 3))
+        made |= {name: rng.random((size, size, 3)) for name in ("albedo", "normal")} | {
+            "depth": rng.random((size, size))
+        }
+        return made | {f"{name}_var": scale**2 * rng.random((size, size, 3)) for name in ("primal", "dx", "dy")}
+
+    stacks = [GradientStack(layers()) for _ in range(inputs)]
+    direct = np.float32(scale * rng.random((size, size, 3)))
+    return CropData(stacks, [2, 9][:inputs], direct + np.float32(scale), direct)
+
+
+@pytest.fixture
+def folder(tmp_path, rng):
+    """A training set of two shards, with 2 and 1 crops of two scenes; and what is in it."""
+    given, entries = [], []
+    for scene, count in (("a", 2), ("b", 1)):
+        crops = [crop_data(rng) for _ in range(count)]
+        path = tmp_path / "shards" / f"{scene}-000.safetensors"
+        path.parent.mkdir(exist_ok=True)
+        told = [{"spp": list(crop.spp), "seconds": {"inputs": 1.0}} for crop in crops]
+        record = {"scene": scene, "crops": told, "failures": []}
+        write_shard(path, crops, record)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        name = f"shards/{path.name}"
+        entries.append({"file": name, "sha256": digest, "bytes": path.stat().st_size} | record)
+        given += crops
+    manifest = {"format": FORMAT, "version": VERSION, "config": {}, "planned": 3, "shards": entries}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    return tmp_path, given
+
+
+def test_what_is_written_is_read_back(folder):
+    path, given = folder
+    data = pickle.loads(pickle.dumps(Dataset(path)))
+    assert (len(data), data.scenes, data[2].scene, data[-1].scene) == (3, ("a", "b"), "b", "b")
+    for crop, expected in zip(data, given, strict=True):
+        assert (crop.inputs, crop.spp) == (2, (2, 9))
+        np.testing.assert_allclose(crop.reference, expected.reference, rtol=2e-3)
+        np.testing.assert_allclose(crop.reference_direct, expected.reference_direct, atol=1e-3)
+        for k in range(2):
+            stack = crop.stack(k)
+            assert set(stack.names) == set(expected.stacks[k].names)
+            for name in stack.names:
+                np.testing.assert_allclose(stack[name], expected.stacks[k][name], rtol=3e-3, atol=1e-6)
+    with pytest.raises(IndexError):
+        data[3]
+    with pytest.raises(NgptError, match="input 2"):
+        data[0].stack(2)
+
+
+@pytest.mark.parametrize(("scale", "dtype"), [(1, np.float16), (1e5, np.float32), (1e-7, np.float32)])
+def test_half_floats_only_where_safe(rng, scale, dtype):
+    """Neither overflow nor underflow, and one bad crop is enough."""
+    tensor = np.stack([rng.random((8, 8)), scale * rng.random((8, 8))])
+    small = smallest_float(tensor)
+    assert small.dtype == dtype
+    assert np.all(np.abs(small - tensor).sum(axis=(1, 2)) <= MAX_LOSS * tensor.sum(axis=(1, 2)))
+
+
+def test_bright_lamps_do_not_cost_digits(tmp_path, rng):
+    """Where the camera sees a lamp of 10^4, what is learnt there, about 1, keeps its digits."""
+    crop = crop_data(rng)
+    lamp = np.full((8, 8, 3), 1e4, np.float32)
+    bright = CropData(crop.stacks, crop.spp, lamp + 1, lamp)
+    write_shard(tmp_path / "x.safetensors", [bright], {})
+    np.testing.assert_allclose(Shard(tmp_path / "x.safetensors").crop("reference_indirect", 0), 1, rtol=1e-3)
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path, rng):
+    crop = crop_data(rng)
+    crop.reference[0, 0, 0] = np.nan
+    with pytest.raises(NgptError, match="reference_indirect"):
+        write_shard(tmp_path / "x.safetensors", [crop], {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_info_verifies(folder, capsys):
+    path, _ = folder
+    assert main(["info", str(path)]) == 0
+    assert "crops: 3" in capsys.readouterr().out
+    shard = path / "shards" / "a-000.safetensors"
+    data = bytearray(shard.read_bytes())
+    data[-5] ^= 1
+    shard.write_bytes(data)
+    assert main(["info", str(path)]) == 1
+    assert "a-000.safetensors: its sha256" in capsys.readouterr().out
+
+
+def test_problems_are_named(folder, rng):
+    path, _ = folder
+    assert problems(path) == []
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["shards"][0]["crops"].append(manifest["shards"][0]["crops"][0])
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    assert any("it must be (3, 2, 8, 8, 3)" in line for line in problems(path))
+    (path / "shards" / "b-000.safetensors").rename(path / "shards" / "c-000.safetensors")
+    found = "\n".join(problems(path))
+    assert "b-000.safetensors: is missing" in found
+    assert "c-000.safetensors: is not in the manifest" in found
+
+
+def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, rng):
+    """The records differ by the times in them, and the manifest may have the first one's checksum."""
+    path, crop = tmp_path / "a.safetensors", crop_data(rng)
+    write_shard(path, [crop], {"seconds": 1})
+    first = path.read_bytes()
+    write_shard(path, [crop], {"seconds": 2})
+    assert path.read_bytes() == first and os.listdir(tmp_path) == ["a.safetensors"]
+    with pytest.raises(NgptError, match="does not exist"):
+        write_shard(tmp_path / "nowhere" / "a.safetensors", [crop], {})
+
+
+def test_a_name_longer_than_names_may_be_is_a_missing_file(folder):
+    """Found by fuzzing."""
+    path, _ = folder
+    manifest = json.loads((path / "manifest.json").read_text())
+    manifest["shards"][0]["file"] = "shards/" + 300 * "x"
+    (path / "manifest.json").write_text(json.dumps(manifest))
+    assert any("is missing" in line for line in problems(path))
+    with pytest.raises(NgptError, match="is missing"):
+        Dataset(path)[0]
+
+
+def tampered(folder, change):
+    manifest = json.loads((folder / "manifest.json").read_text())
+    change(manifest, manifest["shards"][0])
+    (folder / "manifest.json").write_text(json.dumps(manifest))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda m, e: e.update(file="/etc/passwd"), "lists '/etc/passwd', which is not in its folder"),
+        (lambda m, e: e.update(file="shards/../../x"), "which is not in its folder"),
+        (lambda m, e: e.pop("sha256"), r"manifest\.json: 'shards'\[0\]: lacks 'sha256'"),
+        (lambda m, e: e["crops"][0].update(spp="many"), r"'crops'\[0\]: 'spp' is 'many'; it must be a list"),
+        (lambda m, e: e.update(bytes=10**400), r"'bytes' is 1000.*; it must be int"),
+        (lambda m, e: e.update(bytes=True), "'bytes' is True; it must be int"),
+        (lambda m, e: m.update(shards={}), "'shards' is {}; it must be a list"),
+    ],
+)
+def test_manifests_that_cannot_be_used_are_refused(folder, change, message):
+    tampered(folder[0], change)
+    with pytest.raises(NgptError, match=message):
+        Dataset(folder[0])
+
+
+def resealed(path, file):
+    """The manifest's checksum brought up to date with a shard that was changed."""
+    digest = hashlib.sha256((path / file).read_bytes()).hexdigest()
+    tampered(path, lambda m, e: e.update(sha256=digest))
+
+
+def test_changed_shards_are_not_trained_on(folder):
+    path, _ = folder
+    shard = path / "shards" / "a-000.safetensors"
+    whole = shard.read_bytes()
+    for data, message in ((whole[:-1] + b"x", "its sha256 is"), (whole[:500], "its sha256 is"), (None, "is missing")):
+        shard.unlink()
+        if data:
+            shard.write_bytes(data)
+        with pytest.raises(NgptError, match=rf"a-000\.safetensors: {message}"):
+            Dataset(path)[0]
+        assert Dataset(path)[2].stack(0) and any(message in line for line in problems(path))
+        shard.touch()
+
+
+def test_shards_with_other_tensors_are_refused(folder):
+    """Though their checksum is right."""
+    from safetensors.numpy import load_file, save_file
+
+    path, _ = folder
+    shard, record = path / "shards" / "a-000.safetensors", {"ngpt": "{}"}
+    tensors = load_file(shard)
+    for change, message in [
+        ({"dx": tensors["dx"][:, :1]}, r"tensor 'dx' is \(2, 1, 8, 8, 3\), it must be \(2, 2, 8, 8, 3\)"),
+        ({"indirect": tensors["indirect"][0]}, r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
+        ({"albedo": tensors["albedo"].astype("f8")}, "tensor 'albedo' is of type F64"),
+    ]:
+        save_file(tensors | change, shard, record)
+        resealed(path, "shards/a-000.safetensors")
+        with pytest.raises(NgptError, match=message):
+            Dataset(path)[0]
+    save_file({name: tensor for name, tensor in tensors.items() if name != "depth"}, shard, record)
+    resealed(path, "shards/a-000.safetensors")
+    with pytest.raises(NgptError, match="tensors depth are missing"):
+        Dataset(path)[0]
+    save_file(tensors, shard, {"ngpt": "[" * 100_000})
+    with pytest.raises(NgptError, match="its record: cannot be read: brackets within brackets"):
+        Shard(shard)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (None, "no training set"),
+        ("[" * 100_000, "brackets within brackets"),
+        ("{", "cannot be read"),
+        ("{}", "not the manifest"),
+        ('{"format": "ngpt-dataset", "version": 9}', "version 9"),
+    ],
+)
+def test_bad_manifests(tmp_path, text, message):
+    if text is not None:
+        (tmp_path / "manifest.json").write_text(text)
+    with pytest.raises(NgptError, match=message):
+        Dataset(tmp_path)

@@ -1,0 +1,409 @@
+"""The losses: distances that are 0 for equal images, with gradients that are finite everywhere."""
+
+import hashlib
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import save_file
+from scipy.stats import chisquare
+from skimage.metrics import structural_similarity
+
+from ngpt.errors import NgptError
+from ngpt.measure.distances import backbones, elpips, ensemble
+from ngpt.measure.distances.structural import ssim_parts, structural_distance
+from ngpt.training import pixelwise
+from ngpt.training.loss import make_loss
+
+
+def generator(seed=0):
+    return torch.Generator().manual_seed(seed)
+
+
+def images(*shape, seed=0):
+    return torch.rand(*shape, generator=generator(seed))
+
+
+def random_elpips(kind):
+    """The metric with weights of nobody: its graph is all that can be tested without the fitted ones."""
+    torch.manual_seed(3)
+    backbone = kind()
+    for parameter in backbone.parameters():
+        if parameter.ndim > 1:
+            torch.nn.init.kaiming_normal_(parameter)
+    return elpips.FeatureDistance(backbone, [torch.rand(c) for c in kind.CHANNELS])
+
+
+DISTANCES = {
+    "structural": lambda: structural_distance,
+    "squeeze": lambda: random_elpips(backbones.SqueezeNet),
+    "vgg": lambda: random_elpips(backbones.Vgg16),
+    "l1": lambda: pixelwise.l1,
+    "gradient": lambda: pixelwise.gradient_l1,
+    "relative": lambda: pixelwise.relative,
+    "logarithmic": lambda: pixelwise.logarithmic,
+}
+every_distance = pytest.mark.parametrize("name", DISTANCES)
+
+
+@every_distance
+def test_a_distance_is_zero_for_equal_images_positive_else_and_symmetric(name):
+    distance = DISTANCES[name]()
+    a, b = images(2, 3, 48, 40), images(2, 3, 48, 40, seed=1)
+    assert distance(a, a).item() == pytest.approx(0, abs=1e-6)
+    assert distance(a, b).item() > 1e-3
+    assert distance(a, b).item() == pytest.approx(distance(b, a).item(), rel=1e-4)
+    assert distance(a, a + 0.1 * (b - a)).item() < distance(a, b).item()
+
+
+@every_distance
+@pytest.mark.parametrize("value", [0.0, 0.5, 1.0])
+def test_gradients_are_finite_on_flat_images(name, value):
+    distance = DISTANCES[name]()
+    for other in (torch.full((1, 3, 40, 40), value), images(1, 3, 40, 40)):
+        flat = torch.full((1, 3, 40, 40), value, requires_grad=True)
+        distance(flat, other).backward()
+        assert torch.isfinite(flat.grad).all()
+
+
+@every_distance
+def test_gradients_are_those_of_the_value(name):
+    distance = DISTANCES[name]()
+    a, b = images(1, 3, 36, 36).requires_grad_(), images(1, 3, 36, 36, seed=1)
+    distance(a, b).backward()
+    direction = images(1, 3, 36, 36, seed=2) - 0.5
+    step = 1e-3
+    with torch.no_grad():
+        numeric = (distance(a + step * direction, b) - distance(a - step * direction, b)).item() / (2 * step)
+    # The reference's own rounding decides: single precision, piecewise linear networks.
+    assert (a.grad * direction).sum().item() == pytest.approx(numeric, rel=0.06, abs=1e-4)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (5, 40), (17, 9), (200, 180)])
+def test_the_structural_distance_takes_every_size(size):
+    a, b = images(1, 3, *size), images(1, 3, *size, seed=1)
+    assert 0 < structural_distance(a, b) <= 2 and structural_distance(a, a).abs() < 1e-6
+
+
+def test_ssim_is_that_of_scikit_image():
+    a, b = images(1, 1, 40, 50), images(1, 1, 40, 50, seed=1)
+    b = 0.6 * a + 0.4 * b
+    luminance, structure = ssim_parts(a, b, stride=1)
+    _, expected = structural_similarity(
+        a[0, 0].double().numpy(), b[0, 0].double().numpy(), data_range=1, full=True, use_sample_covariance=False
+    )
+    assert np.allclose((luminance * structure)[0, 0], expected[3:-3, 3:-3], atol=1e-5)
+
+
+def test_ssim_of_bright_flat_images_is_not_rounding():
+    a = torch.full((1, 3, 64, 64), 0.9) + 1e-4 * images(1, 3, 64, 64)
+    assert structural_distance(a, a.clone()) < 1e-7
+    assert structural_distance(a, a + 1e-4 * images(1, 3, 64, 64, seed=1)) < 1e-3
+
+
+# The ensemble
+
+
+def draws(count, batch=4, size=600, **options):
+    g = generator(7)
+    return [ensemble.draw(batch, size, size, g, **options) for _ in range(count)]
+
+
+def agrees(counts, expected):
+    """Whether counts come from a distribution, at the level of one in ten thousand."""
+    return chisquare(counts, np.array(expected) / np.sum(expected) * np.sum(counts)).pvalue > 1e-4
+
+
+def test_transforms_have_the_published_distributions():
+    every = draws(4000)
+    assert agrees(np.bincount([t.scale for t in every], minlength=9)[1:], [1 / k**2 for k in range(1, 9)])
+    assert agrees(np.bincount(torch.cat([t.offset.flatten() for t in every]).numpy()), np.ones(8))
+    assert agrees(np.bincount(torch.cat([t.flip for t in every]).numpy()), np.ones(4))
+    assert agrees(np.bincount([t.transpose for t in every]), np.ones(2))
+    orders = torch.cat([t.order for t in every])
+    assert agrees(np.bincount((orders[:, 0] * 2 + (orders[:, 1] > orders[:, 2])).numpy()), np.ones(6))
+    factors = torch.cat([t.factor for t in every]).flatten()
+    assert agrees(np.histogram(factors, 16, (0.2, 1))[0], np.ones(16))
+    phases = [t.phase for t in every if t.scale == 2]
+    assert agrees(np.bincount([2 * y + x for y, x in phases]), np.ones(4))
+
+
+def test_draws_are_stratified_over_the_batch():
+    for transform in draws(50, batch=12):
+        assert np.bincount(transform.flip, minlength=4).tolist() == [3, 3, 3, 3]
+        assert all(
+            sorted(((column - 0.2) / 0.8 * 12).int().tolist()) == list(range(12)) for column in transform.factor.T
+        )
+        counts = np.unique(transform.order.numpy(), axis=0, return_counts=True)[1]
+        assert counts.tolist() == [2] * 6
+
+
+def test_scales_leave_the_image_large_enough():
+    assert {t.scale for t in draws(300, size=100, smallest=32)} == {1, 2, 3}
+    assert {t.scale for t in draws(300, scales=2)} == {1, 2}
+    assert {t.scale for t in draws(20, size=20)} == {1}
+
+
+def test_the_same_seed_draws_the_same():
+    a, b = ensemble.draw(3, 64, 64, generator(5)), ensemble.draw(3, 64, 64, generator(5))
+    image = images(3, 3, 64, 64)
+    assert torch.equal(a(image), b(image))
+
+
+def test_a_transform_moves_pixels_and_scales_colours():
+    image = images(1, 3, 20, 24)
+    one = torch.ones(1, 3)
+    same = ensemble.Transform(
+        1, (0, 0), torch.zeros(1, 2, dtype=int), torch.zeros(1, dtype=int), False, torch.tensor([[0, 1, 2]]), one
+    )
+    assert torch.equal(same(image), image[..., :13, :17])
+    other = ensemble.Transform(
+        2, (1, 0), torch.tensor([[1, 0]]), torch.tensor([1]), True, torch.tensor([[2, 0, 1]]), 0.5 * one
+    )
+    boxes = torch.nn.functional.avg_pool2d(image[..., 1:, :], 2)[..., 1:3, 0:5]
+    assert torch.allclose(other(image), 0.5 * boxes[:, [2, 0, 1]].flip(-1).transpose(-1, -2))
+
+
+def test_a_mirrored_pair_is_as_far_apart_in_the_mean():
+    loss = make_loss({"evaluations": 40, "l1": 0.0, "gradient": 0.0})
+    a, b = images(4, 3, 64, 64), images(4, 3, 64, 64, seed=1)
+    value = loss(a, b, generator(0))[0]
+    assert value.item() == pytest.approx(loss(a.flip(-1), b.flip(-1), generator(1))[0].item(), rel=0.02)
+
+
+# The composite
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0, 1e6])
+def test_the_loss_is_finite_at_the_extremes(value):
+    loss = make_loss({"relative": 1.0, "logarithmic": 1.0})
+    for target in (torch.full((2, 3, 40, 40), value), images(2, 3, 40, 40)):
+        prediction = torch.full((2, 3, 40, 40), value, requires_grad=True)
+        total, parts = loss(prediction, target, generator())
+        total.backward()
+        assert torch.isfinite(total) and torch.isfinite(prediction.grad).all()
+        assert set(parts) == {"perceptual", "l1", "gradient", "relative", "logarithmic"}
+
+
+def test_the_loss_is_the_weighted_sum_of_its_parts():
+    loss = make_loss({"l1": 0.5, "gradient": 0.25, "relative": 2.0})
+    total, parts = loss(images(1, 3, 40, 40), images(1, 3, 40, 40, seed=1), generator())
+    expected = parts["perceptual"] + 0.5 * parts["l1"] + 0.25 * parts["gradient"] + 2 * parts["relative"]
+    assert torch.allclose(total, expected)
+    total, parts = make_loss({"kind": "l1"})(images(1, 3, 40, 40), images(1, 3, 40, 40, seed=1), generator())
+    assert torch.allclose(total, parts["l1"] + 0.01 * parts["gradient"])
+
+
+def test_tone_mapping_is_that_of_ngpt():
+    grey, red = torch.full((1, 3, 1, 1), 1e9), torch.zeros(1, 3, 1, 1)
+    red[:, 0] = 1e9
+    assert pixelwise.tone_mapped(grey).flatten().tolist() == pytest.approx([1, 1, 1])
+    assert pixelwise.tone_mapped(red).flatten().tolist() == pytest.approx([3, 0, 0])
+
+
+# Backbones and their files
+
+# Index of each fire module, its channels in, squeezed and expanded (each of two); of each convolution, in and out.
+_FIRES = {3: (64, 16, 64), 4: (128, 16, 64), 6: (128, 32, 128), 7: (256, 32, 128), 9: (256, 48, 192)}
+_FIRES |= {10: (384, 48, 192), 11: (384, 64, 256), 12: (512, 64, 256)}
+SQUEEZENET = {"features.0.weight": [64, 3, 3, 3], "features.0.bias": [64]}
+for _i, (_in, _squeezed, _out) in _FIRES.items():
+    for _name, _shape in {
+        "squeeze": [_squeezed, _in, 1, 1],
+        "expand1x1": [_out, _squeezed, 1, 1],
+        "expand3x3": [_out, _squeezed, 3, 3],
+    }.items():
+        SQUEEZENET |= {f"features.{_i}.{_name}.weight": _shape, f"features.{_i}.{_name}.bias": _shape[:1]}
+VGG16 = {}
+for _i, _in, _out in [
+    (0, 3, 64), (2, 64, 64), (5, 64, 128), (7, 128, 128), (10, 128, 256), (12, 256, 256), (14, 256, 256),
+    (17, 256, 512), (19, 512, 512), (21, 512, 512), (24, 512, 512), (26, 512, 512), (28, 512, 512),
+]:  # fmt: skip
+    VGG16 |= {f"features.{_i}.weight": [_out, _in, 3, 3], f"features.{_i}.bias": [_out]}
+
+
+@pytest.mark.parametrize(
+    ("kind", "shapes", "parameters", "sizes"),
+    [
+        (backbones.SqueezeNet, SQUEEZENET, 722_496, [64, 31, 15, 15, 7, 7, 3, 3, 3, 3]),
+        (backbones.Vgg16, VGG16, 14_714_688, [64, 64, 64, 32, 32, 16, 16, 16, 8, 8, 8, 4, 4, 4]),
+    ],
+)
+def test_backbones_are_those_of_torchvision(kind, shapes, parameters, sizes):
+    network = kind()
+    state = network.state_dict()
+    assert sum(t.numel() for t in state.values()) == parameters
+    assert {name: list(tensor.shape) for name, tensor in state.items()} == shapes
+    features = list(network(images(1, 3, 64, 64), lambda x: x))
+    assert tuple(f.shape[1] for f in features) == kind.CHANNELS
+    assert [f.shape[2] for f in features] == sizes
+
+
+def test_autocast_does_not_reach_the_features():
+    distance = random_elpips(backbones.SqueezeNet)
+    a, b = images(1, 3, 64, 64), images(1, 3, 64, 64, seed=1)
+    near = a + 1e-3 * (b - a)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = distance(a, near)
+    assert inside == distance(a, near)
+
+
+def test_dropout_is_shared_by_both_images():
+    distance = random_elpips(backbones.SqueezeNet)
+    a, b = images(1, 3, 64, 64), images(1, 3, 64, 64, seed=1)
+    assert distance(a, a, generator()) == 0
+    values = {distance(a, b, generator(i)).item() for i in range(3)}
+    assert len(values) == 3 and distance(a, b, generator(1)).item() in values
+
+
+def weight_files(folder, kind=backbones.SqueezeNet):
+    network = kind()
+    # As torchvision's files, with the classifier's tensors beside the features'.
+    save_file(network.state_dict() | {"classifier.1.weight": torch.zeros(1)}, folder / "backbone.safetensors")
+    save_file({f"lin{i}": torch.rand(1, c, 1, 1) for i, c in enumerate(kind.CHANNELS)}, folder / "lin.safetensors")
+    return {"backbone": str(folder / "backbone.safetensors"), "weights": str(folder / "lin.safetensors")}
+
+
+def test_elpips_trains_when_its_files_are_there(tmp_path):
+    loss = make_loss({"kind": "elpips-squeeze", **weight_files(tmp_path)})
+    prediction = images(2, 3, 48, 48).requires_grad_()
+    total, parts = loss(prediction, images(2, 3, 48, 48, seed=1), generator())
+    total.backward()
+    assert parts["perceptual"] > 0 and torch.isfinite(prediction.grad).all() and prediction.grad.abs().max() > 0
+
+
+def test_missing_and_damaged_files_are_explained(tmp_path, monkeypatch):
+    files = weight_files(tmp_path)
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "cache"))
+    pickled, empty, damaged = str(tmp_path / "a.pth"), *(str(tmp_path / f"{n}.safetensors") for n in ("b", "c"))
+    torch.save(backbones.SqueezeNet().state_dict(), pickled)
+    save_file({"x": torch.zeros(3)}, empty)
+    state = backbones.SqueezeNet().state_dict()
+    state["features.0.bias"][5] = torch.nan
+    save_file(state, damaged)
+    cases = [
+        ({"backbone": ""}, r"squeezenet1_1-b8a52dc0\.pth: no such file; get .* \"structural\" needs no weights"),
+        ({"weights": ""}, "loss.weights is not set"),
+        ({"weights": "nowhere"}, "nowhere: no such file"),
+        ({"weights": pickled}, "not a readable safetensors file"),
+        ({"backbone": __file__}, r"checksum is not b8a52dc0.*convert other weights to \.safetensors"),
+        ({"backbone": pickled}, r"checksum is not b8a52dc0"),
+        ({"backbone": empty}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"backbone": damaged}, "'features.0.bias' holds values that are not finite"),
+        ({"backbone": files["weights"]}, r"'features.0.weight' should be \[64, 3, 3, 3\], is missing"),
+        ({"kind": "elpips-vgg"}, r"vector 'lin2' is of 128 numbers; it should have 64|'lin1[0-3]' is missing"),
+    ]
+    for change, complaint in cases:
+        with pytest.raises(NgptError, match=complaint):
+            make_loss({"kind": "elpips-squeeze", **files, **change})
+    cache = tmp_path / "cache" / "hub" / "checkpoints"
+    cache.mkdir(parents=True)
+    (cache / backbones.SqueezeNet.FILE).write_bytes((tmp_path / "a.pth").read_bytes())
+    with pytest.raises(NgptError, match=r"checksum is not b8a52dc0"):
+        make_loss({"kind": "elpips-squeeze", **files, "backbone": ""})
+    save_file({f"lin{i}": -torch.ones(c) for i, c in enumerate(backbones.SqueezeNet.CHANNELS)}, files["weights"])
+    with pytest.raises(NgptError, match="'lin0' holds numbers that are negative"):
+        make_loss({"kind": "elpips-squeeze", **files})
+
+
+class Payload:
+    def __reduce__(self):
+        return (print, ("code was run",))
+
+
+def pose_as_torchvision(monkeypatch, path):
+    digits = hashlib.sha256(path.read_bytes()).hexdigest()[:8]
+    monkeypatch.setattr(backbones.SqueezeNet, "FILE", f"squeezenet1_1-{digits}.pth")
+
+
+def test_torchvisions_own_file_is_read(tmp_path, monkeypatch):
+    files, path = weight_files(tmp_path), tmp_path / "any.pth"
+    state = backbones.SqueezeNet().state_dict()
+    torch.save(state, path)
+    pose_as_torchvision(monkeypatch, path)
+    network = backbones.load(backbones.SqueezeNet, str(path))
+    assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
+    make_loss({"kind": "elpips-squeeze", **files, "backbone": str(path)})
+
+
+def test_no_code_is_run_from_weight_files(tmp_path, capsys, monkeypatch):
+    """Not even from one that has the checksum."""
+    files, path = weight_files(tmp_path), tmp_path / "any.pth"
+    torch.save({"features.0.weight": Payload()}, path)
+    pose_as_torchvision(monkeypatch, path)
+    with pytest.raises(NgptError, match="cannot be read as PyTorch weights"):
+        make_loss({"kind": "elpips-squeeze", **files, "backbone": str(path)})
+    assert "code was run" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("settings", "complaint"),
+    [
+        ({"kind": "perceptive"}, "choose one of"),
+        ({"kinds": "l1"}, "unknown key 'kinds'"),
+        ({"l1": -1.0}, "not negative"),
+        ({"l1": float("nan")}, "must be finite"),
+        ({"l1": "much"}, "must be like 0.01"),
+        ({"evaluations": 0}, "at least 1"),
+    ],
+)
+def test_settings_are_checked(settings, complaint):
+    with pytest.raises(NgptError, match=complaint):
+        make_loss(settings)
+
+
+def test_noise_of_the_target_does_not_move_the_least_of_huber():
+    """Skewed noise, of which the median lies below the mean: an absolute error has its least at the median."""
+    target = 2 * torch.from_numpy(np.random.default_rng(0).gamma(20, 1 / 20, (1, 3, 200, 200))).float()
+    best = {}
+    for name, loss in (("huber", pixelwise.huber), ("l1", pixelwise.l1)):
+        values = torch.linspace(1.9, 2.1, 41)
+        # The slope, as training sees it, changes its sign at the least.
+        slopes = []
+        for value in values:
+            prediction = torch.full_like(target, value.item(), requires_grad=True)
+            loss(prediction, target).backward()
+            slopes.append(prediction.grad.sum().item())
+        best[name] = values[int(np.argmax(np.array(slopes) > 0))].item()
+    assert best["huber"] == pytest.approx(2, abs=0.011)
+    assert best["l1"] < 1.98
+
+
+def test_huber_is_zero_for_equal_images_and_takes_part_in_the_loss():
+    a, b = images(2, 3, 16, 16), images(2, 3, 16, 16, seed=1)
+    assert pixelwise.huber(a, a).item() == 0 < pixelwise.huber(a, b).item()
+    total, parts = make_loss({"kind": "l1", "huber": 2.0, "gradient": 0.0})(a, b, generator())
+    assert total.item() == pytest.approx(parts["l1"].item() + 2 * parts["huber"].item())
+
+
+def test_a_firefly_of_the_target_counts_once_whatever_its_brightness():
+    prediction, target = torch.ones(1, 3, 8, 8, requires_grad=True), torch.ones(1, 3, 8, 8)
+    gradients = []
+    for firefly in (10.0, 1e6):
+        target[0, :, 3, 3] = firefly
+        gradients.append(torch.autograd.grad(pixelwise.huber(prediction, target), prediction)[0])
+    assert torch.allclose(*gradients)
+
+
+def test_of_errors_of_one_size_the_pyramid_sees_the_wide_ones():
+    """A patch that is off counts as much at every resolution; a checkerboard of the same error only at the finest."""
+    target = torch.full((1, 3, 64, 64), 0.2)
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    sign = 1 - 2.0 * ((x + y) % 2)
+    fine, wide = (pixelwise.pyramid(target + 0.01 * s, target).item() for s in (sign, torch.ones_like(sign)))
+    assert pixelwise.pyramid(target, target).item() == 0
+    assert fine == pytest.approx(wide / 4, rel=0.1)
+    assert pixelwise.l1(target + 0.01 * sign, target).item() == pytest.approx(
+        pixelwise.l1(target + 0.01, target).item(), rel=0.1
+    )
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 13)])
+def test_the_pyramid_takes_any_size_and_any_radiance(size):
+    prediction = torch.zeros(2, 3, *size)
+    prediction[0], prediction[1, 0] = 1e12, -5
+    prediction.requires_grad_()
+    value = pixelwise.pyramid(prediction, torch.rand(2, 3, *size))
+    value.backward()
+    assert 0 < value.item() < 1 and torch.isfinite(prediction.grad).all()
+    assert make_loss({"kind": "l1", "pyramid": 1.0})(prediction, prediction.detach(), generator())[0].item() == 0

@@ -1,0 +1,126 @@
+"""train.py and the configurations that come with it."""
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.network.model import Reconstructor, parameters
+from ngpt.training.cost import cost
+from ngpt.training.settings import read_settings
+
+CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
+
+
+@pytest.fixture
+def train(capsys):
+    """Runs train.py in this process: exit status, standard output and error."""
+    main = runpy.run_path("train.py")["main"]
+
+    def run(*arguments):
+        status = main(list(arguments))
+        return status, *capsys.readouterr()
+
+    return run
+
+
+@pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
+def test_configurations_are_whole(path):
+    settings = read_settings(path)
+    assert "parameters" in cost(settings)
+    # Each opens with what it is.
+    assert path.read_text().startswith("# ")
+
+
+def test_sizes():
+    sizes = {path.stem: parameters(Reconstructor(read_settings(path).model)) for path in CONFIGS}
+    assert sizes["paper"] == sizes["paper-l1"] == 4_358_534
+    assert sizes["paper-no-gradients"] == 4_350_836
+    assert abs(sizes["plain-unet"] / sizes["paper"] - 1) < 0.01
+
+
+def test_a_dry_run_says_what_it_would_cost(train):
+    status, output, _ = train("--config", "configs/paper.toml", "--dry-run")
+    assert status == 0
+    assert "4,358,534" in output and "765.3 G at 1280x720" in output
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["--config", "nowhere.toml", "--dry-run"], "nowhere.toml: cannot be read"),
+        (["--config", "configs/fast.toml"], "--out is missing"),
+        (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], "no such folder"),
+        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], "choose one of"),
+    ],
+)
+def test_mistakes_end_in_one_line(train, tmp_path, arguments, complaint):
+    status, _, errors = train(*[str(tmp_path) if a == "OUT" else a for a in arguments])
+    assert status == 2
+    assert complaint in errors and errors.count("\n") == 1
+
+
+def test_views_of_ones_own_train_a_network(train, tmp_path):
+    from crops import SyntheticCrop
+
+    for i in range(3):
+        crop = SyntheticCrop("", i)
+        view = tmp_path / "views" / f"view{i}"
+        view.mkdir(parents=True)
+        ngpt.write(view / "reference.exr", crop.reference)
+        ngpt.write(view / "few.exr", crop.stack(0))
+    changes = {
+        "data.folders": [str(tmp_path / "views")],
+        "data.validation": ["view2"],
+        "data.crop": 32,
+        "model.channels": [4, 4],
+        "model.units": [1, 1],
+        "run.steps": 2,
+        "run.batch": 1,
+        "run.precision": "float32",
+        "optimizer.warmup": 1,
+        "run.log": 1,
+    }
+    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+    out = tmp_path / "run"
+    status, output, errors = train("--config", "configs/fast.toml", "--out", str(out), *arguments)
+    assert status == 0, errors
+    assert "finished at step 2" in output and "relMSE" in output
+    _, output, _ = train("--config", "configs/fast.toml", "--out", str(out), *arguments, "--set", "run.steps=3")
+    assert "at step 2 of 3" in output and "finished at step 3" in output
+    image = ngpt.denoise(SyntheticCrop("", 2).stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
+    assert image.shape == (32, 32, 3)
+
+
+def test_the_shipped_network_is_fine_tuned_in_one_command(train, tmp_path):
+    from crops import SyntheticCrop
+
+    crop = SyntheticCrop("", 0)
+    (tmp_path / "views" / "mine").mkdir(parents=True)
+    ngpt.write(tmp_path / "views" / "mine" / "reference.exr", crop.reference)
+    ngpt.write(tmp_path / "views" / "mine" / "few.exr", crop.stack(0))
+    changes = {"data.folders": [str(tmp_path / "views")], "data.crop": 32, "run.steps": 1, "run.batch": 1}
+    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+    out = tmp_path / "run"
+    status, _, errors = train("--config", "configs/fine-tune.toml", "--out", str(out), *arguments)
+    assert status == 0, errors
+    ours = ngpt.denoise(crop.stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
+    # One step at a low rate: close to what it started from, and not the same.
+    change = np.abs(ours - ngpt.denoise(crop.stack(0), "ngpt-fast"))
+    assert 0 < change.mean() < 0.05
+
+
+def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):
+    changes = {
+        "data.folders": ["configs/data-tiny.toml"],
+        "data.crop": 32,
+        "run.steps": 3,
+        "run.batch": 2,
+        "run.log": 1,
+    }
+    arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
+    status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *arguments)
+    assert status == 0, errors
+    assert "finished at step 3" in output

@@ -1,0 +1,396 @@
+"""Training: it learns, it can be stopped at any moment, and it explains what is wrong."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from crops import SyntheticCrop  # noqa: E402
+
+import ngpt  # noqa: E402
+from ngpt.errors import NgptError  # noqa: E402
+from ngpt.network import weights  # noqa: E402
+from ngpt.training import examples  # noqa: E402
+from ngpt.training.augment import Augmentation  # noqa: E402
+from ngpt.training.schedule import learning_rate  # noqa: E402
+from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
+from ngpt.training.trainer import Trainer, published  # noqa: E402
+
+CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
+SETTINGS = {
+    "model": {
+        "network": "dense",
+        "channels": [4, 6],
+        "units": [1, 1],
+        "inputs": ["primal", "dx", "dy", "albedo", "normal", "depth"],
+    },
+    "data": {"crop": 32},
+    "augmentation": {"brightness": 0.0},
+    "optimizer": {"learning_rate": 1e-2, "schedule": "cosine", "warmup": 5, "ema": 0.9},
+    "run": {"steps": 12, "batch": 2, "log": 2, "save": 5, "validate": 6},
+}
+
+
+def loss(prediction, target, generator):
+    """Random, so that resuming must restore the generator too."""
+    weight = 1 + 0.1 * torch.rand(target.shape, generator=generator)
+    parts = {"l1": (weight * (prediction - target).abs()).mean()}
+    return parts["l1"], parts
+
+
+def settings(**changes):
+    values = json.loads(json.dumps(SETTINGS))
+    for name, value in changes.items():
+        table, _, key = name.partition("_")
+        values[table][key] = value
+    return from_dict(values, "test")
+
+
+def trainer(out, crops=CROPS, **changes):
+    out.mkdir(exist_ok=True)
+    return Trainer(settings(**changes), crops[:4], crops[4:], loss, out, say=lambda text: None)
+
+
+def test_it_learns_and_its_weights_can_be_used(tmp_path):
+    run = trainer(tmp_path, run_steps=300, run_batch=4, run_validate=300, model_channels=[8, 8])
+    assert run.run()
+    log = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    scores = next(entry for entry in reversed(log) if "relMSE" in entry)
+    assert scores["relMSE"] < 0.5 * scores["relMSE primal"]
+    assert (tmp_path / "validation-0000300.png").read_bytes().startswith(b"\x89PNG")
+    # The method does what validation measured.
+    crop = CROPS[5]
+    image = ngpt.denoise(crop.stack(0), "ngpt", weights=str(tmp_path / "weights.safetensors"))
+    error = np.mean((image - crop.reference) ** 2)
+    assert error < 0.5 * np.mean((crop.stack(0)["primal"] - crop.reference) ** 2)
+
+
+def test_one_batch_can_be_learnt_by_heart():
+    run_settings = settings()
+    drawn = examples.Examples(CROPS[:1], run_settings.model, run_settings.augmentation, 32, seed=0)
+    from ngpt.network.model import Reconstructor
+    from ngpt.network.transfer import signed_exp
+
+    torch.manual_seed(0)
+    model = Reconstructor(run_settings.model)
+    optimizer = torch.optim.Adam(model.parameters(), 5e-3)
+    batch = {name: torch.stack([drawn[0][name], drawn[1][name]]) for name in drawn[0]}
+    target = batch.pop("target")
+    first = None
+    for _ in range(300):
+        prediction = signed_exp(model.predict(batch)[..., 15:-15, 15:-15])
+        value = (prediction - target).abs().mean()
+        first = first or float(value.detach())
+        optimizer.zero_grad()
+        value.backward()
+        optimizer.step()
+    assert float(value.detach()) < 0.03 * first
+
+
+@pytest.mark.parametrize("stop", [1, 5, 7])
+def test_a_stopped_run_continues_bit_for_bit(tmp_path, stop):
+    whole = trainer(tmp_path / "whole")
+    whole.run()
+    part = trainer(tmp_path / "part")
+    losses = iter(range(stop))
+
+    def train(batch, original=part._train):
+        entry = original(batch)
+        if next(losses, None) == stop - 1:
+            part._interrupt()
+        return entry
+
+    part._train = train
+    assert not part.run()
+    rest = trainer(tmp_path / "part")
+    rest.resume()
+    assert rest.step == stop
+    rest.run()
+    for a, b in zip(whole.average.parameters(), rest.average.parameters(), strict=True):
+        assert torch.equal(a, b)
+    logs = [(tmp_path / name / "log.jsonl").read_text().splitlines() for name in ("whole", "part")]
+    steps = [[json.loads(line)["step"] for line in log] for log in logs]
+    assert steps[0] == steps[1]
+
+
+def test_a_killed_run_continues_bit_for_bit(tmp_path):
+    """SIGKILL at a moment of its own choosing; what is on disk is whole, and leads to the same weights."""
+    program = (
+        "import sys; from pathlib import Path; sys.path[:0] = ['tests/training'];"
+        "import torch; torch.set_num_threads(1); import test_training as t;"
+        "r = t.trainer(Path(sys.argv[1]), run_steps=40, run_save=3);"
+        "r.resume() if r.checkpoint.exists() else None; r.run()"
+    )
+    whole = trainer(tmp_path / "whole", run_steps=40, run_save=3)
+    whole.run()
+    out = tmp_path / "killed"
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    process = subprocess.Popen([sys.executable, "-c", program, str(out)], env=environment)
+    deadline = time.monotonic() + 60
+    while not (out / "checkpoint.safetensors").exists() and time.monotonic() < deadline and process.poll() is None:
+        time.sleep(0.01)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    weights.load_weights(out / "weights.safetensors") if (out / "weights.safetensors").exists() else None
+    subprocess.run([sys.executable, "-c", program, str(out)], env=environment, check=True)
+    ours, _ = weights.read_tensors(tmp_path / "whole" / "weights.safetensors")
+    theirs, _ = weights.read_tensors(out / "weights.safetensors")
+    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
+
+
+def test_a_wall_clock_budget_stops_it(tmp_path):
+    run = trainer(tmp_path, run_minutes=1e-9)
+    assert not run.run() and run.step == 1 and run.checkpoint.exists()
+
+
+def test_a_loss_that_is_not_finite_stops_it_and_keeps_the_batch(tmp_path):
+    run = trainer(tmp_path)
+    run.run()
+    before = run.checkpoint.read_bytes()
+    run = trainer(tmp_path)
+    run.loss = lambda prediction, target, generator: (prediction.mean() * float("nan"), {})
+    with pytest.raises(NgptError, match=r"step 0: the loss is nan.*bad-batch"):
+        run.run()
+    batch, header = weights.read_tensors(tmp_path / "bad-batch-0000000.safetensors")
+    assert header["kind"] == "batch" and batch["target"].shape == (2, 3, 18, 18)
+    assert run.checkpoint.read_bytes() == before
+
+
+def test_examples_depend_on_nothing_but_their_index():
+    s = settings()
+    make = lambda: examples.Examples(CROPS, s.model, Augmentation(), 24, seed=3)  # noqa: E731
+    forward, backward = make(), make()
+    a = [forward[i] for i in range(4)]
+    b = [backward[i] for i in reversed(range(4))][::-1]
+    for x, y in zip(a, b, strict=True):
+        assert all(torch.equal(x[name], y[name]) for name in x)
+    assert a[0]["primal"].shape == (3, 40, 40) and a[0]["target"].shape == (3, 10, 10)
+    assert not torch.equal(a[0]["primal"], a[1]["primal"])
+
+
+def test_the_target_is_where_the_input_is():
+    s = settings()
+    crop = SyntheticCrop("clean", 0)
+    crop.spp = (10**12, 10**12)
+    drawn = examples.Examples([crop], s.model, Augmentation(), 32, seed=0)
+    for i in range(5):
+        example = drawn[i]
+        assert torch.allclose(example["primal"][:, 15:-15, 15:-15], example["target"], rtol=1e-3, atol=1e-3)
+
+
+def test_the_best_input_is_shown_once_more_with_less_noise():
+    s = settings()
+    crop = SyntheticCrop("noisy", 0)
+    crop.spp = (1, 4)
+    drawn = examples.Examples([crop], s.model, Augmentation(quieter=(0.01, 0.01)), 32, seed=0)
+    inner = np.s_[:, 15:-15, 15:-15]
+    errors = [
+        (example["primal"][inner] - example["target"]).abs().mean().item()
+        for example in map(drawn.__getitem__, range(30))
+    ]
+    quiet = sum(error < 0.05 * max(errors) for error in errors)
+    # A third of them; at 4 samples there is half the noise of one sample.
+    assert 3 <= quiet <= 18
+    assert min(errors) > 0
+
+
+def test_a_mixture_is_its_parts_one_after_the_other():
+    growing = CROPS[:1]
+    mixture = examples.Mixture(growing, CROPS[3:5])
+    assert [crop.scene for crop in mixture] == ["scene0", "scene3", "scene4"]
+    growing.append(CROPS[1])
+    assert len(mixture) == 4 and mixture[1].scene == "scene1" and mixture[3].scene == "scene4"
+
+
+def test_scenes_are_held_out_whole():
+    training, held_out = examples.split(CROPS, ("scene1", "scene5"))
+    assert [crop.scene for crop in held_out] == ["scene1", "scene5"] and len(training) == 4
+    assert examples.split(CROPS, ()) == (CROPS, [])
+
+
+def test_folders_of_stacks_are_crops(tmp_path):
+    crop = CROPS[0]
+    (tmp_path / "view").mkdir()
+    with pytest.raises(NgptError, match="no folder in it holds"):
+        examples.open_crops(tmp_path)
+    ngpt.write(tmp_path / "view" / "a.exr", crop.stack(0))
+    with pytest.raises(NgptError, match=r"no reference\.exr"):
+        examples.open_crops(tmp_path)
+    ngpt.write(tmp_path / "view" / "reference.exr", crop.reference)
+    (read,) = examples.open_crops(tmp_path)
+    assert read.inputs == 1 and read.scene == "view"
+    assert np.allclose(read.reference, crop.reference)
+    assert np.allclose(read.stack(0)["dx"], crop.stack(0)["dx"])
+    with pytest.raises(NgptError, match="no such folder"):
+        examples.open_crops(tmp_path / "nowhere")
+
+
+def test_the_papers_schedule():
+    paper = OptimizerSettings()
+    assert learning_rate(paper, 0, 600_000) == pytest.approx(5e-8)
+    assert learning_rate(paper, 5_000, 600_000) == pytest.approx(5e-6)
+    assert learning_rate(paper, 10_000, 600_000) == learning_rate(paper, 50_000, 600_000) == 5e-4
+    assert learning_rate(paper, 120_000, 600_000) == pytest.approx(2.5e-4)
+    # The facts sheet of the released code: 2.2e-6 at the end.
+    assert learning_rate(paper, 600_000, 600_000) == pytest.approx(2.2e-6, rel=0.03)
+
+
+def test_the_cosine_schedule():
+    s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
+    rates = [learning_rate(s, i, 110) for i in range(110)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
+    assert all(a >= b for a, b in pairwise(rates[10:]))
+
+
+def test_settings_are_checked(tmp_path):
+    path = tmp_path / "a.toml"
+    path.write_text('[model]\nnetwork = "plain"\nchannels = [4]\nunits = []\ninputs = ["primal"]\n')
+    assert read_settings(path, ["run.steps=7", "optimizer.schedule=cosine"]).run.steps == 7
+    for change, complaint in [
+        ("run.stepz=7", "unknown key 'stepz'"),
+        ("run.steps=many", "must be like 600000"),
+        ("run.steps=0", "at least 1"),
+        ("optimizer.schedule=steep", "choose one of"),
+        ("optimizer.ema=1.0", "below 1"),
+        ("runs.steps=7", "unknown 'runs'"),
+        ("run", r"table\.key=value"),
+        ("model.inputs=['primal', 'x']", "input 'x'"),
+    ]:
+        with pytest.raises(NgptError, match=complaint):
+            read_settings(path, [change])
+    path.write_text("[model\n")
+    with pytest.raises(NgptError, match=r"a\.toml: cannot be read"):
+        read_settings(path)
+
+
+def test_runs_that_cannot_work_are_refused(tmp_path):
+    with pytest.raises(NgptError, match="divisible by 2"):
+        trainer(tmp_path, data_crop=31)
+    with pytest.raises(NgptError, match="no crops"):
+        trainer(tmp_path, crops=[])
+    with pytest.raises(NgptError, match="smaller than the 64"):
+        trainer(tmp_path, data_crop=64).run()
+    trainer(tmp_path, run_steps=1).run()
+    with pytest.raises(NgptError, match=r"another \[model\]"):
+        trainer(tmp_path, model_units=[2, 1]).resume()
+
+
+def test_fine_tuning_starts_from_weights(tmp_path):
+    first = trainer(tmp_path / "a", run_steps=3)
+    first.run()
+    values = json.loads(json.dumps(SETTINGS)) | {"initial": str(tmp_path / "a" / "weights.safetensors")}
+    (tmp_path / "b").mkdir()
+    second = Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b", say=lambda text: None)
+    for a, b in zip(first.average.parameters(), second.model.parameters(), strict=True):
+        assert torch.equal(a, b)
+    values["model"]["units"] = [2, 2]
+    with pytest.raises(NgptError, match=r"another \[model\]"):
+        Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b")
+
+
+def test_weights_do_not_tell_where_things_lie(tmp_path):
+    values = SETTINGS | {"initial": "/home/me/a.safetensors", "loss": {"kind": "l1", "backbone": "/home/me/b.pth"}}
+    values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
+    told = published(from_dict(values, "test"))
+    assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
+
+
+def test_damaged_weights_are_explained(tmp_path):
+    run = trainer(tmp_path, run_steps=1)
+    run.run()
+    path = tmp_path / "weights.safetensors"
+    tensors, header = weights.read_tensors(path)
+    name = "network.head.convolution.bias"
+    for change, complaint in [
+        ({name: torch.zeros(4)}, r"tensor 'network.head.convolution.bias' is \[4\], the model's is \[3\]"),
+        ({name: torch.full((3,), torch.nan)}, "not finite"),
+        ({"network.surplus": torch.zeros(1)}, "unexpected tensor 'network.surplus'"),
+    ]:
+        weights.write_tensors(path, tensors | change, header, overwrite=True)
+        with pytest.raises(NgptError, match=complaint):
+            weights.load_weights(path)
+    weights.write_tensors(path, {k: v for k, v in tensors.items() if k != name}, header, overwrite=True)
+    with pytest.raises(NgptError, match=r"lacks tensor 'network.head.convolution.bias'"):
+        weights.load_weights(path)
+    weights.write_tensors(path, tensors, header | {"format": 99}, overwrite=True)
+    with pytest.raises(NgptError, match="format 99"):
+        weights.load_weights(path)
+    model = header["model"]
+    for change, complaint in [
+        ({"units": [1, 10**6]}, r"units \[1, 1000000\]: give a positive number, up to 32"),
+        ({"channels": [4, 10**9]}, "up to 1024"),
+        ({"channels": [4] * 20, "units": [1] * 20}, "at most 8 levels"),
+        ({"channels": [4.0, True]}, "give a positive number"),
+        # Allowed, and two gigabytes: refused before they are taken.
+        ({"channels": [1024] * 2, "units": [8, 8]}, "is \\[.*the model's is|lacks tensor|unexpected tensor"),
+        ({"network": ["dense"]}, "network"),
+    ]:
+        weights.write_tensors(path, tensors, header | {"model": model | change}, overwrite=True)
+        with pytest.raises(NgptError, match=complaint) as caught:
+            weights.load_weights(path)
+        assert str(path) in str(caught.value)
+    weights.write_tensors(path, tensors | {name: torch.zeros(3, dtype=torch.int32)}, header, overwrite=True)
+    with pytest.raises(NgptError, match=r"is of type torch\.int32"):
+        weights.load_weights(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(NgptError, match="not a readable safetensors file"):
+        weights.load_weights(path)
+    with pytest.raises(NgptError, match="holds a checkpoint"):
+        weights.load_weights(tmp_path / "checkpoint.safetensors")
+    with pytest.raises(NgptError, match="no such file"):
+        ngpt.denoise(CROPS[0].stack(0), "ngpt", weights=str(tmp_path / "nothing"))
+
+
+def test_a_stack_without_what_the_weights_read_is_explained(tmp_path):
+    trainer(tmp_path, run_steps=1).run()
+    path = str(tmp_path / "weights.safetensors")
+    stack = CROPS[0].stack(0)
+    poor = ngpt.GradientStack.from_arrays(primal=stack["primal"], dx=stack["dx"], dy=stack["dy"])
+    with pytest.raises(NgptError, match="need layers albedo, normal, depth, which the stack lacks"):
+        ngpt.denoise(poor, "ngpt", weights=path)
+
+
+def test_checkpoints_that_do_not_fit_are_explained(tmp_path):
+    trainer(tmp_path, run_steps=1).run()
+    path = tmp_path / "checkpoint.safetensors"
+    tensors, header = weights.read_tensors(path)
+    moment = next(name for name in tensors if name.startswith("adam2/"))
+    for changed, told, complaint in [
+        (tensors | {moment: torch.zeros(7)}, header, r"is \[7\], the model's is"),
+        (tensors | {moment: tensors[moment] * torch.nan}, header, "not finite"),
+        ({n: t for n, t in tensors.items() if n != moment}, header, "lacks tensor"),
+        ({}, header, "lacks tensor"),
+        (tensors, header | {"step": "many"}, "its header: 'step' is 'many'; it must be int"),
+        (tensors, {k: v for k, v in header.items() if k != "settings"}, "its header: lacks 'settings'"),
+    ]:
+        weights.write_tensors(path, changed, told, overwrite=True)
+        with pytest.raises(NgptError, match=complaint) as caught:
+            trainer(tmp_path, run_steps=1).resume()
+        assert str(path) in str(caught.value)
+
+
+@pytest.mark.slow
+def test_two_processes_do_what_one_does(tmp_path):
+    """Gradients of two processes with half the batch each, averaged, are those of one; their examples are the same."""
+    program = (
+        "import sys; from pathlib import Path; sys.path[:0] = ['tests/training']; import test_training as t;"
+        "t.loss = lambda p, q, g: ((p - q).abs().mean(), {});"
+        "r = t.trainer(Path(sys.argv[1]), run_steps=3); r.run(); r.processes.close()"
+    )
+    environment = os.environ | {"PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
+    (tmp_path / "run.py").write_text(program)
+    one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one")]
+    two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two")]
+    subprocess.run(one, env=environment, check=True)
+    subprocess.run(two, env=environment, check=True)
+    ours, _ = weights.read_tensors(tmp_path / "one" / "weights.safetensors")
+    theirs, _ = weights.read_tensors(tmp_path / "two" / "weights.safetensors")
+    assert all(torch.allclose(ours[name], theirs[name], rtol=1e-3, atol=1e-4) for name in ours)
