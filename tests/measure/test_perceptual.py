@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ngpt.measure import perceptual
 from ngpt.errors import NgptError
+from ngpt.measure import perceptual
 
 
 @pytest.fixture
