@@ -45,7 +45,8 @@ def measure(config, job) -> dict:
 
     from data_gen.dataset.cameras import View
     from data_gen.dataset.crops import made_scene, make_shard
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
     from ngpt.training.shards import Shard
 
     with tempfile.TemporaryDirectory() as folder:

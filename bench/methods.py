@@ -69,7 +69,8 @@ def main() -> None:
 
 def cached(scene: str, spp: int, sampler: str, seed: int, args: argparse.Namespace) -> GradientStack:
     """A rendered stack, from the cache if it is there."""
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     width, height = args.size
     path = args.cache / f"{scene_name(scene)}-{sampler}-{spp}-{width}x{height}.exr"

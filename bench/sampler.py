@@ -99,11 +99,14 @@ def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | 
     import drjit as dr
     import mitsuba as mi
 
-    from data_gen.render import choose_sampler, describe, load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.samplers import choose
+    from data_gen.scenes.facts import scene_facts
+    from data_gen.scenes.load import load_scene
 
     size = (args.size[0], args.size[1])
     scene = load_scene(scene_file, size)
-    if choose_sampler(*describe(scene))[0] != "gpt":
+    if choose(scene_facts(scene))[0] != "gpt":
         return None
 
     def path(seed: int) -> None:

@@ -4,6 +4,7 @@ import importlib
 import sys
 
 from data_gen.llvm import use_llvm
+from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -38,8 +39,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         mi.set_variant(name)
         # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
-        for plugin in ("common", "gpt_basic", "gpt.integrator"):
-            module = f"data_gen.samplers.{plugin}"
+        for module in ("data_gen.samplers.common", *filter(None, (s.module for s in SAMPLERS.values()))):
             if module in sys.modules:
                 importlib.reload(sys.modules[module])
             else:

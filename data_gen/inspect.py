@@ -7,8 +7,10 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.render import SAMPLERS, choose_sampler, complaint
+from data_gen.samplers import SAMPLERS, choose
 from data_gen.scenes.builtin import SCENES
+from data_gen.scenes.facts import Facts, polarised
+from data_gen.scenes.load import complaint
 from ngpt.errors import NgptError
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
@@ -47,7 +49,9 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
             media.append(props.id() or props.plugin_name())
     integrator = next(iter(plugins["Integrator"]), "path")
     lens = "thinlens" in plugins["Sensor"]
-    sampler, reason = choose_sampler(integrator, media)
+    mirrors = any(name in plugins["BSDF"] for name in _MIRRORS)
+    facts = Facts(integrator, tuple(sorted(media)), polarised(), mirrors)
+    sampler, reason = choose(facts)
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
         "size": size,
@@ -56,30 +60,27 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         "shutter": shutter,
         "sampler": sampler,
         "plan": [
-            f"{sampler}: {SAMPLERS[sampler]}",
+            f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
-            *_transport(plugins, media, integrator, sampler),
+            *SAMPLERS[sampler].notes(facts),
+            *_contents(plugins, facts),
             *_camera(lens, shutter),
         ],
     }
 
 
-def _transport(plugins: dict[str, Counter], media: list[str], integrator: str, sampler: str) -> list[str]:
-    """What the sampler will do about materials, lights and media, a line for each thing that matters to it."""
-    gpt = sampler == "gpt"
-    how = "offset paths join it where materials are rough" if gpt else "replayed as a whole"
-    lines = [f"transport: Mitsuba's '{integrator}', {how}"]
-    if media:
-        lines.append("media: replayed with everything else; features are those of the surfaces behind them")
-        lines.append("media: `--sampler gpt` refuses them; `--sampler primal` renders without gradients, in a fifth")
-        if not integrator.startswith("vol"):
-            lines.append(
-                f"media are in the scene, but '{integrator}' does not render them: use -D integrator=volpath or alike"
-            )
-    if any(name in plugins["BSDF"] for name in _MIRRORS):
+def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
+    """What materials, lights and media mean for a stack, whoever renders it, a line for each thing that matters."""
+    lines = []
+    for name, sampler in SAMPLERS.items():
+        if reason := sampler.refuses(facts):
+            lines.append(f"`--sampler {name}` refuses: {reason}")
+    if facts.media and not facts.integrator.startswith("vol"):
+        lines.append(
+            f"media are in the scene, but '{facts.integrator}' does not render them: use -D integrator=volpath or alike"
+        )
+    if facts.mirrors:
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
-        if gpt:
-            lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
         lines.append("holes: features are those of what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):

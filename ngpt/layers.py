@@ -36,3 +36,6 @@ LAYERS: dict[str, Layer] = {
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),
     )
 }
+
+# The differences of the contract: layer -> offset (x, y, frames) from a pixel to the one it is compared with; y down.
+DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}

@@ -62,7 +62,8 @@ def test_pixels_without_samples_count_nothing(rng):
 
 
 def test_rendered_stacks(renderer):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     scene = load_scene("glossy", (16, 12))
     parts = [render_stack(scene, spp, seed, diagnostics=True) for seed, spp in enumerate((8, 24))]
@@ -83,7 +84,7 @@ def test_films_of_both_parts_and_of_all_samples(renderer, rng):
 
     def stack(part, seed):
         film = GradientFilm(16, 16)
-        for name, values in zip(("primal", "right", "left", "down", "up"), samples[:, :, part], strict=True):
+        for name, values in zip(("primal", "dx+", "dx-", "dy+", "dy-"), samples[:, :, part], strict=True):
             film.put(name, mi.Color3f(mi.Float(values.ravel())))
         attributes = {"ngpt:spp": film.samples, "ngpt:seed": str(seed)}
         layers = film.develop()

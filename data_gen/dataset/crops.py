@@ -34,7 +34,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
     import mitsuba as mi
 
     from data_gen.dataset.cameras import Surroundings
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     crops: list[CropData] = []
     record: dict = {"scene": job.scene, "batch": job.batch, "crops": [], "failures": []}

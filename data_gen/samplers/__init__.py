@@ -1,1 +1,161 @@
-"""The samplers: what renders the layers of a gradient stack."""
+"""The samplers: one registry, one way to call them.
+
+A new sampler is a file and one more entry in ``SAMPLERS``. The command line, ``ngpt info``, the choice of "auto", the
+refusals, the evaluation and the tests find it there. Nothing here imports Mitsuba: a sampler's module, whose classes
+belong to a Mitsuba variant, is imported when the sampler is made.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+from ngpt.errors import NgptError
+
+if TYPE_CHECKING:
+    from data_gen.passes import SamplePass
+    from data_gen.scenes.facts import Facts
+
+# Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
+PATH_BYTES = 256
+
+
+@dataclass(frozen=True)
+class Sampler:
+    """What renders the layers of a gradient stack.
+
+    ``name``        as users call it
+    ``summary``     one line for the user
+    ``make``        (scene, options) -> what takes the samples of a pass (``data_gen.passes.SamplePass``); raises
+                    NgptError for a scene it cannot render
+    ``refuses``     facts about a scene -> why the sampler cannot render it, "" if it can
+    ``notes``       facts about a scene -> what the user should know about rendering it, a line each
+    ``options``     the options that ``make`` takes: name -> what it does
+    ``gradients``   whether it renders dx and dy
+    ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
+    ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
+                    has so many, and variances are over passes
+    ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
+    ``module``      where its Mitsuba classes are, imported anew with each variant; "" if it has none
+    """
+
+    name: str
+    summary: str
+    make: Callable[..., SamplePass]
+    refuses: Callable[[Facts], str] = lambda facts: ""
+    notes: Callable[[Facts], list[str]] = lambda facts: []
+    options: Mapping[str, str] = field(default_factory=dict)
+    gradients: bool = True
+    rank: int = 0
+    batch: int = 0
+    lane_bytes: int = PATH_BYTES
+    module: str = ""
+
+
+SAMPLERS: dict[str, Sampler] = {}
+
+
+def register(sampler: Sampler) -> None:
+    """Adds a sampler, behind those there are. Raises NgptError if its name is taken."""
+    if sampler.name in ("auto", *SAMPLERS):
+        raise NgptError(f"there is a sampler '{sampler.name}' already")
+    SAMPLERS[sampler.name] = sampler
+
+
+def find(name: str, facts: Facts | None = None) -> Sampler:
+    """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
+    if name not in SAMPLERS:
+        raise NgptError(f"unknown sampler '{name}'; choose one of: auto, {', '.join(SAMPLERS)}")
+    sampler = SAMPLERS[name]
+    if facts is not None and (reason := sampler.refuses(facts)):
+        able = [other for other in SAMPLERS.values() if not other.refuses(facts)]
+        names = [other.name if other.gradients else f"{other.name} (no gradients)" for other in able]
+        raise NgptError(f"sampler '{name}' cannot render this scene: {reason}; use --sampler {', or '.join(names)}")
+    return sampler
+
+
+def choose(facts: Facts) -> tuple[str, str]:
+    """The sampler that "auto" stands for, and why."""
+    reasons = []
+    for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
+        if not sampler.rank:
+            continue
+        reason = sampler.refuses(facts)
+        if not reason:
+            media = "there are media" if facts.media else "there are no media"
+            return sampler.name, "; ".join(reasons) or f"the integrator is '{facts.integrator}' and {media}"
+        reasons.append(reason)
+    raise NgptError(f"no sampler can render this scene with gradients: {'; '.join(reasons)}; use --sampler primal")
+
+
+def summaries() -> dict[str, str]:
+    """Name -> summary, for help texts."""
+    return {name: sampler.summary for name, sampler in SAMPLERS.items()}
+
+
+def _from_module(module: str) -> Callable[..., SamplePass]:
+    """The function ``make`` of a module, which is imported when it is first called."""
+    return lambda scene, **options: import_module(module).make(scene, **options)
+
+
+def _refused_by_gpt(facts: Facts) -> str:
+    if facts.polarised:
+        return f"variant '{facts.polarised}' is polarised, which 'gpt' does not follow"
+    if facts.integrator != "path":
+        return f"the integrator is '{facts.integrator}', and 'gpt' knows only 'path'"
+    if facts.media:
+        return f"there are media ({', '.join(facts.media)}), which 'gpt' does not see"
+    return ""
+
+
+def _notes_on_replay(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', replayed as a whole"]
+    if facts.media:
+        lines.append("media: replayed with everything else; features are those of the surfaces behind them")
+    return lines
+
+
+def _notes_on_gpt(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', offset paths join it where materials are rough"]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
+    return lines
+
+
+_GPT, _BASIC, _PRIMAL = (f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "primal"))
+
+for _sampler in (
+    Sampler(
+        "gpt",
+        "gradients by shifted paths that join their base path (surfaces; the sampler to use)",
+        _from_module(_GPT),
+        _refused_by_gpt,
+        _notes_on_gpt,
+        {
+            "shift": "before paths join: replay, or half-vector, which copies that of smooth events",
+            "reuse": "true: the primal is the mean over base paths and the offset paths of neighbours",
+            "roughness_threshold": "the microfacet roughness above which materials are connectable",
+            "diagnostics": "true: rates of failed shifts",
+        },
+        rank=1,
+        module=_GPT,
+    ),
+    Sampler(
+        "gpt-basic",
+        "gradients by random sequence replay (any transport; five paths per sample)",
+        _from_module(_BASIC),
+        notes=_notes_on_replay,
+        rank=9,
+        module=_BASIC,
+    ),
+    Sampler(
+        "primal",
+        "the scene's own integrator without gradients (references, primal denoisers)",
+        _from_module(_PRIMAL),
+        options={"features": "false: the primal alone"},
+        gradients=False,
+    ),
+):
+    register(_sampler)

@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
+from data_gen.passes import SamplePass, render_passes
 from ngpt.layers import LAYERS
 
 
@@ -14,16 +15,20 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
     layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
-    pixels. Derived classes implement ``render_film()`` and ``sample()``.
+    pixels. Derived classes implement ``prepare()`` and ``sample()``.
     """
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.channels: list[str] = []
 
-    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
-        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
+    def prepare(self, scene) -> SamplePass:
+        """What takes the samples of a pass."""
         raise NotImplementedError
+
+    def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
+        """The film of ``spp`` samples per pixel."""
+        return render_passes(self.prepare(scene), sensor, seed, spp)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""

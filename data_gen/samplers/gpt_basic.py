@@ -20,11 +20,13 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
-from data_gen.paths.camera import CameraSamples, render_passes
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator
+from data_gen.scenes.load import reference_integrator
 
 
 class GPTBasic(GradientIntegrator):
@@ -46,9 +48,8 @@ class GPTBasic(GradientIntegrator):
         """The primal estimate alone: see the nested integrator."""
         return self.nested.sample(scene, sampler, ray, medium, active)
 
-    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
-        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
-        return render_passes(lambda camera, film: self.sample_pass(scene, camera, film), sensor, seed, spp, **progress)
+    def prepare(self, scene) -> SamplePass:
+        return lambda camera, film: self.sample_pass(scene, camera, film)
 
     def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path for each camera sample and shifts it to the four neighbours of its pixel."""
@@ -75,6 +76,11 @@ class GPTBasic(GradientIntegrator):
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
         dr.eval(L, Le, inside)
         return L, Le, inside
+
+
+def make(scene: mi.Scene) -> SamplePass:
+    """The sampler ``gpt-basic``: around the scene's own integrator."""
+    return mi.load_dict({"type": "gpt_basic", "integrator": reference_integrator(scene)}).prepare(scene)
 
 
 mi.register_integrator("gpt_basic", lambda props: GPTBasic(props))

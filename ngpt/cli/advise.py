@@ -32,7 +32,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.costs import measure
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))

@@ -77,7 +77,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Console) -> Scene:
     """Renders one scene with its reference, runs every method on it, and writes all of the images."""
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *METHODS)}
     scene = load_scene(name, args.size)

@@ -57,11 +57,11 @@ def overview() -> dict:
         use_renderer()
     except NgptError as error:
         return report | {"rendering": f"not available: {error}"}
-    from data_gen.render import SAMPLERS
+    from data_gen.samplers import summaries
     from data_gen.scenes.builtin import SCENES
 
     scenes = {name: (scene.__doc__ or "").split("\n")[0] for name, scene in SCENES.items()}
-    return report | {"samplers": SAMPLERS, "built-in scenes": scenes}
+    return report | {"samplers": summaries(), "built-in scenes": scenes}
 
 
 def scene(name: str, parameters: dict[str, str]) -> dict:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from data_gen.samplers import summaries
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, positive, print_json, size
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
@@ -27,9 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "first of them is reached",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
-    parser.add_argument(
-        "--sampler", default="auto", help="auto, gpt, gpt-basic, or primal: no gradients (default: auto)"
-    )
+    samplers = "; ".join(f"{name}: {summary}" for name, summary in summaries().items())
+    parser.add_argument("--sampler", default="auto", metavar="NAME", help=f"default: auto. {samplers}")
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument(
         "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 6144)"
@@ -55,8 +55,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.paths.camera import DEFAULT_MEMORY
-    from data_gen.render import check_options, load_scene, render_stack
+    from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.render import check_options, render_stack
+    from data_gen.scenes.load import load_scene
 
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)
     memory = args.memory or DEFAULT_MEMORY

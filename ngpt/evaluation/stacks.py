@@ -151,7 +151,7 @@ class SceneStacks:
             from data_gen.backend import use_variant
 
             use_variant()
-            from data_gen.render import load_scene
+            from data_gen.scenes.load import load_scene
 
             self._scene = load_scene(self.source, self.config.size)
         return self._scene

@@ -287,7 +287,7 @@ def test_lines_of_progress_tell_the_time_left(capsys, monkeypatch):
 def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path, presses):
     # In a process of its own, with a sampler that presses the keys once the first pass is done.
     code = (
-        "import data_gen.paths.camera as c, os, signal, sys, time\n"
+        "import data_gen.passes as c, os, signal, sys, time\n"
         "def end_pass(film, *block):\n"
         "    presses = int(sys.argv[1]) if film._pass else 0\n"
         "    old(film, *block)\n"

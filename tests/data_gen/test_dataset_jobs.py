@@ -123,7 +123,7 @@ def test_a_scene_comes_from_its_seed(tmp_path):
 
 
 def test_a_scene_can_be_saved_by_its_seed(tmp_path, monkeypatch, capsys):
-    from data_gen.dataset import scenes
+    from data_gen.scenes.procedural import scenes
 
     monkeypatch.setattr(sys, "argv", ["scenes", "5", str(tmp_path / "new")])
     assert scenes.main() == 0 and (tmp_path / "new/scene.xml").is_file()
@@ -170,7 +170,7 @@ def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
 
 def test_a_scene_has_its_parts_in_the_same_order_whenever_it_is_loaded(renderer, tmp_path):
     """Merging of equal parts shuffles them, and with the lamps the light that a random number stands for."""
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     path = str(make_scene((1, 2), tmp_path))
     orders = set()

@@ -6,7 +6,8 @@ import pytest
 
 def features_of(mi, size=(33, 33), spp=4, **objects):
     """Feature layers of a scene seen by a camera at (0, 0, 5) that looks along -z with 30 degrees across."""
-    from data_gen.render import render_stack, set_film_size
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import set_film_size
 
     camera = {
         "type": "perspective",

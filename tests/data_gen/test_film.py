@@ -56,10 +56,10 @@ def test_gradients_combine_both_directions(renderer, film):
         target.put(name, mi.Color3f(mi.Float(np.repeat(pixels, 2).astype(np.float32))))
 
     # Differences "neighbour - base", two equal samples a pixel; the outer neighbours do not exist.
-    put("right", 1, 2, 99)
-    put("left", 99, -3, -5)
-    put("down", 99, 99, 99)
-    put("up", 99, 99, 99)
+    put("dx+", 1, 2, 99)
+    put("dx-", 99, -3, -5)
+    put("dy+", 99, 99, 99)
+    put("dy-", 99, 99, 99)
     layers = target.develop()
     assert layers["dx"][0, :, 0].tolist() == [(1 + 3) / 2, (2 + 5) / 2, 0]
     assert not layers["dy"].any()
@@ -69,13 +69,13 @@ def test_variance_of_a_gradient_is_that_of_its_mean(renderer, film, rng):
     mi = renderer
     target = film(4, 4)
     fill(mi, target, np.zeros((16, 8, 3)))
-    samples = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("right", "left", "down", "up")}
+    samples = {name: rng.normal(size=(16, 8)).astype(np.float32) for name in ("dx+", "dx-", "dy+", "dy-")}
     for name, values in samples.items():
         target.put(name, mi.Color3f(mi.Float(values.ravel())))
     variance = {name: values.var(axis=1, ddof=1).reshape(4, 4) / 8 for name, values in samples.items()}
     layers = target.develop()
-    assert np.allclose(layers["dx_var"][:, :-1, 0], (variance["right"][:, :-1] + variance["left"][:, 1:]) / 4)
-    assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["down"][:-1] + variance["up"][1:]) / 4)
+    assert np.allclose(layers["dx_var"][:, :-1, 0], (variance["dx+"][:, :-1] + variance["dx-"][:, 1:]) / 4)
+    assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["dy+"][:-1] + variance["dy-"][1:]) / 4)
 
 
 def test_diagnostics_are_images_beside_the_layers(renderer, film, rng):
@@ -103,7 +103,7 @@ def test_constant_samples_have_no_variance_and_float64_keeps_long_sums(renderer,
 
 
 def test_blocks_and_strands_lose_no_sample(renderer, film, rng, monkeypatch):
-    import data_gen.film as module
+    import data_gen.film.gradient_film as module
 
     samples = rng.random((6, 40, 3)).astype(np.float32)
     results = []
@@ -121,3 +121,62 @@ def test_blocks_and_strands_lose_no_sample(renderer, film, rng, monkeypatch):
     for layers in results:
         assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-6)
         assert np.allclose(layers["primal_var"].reshape(6, 3), samples.var(axis=1, ddof=1) / 40, rtol=1e-5)
+
+
+def test_splats_add_up_in_any_order(renderer, film, rng):
+    """Values over 16 orders of magnitude, to the last bit; those that are not finite are counted where they fell."""
+    import math
+
+    mi, n = renderer, 20000
+    pixel = rng.integers(0, 6, n).astype(np.uint32)
+    value = (rng.normal(size=(3, n)) * 10.0 ** rng.uniform(-8, 8, n)).astype(np.float32)
+    value[1, 7], value[2, 9] = np.nan, np.inf
+    good = np.isfinite(value).all(axis=0)
+    results = []
+    for order in (np.arange(n), rng.permutation(n)):
+        target = film(3, 2, batches=True)
+        target.splat("primal", mi.UInt32(pixel[order]), mi.Color3f(*value[:, order]))
+        target.end_pass(4)
+        results.append(target.develop()["primal"].reshape(6, 3))
+        assert target.samples == 4 and target.discarded == 2
+        assert target.diagnose()["diagnostics.discarded"].ravel()[pixel[7]] > 0
+    assert np.array_equal(*results)
+    exact = [[math.fsum(row[good & (pixel == i)].astype(float)) / 4 for row in value] for i in range(6)]
+    assert np.array_equal(results[0], np.array(exact, np.float32))
+
+
+def test_batches_have_the_variance_of_their_means(renderer, film, rng):
+    """Samples of a pass that share their error: over samples the variance would be far too small."""
+    mi = renderer
+    shared = rng.normal(size=(24, 1, 1, 3))
+    samples = (shared + 0.1 * rng.normal(size=(24, 6, 8, 3))).astype(np.float32)
+    samples[3, 2, 5] = np.nan
+    target = film(3, 2, batches=True)
+    for batch in samples:
+        fill(mi, target, batch)
+        target.end_pass(8)
+    means = np.nanmean(samples.astype(np.float64), axis=2)
+    layers = target.develop()
+    assert target.samples == 24 * 8 and target.discarded == 1
+    assert np.allclose(layers["primal"].reshape(6, 3), means.mean(axis=0), rtol=1e-6)
+    assert np.allclose(layers["primal_var"].reshape(6, 3), means.var(axis=0, ddof=1) / 24, rtol=1e-6)
+
+
+def test_what_is_put_and_what_is_splatted_are_one_value(renderer, film):
+    mi = renderer
+    target = film(2, 1, batches=True)
+    for scale in (1, 3):
+        # Two samples a pixel; the second pixel's are all lost, so that nothing is known of it in this pass.
+        lost = np.nan if scale == 3 else 8
+        target.put("primal", mi.Color3f(mi.Float(np.array([scale, 3 * scale, lost, lost], np.float32))))
+        for pixel in (0, 0, 1):
+            target.splat("primal", mi.UInt32([pixel]), mi.Color3f(mi.Float([4.0 * scale])))
+        target.end_pass(2)
+    image = target.develop()["primal"][0, :, 0]
+    # (1 + 3) / 2 + (4 + 4) / 2 = 6, and three times that; 8 + 4 / 2 = 10, once.
+    assert image.tolist() == [(6 + 18) / 2, 10]
+
+
+def test_films_of_independent_samples_take_no_splats(renderer, film):
+    with pytest.raises(ValueError, match="make it with batches"):
+        film(2, 1).splat("primal", renderer.UInt32([0]), renderer.Color3f(1))

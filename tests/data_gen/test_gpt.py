@@ -40,14 +40,11 @@ def test_unbiased_with_a_large_budget(renderer, scene):
 
 
 @pytest.mark.parametrize("threshold", [0.0, 10.0])
-def test_unbiased_whatever_is_connectable(renderer, threshold, monkeypatch):
+def test_unbiased_whatever_is_connectable(renderer, threshold):
     """All that is not a mirror, and nothing at all, which leaves random sequence replay."""
-    from data_gen.samplers.gpt import integrator as gpt
-
-    monkeypatch.setattr(gpt, "ROUGHNESS_THRESHOLD", threshold)
     scene = load(renderer, plenty, (32, 32))
     references = render_references(renderer, scene, spp=128)
-    for name, result in gradient_tests(render_ours(scene, "gpt"), references):
+    for name, result in gradient_tests(render_ours(scene, "gpt", roughness_threshold=threshold), references):
         assert result.passed, f"{name}: {result}"
 
 
@@ -65,8 +62,8 @@ def test_agrees_with_the_teaching_sampler(renderer):
         ("reconnection_jacobian", lambda mi, dr, *geometry: mi.Float(1)),
         ("gradient_weight", lambda mi, dr, r, good: dr.select(good, 2 / (1 + r), 1)),
         ("gradient_weight", lambda mi, dr, r, good: mi.Float(1)),
-        ("SHIFTS", {"right": (2, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1)}),
-        ("SHIFTS", {"right": (1, 0), "left": (-1, 0), "down": (0, -1), "up": (0, 1)}),
+        ("SHIFTS", {"dx+": (2, 0), "dx-": (-1, 0), "dy+": (0, 1), "dy-": (0, -1)}),
+        ("SHIFTS", {"dx+": (1, 0), "dx-": (-1, 0), "dy+": (0, -1), "dy-": (0, 1)}),
     ],
     ids=[
         "no Jacobian",
@@ -90,19 +87,19 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
-def one_direction(film, forward, backward, axis):
+def one_direction(film, layer):
     """Differences sampled from one of the two pixels only."""
-    gradient, variance = type(film).true_gradient(film, forward, backward, axis)
-    ahead = np.s_[:, :-1] if axis == 1 else np.s_[:-1]
-    gradient[ahead] = film._image(film._statistics(forward)[1])[ahead]
+    gradient, variance = type(film).true_gradient(film, layer)
+    ahead = np.s_[:, :-1] if layer == "dx" else np.s_[:-1]
+    gradient[ahead] = film._image(film._statistics(f"{layer}+")[1])[ahead]
     return gradient, variance
 
 
-def wrapped(film, forward, backward, axis):
+def wrapped(film, layer):
     """The last column's difference taken to the first."""
-    gradient, variance = type(film).true_gradient(film, forward, backward, axis)
+    gradient, variance = type(film).true_gradient(film, layer)
     image = film._image(film._statistics("primal")[1])
-    return np.where(gradient == 0, np.roll(image, -1, axis=axis) - image, gradient), variance
+    return np.where(gradient == 0, np.roll(image, -1, axis=1 if layer == "dx" else 0) - image, gradient), variance
 
 
 @pytest.mark.parametrize("mutant", [one_direction, wrapped])
@@ -313,19 +310,21 @@ def test_works_as_a_mitsuba_integrator(renderer):
 
 def test_the_choice_of_a_sampler(renderer):
     from data_gen.inspect import inspect_scene
-    from data_gen.render import choose_sampler, describe, render_stack
+    from data_gen.render import render_stack
+    from data_gen.samplers import choose
+    from data_gen.scenes.facts import scene_facts
 
-    assert choose_sampler(*describe(load(renderer, "diffuse", (4, 4))))[0] == "gpt"
+    assert choose(scene_facts(load(renderer, "diffuse", (4, 4))))[0] == "gpt"
     assert inspect_scene("diffuse")["plan"][1] == "because the integrator is 'path' and there are no media"
     foggy = load(renderer, fog, (4, 4))
-    assert choose_sampler(*describe(foggy))[0] == "gpt-basic"
+    assert choose(scene_facts(foggy))[0] == "gpt-basic"
     with pytest.raises(NgptError, match=r"'gpt' cannot render this scene: .*'VolumetricPath.*--sampler gpt-basic"):
         render_stack(foggy, 1, sampler="gpt")
 
     def unseen_fog():
         return fog() | {"integrator": {"type": "path"}}
 
-    assert "media" in choose_sampler(*describe(load(renderer, unseen_fog, (4, 4))))[1]
+    assert "media" in choose(scene_facts(load(renderer, unseen_fog, (4, 4))))[1]
 
 
 def test_polarised_light_is_declined(renderer):

@@ -18,9 +18,9 @@ def make_plan(scene, **options):
 
 def render(scene, spp=16, size=None, **options):
     """Layers of our integrator with these parameters, and the rate of failed shifts if that is asked for."""
-    from data_gen.render import gpt_integrator
+    from data_gen.samplers.gpt.integrator import stand_in
 
-    integrator = gpt_integrator(scene)
+    integrator = stand_in(scene)
     for name, value in options.items():
         setattr(integrator, name, value)
     film = integrator.render_film(scene, scene.sensors()[0], 0, spp)
@@ -83,11 +83,11 @@ def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
 @pytest.mark.parametrize("scene", [plenty, glass, "environment"])
 def test_half_vector_copy_is_unbiased(renderer, scene, monkeypatch):
     from data_gen.paths import shift
-    from data_gen.render import gpt_integrator
+    from data_gen.samplers.gpt.integrator import stand_in
 
     scene_has_frosted_glass = scene is glass
     scene = load(renderer, scene, (32, 32))
-    integrator = gpt_integrator(scene)
+    integrator = stand_in(scene)
     integrator.shift = "half-vector"
     # Frosted glass and brushed metal are shifted by half-vectors then.
     integrator.roughness_threshold = 0.35
@@ -175,10 +175,10 @@ def mostly(condition):
 
 @pytest.mark.parametrize("scene", ["glossy", plenty])
 def test_the_primal_of_base_and_offset_paths_is_unbiased(renderer, scene):
-    from data_gen.render import gpt_integrator
+    from data_gen.samplers.gpt.integrator import stand_in
 
     scene = load(renderer, scene, (32, 32))
-    integrator = gpt_integrator(scene)
+    integrator = stand_in(scene)
     integrator.reuse = True
     stacks = [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop() for seed in range(16)]
     for name, result in gradient_tests(stacks, render_references(renderer, scene, spp=128)):
@@ -239,9 +239,9 @@ def test_shift_modes_agree(renderer):
     scene = load(renderer, lambda: polished(0.2), (24, 24))
 
     def batches(shift):
-        from data_gen.render import gpt_integrator
+        from data_gen.samplers.gpt.integrator import stand_in
 
-        integrator = gpt_integrator(scene)
+        integrator = stand_in(scene)
         integrator.shift, integrator.roughness_threshold = shift, 10.0
         return [integrator.render_film(scene, scene.sensors()[0], seed, 64).develop()["dx"] for seed in range(16)]
 

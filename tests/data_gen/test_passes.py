@@ -15,41 +15,21 @@ def same(a, b):
         assert np.array_equal(a[name], b[name], equal_nan=True), name
 
 
-@pytest.mark.parametrize(
-    ("sampler", "size"), [("gpt", (16, 12)), ("gpt", (7, 5)), ("gpt-basic", (7, 5)), ("primal", (16, 12))]
-)
-def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, sampler, size):
-    from data_gen.paths import camera
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "glossy", size)
-    whole = render_stack(scene, 150, 7, sampler)
-    same(whole, render_stack(scene, 150, 7, sampler))
-    calls = []
-    monkeypatch.setattr(camera, "_FIRST_LANES", size[0] * size[1] * 40)
-    monkeypatch.setattr(camera, "_PASS_SECONDS", 1e-9)
-    parts = render_stack(scene, 150, 7, sampler, lambda done, total: calls.append((done, total)))
-    # 40 samples are two blocks of 16; what is left over at the end is a pass of its own.
-    assert calls == [(n, 150) for n in (0, 32, 48, 64, 80, 96, 112, 128, 144, 150)]
-    same(whole, parts)
-    assert not np.array_equal(whole["primal"], render_stack(scene, 150, 8, sampler)["primal"])
-
-
 def test_large_images_with_small_blocks(renderer, monkeypatch):
-    from data_gen.paths import camera
+    from data_gen import passes
     from data_gen.render import render_stack
 
     scene = load(renderer, "glossy", (33, 21))
-    monkeypatch.setattr(camera, "_BLOCK_LANES", 33 * 21 * 5)
+    monkeypatch.setattr(passes, "_BLOCK_LANES", 33 * 21 * 5)
     whole = render_stack(scene, 14, 7)
-    assert camera.block_of_samples(33 * 21) == 4
-    monkeypatch.setattr(camera, "_PASS_SECONDS", 1e-9)
+    assert passes.block_of_samples(33 * 21) == 4
+    monkeypatch.setattr(passes, "_PASS_SECONDS", 1e-9)
     same(whole, render_stack(scene, 14, 7))
 
 
 def test_passes_do_not_move_blocks_within_packets(renderer):
     from data_gen.film import GradientFilm
-    from data_gen.paths.camera import blocks_within
+    from data_gen.passes import blocks_within
 
     assert blocks_within(1000, GradientFilm(32, 21), 4) > 1
     # 33 * 21 * 4 lanes are no whole number of packets of 16: a second block would start amid one.
@@ -94,26 +74,9 @@ def test_stopping_keeps_the_samples_done(renderer):
     same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal"))
 
 
-@pytest.mark.parametrize("sampler", ["gpt", "gpt-basic"])
-def test_memory_stays_within_its_budget(renderer, sampler):
-    import drjit as dr
-
-    from data_gen.render import render_stack
-
-    scene = load(renderer, "glossy", (64, 48))
-    whole = render_stack(scene, 100, 1, sampler)
-    dr.flush_malloc_cache()
-    dr.detail.malloc_clear_statistics()
-    before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
-    calls = []
-    stack = render_stack(scene, 100, 1, sampler, lambda *call: calls.append(call), memory=40)
-    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before < 40 * 2**20
-    assert len(calls) > 5
-    same(whole, stack)
-
-
 def test_sizes_that_memory_cannot_hold(renderer):
-    from data_gen.render import render_stack, set_film_size
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import set_film_size
 
     scene = load(renderer, "diffuse", (4, 4))
     set_film_size(scene, (20000, 10000))

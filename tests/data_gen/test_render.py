@@ -28,7 +28,8 @@ def scene_file(renderer, tmp_path):
 
 
 def test_scene_file_with_its_own_size_a_given_size_and_parameters(scene_file):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     assert render_stack(load_scene(scene_file()), 1)["primal"].shape == (30, 40, 3)
     assert render_stack(load_scene(scene_file(), parameters={"resx": "20"}), 1)["primal"].shape == (30, 20, 3)
@@ -36,7 +37,8 @@ def test_scene_file_with_its_own_size_a_given_size_and_parameters(scene_file):
 
 
 def test_crop_window_shows_its_part_of_the_image(scene_file):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     names = ("offset_x", "offset_y", "width", "height")
     crop = "".join(f'<integer name="crop_{n}" value="{v}"/>' for n, v in zip(names, (10, 5, 20, 15), strict=True))
@@ -48,7 +50,8 @@ def test_crop_window_shows_its_part_of_the_image(scene_file):
 
 
 def test_paths_alone_are_those_with_features(scene_file):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     scene = load_scene(scene_file(), (17, 5))
     bare, full = (render_stack(scene, 4, 0, "primal", with_features=flag) for flag in (False, True))
@@ -59,7 +62,8 @@ def test_paths_alone_are_those_with_features(scene_file):
 
 
 def test_the_primal_sampler_agrees_with_mitsuba(renderer):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
     from ngpt.testing import z_test
 
     scene = load_scene("environment", (24, 24))
@@ -70,7 +74,8 @@ def test_the_primal_sampler_agrees_with_mitsuba(renderer):
 
 
 def test_attributes_tell_how_it_was_made(renderer):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     attributes = render_stack(load_scene("lens", (8, 8)), 3, seed=2**63).attributes
     assert attributes["ngpt:spp"] == 3 and attributes["ngpt:seed"] == str(2**63)
@@ -83,7 +88,8 @@ def test_every_kind_of_variant_renders_the_same_image(renderer, variant):
     from data_gen.backend import use_variant
 
     def mean(spp):
-        from data_gen.render import load_scene, render_stack
+        from data_gen.render import render_stack
+        from data_gen.scenes.load import load_scene
 
         stack = render_stack(load_scene("lens", (12, 8)), spp)
         return {name: stack[name].mean(axis=(0, 1)) for name in stack.names}
@@ -110,7 +116,7 @@ def test_every_kind_of_variant_renders_the_same_image(renderer, variant):
     ],
 )
 def test_scenes_that_are_not_there(renderer, arguments, message):
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     with pytest.raises(NgptError, match=message):
         load_scene(**arguments)
@@ -126,7 +132,7 @@ def test_scenes_that_are_not_there(renderer, arguments, message):
     ],
 )
 def test_scene_files_that_cannot_be_loaded(scene_file, options, message):
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     with pytest.raises(NgptError, match=message) as error:
         load_scene(scene_file(**options))
@@ -134,7 +140,8 @@ def test_scene_files_that_cannot_be_loaded(scene_file, options, message):
 
 
 def test_integrators_without_camera_paths(scene_file):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     with pytest.raises(NgptError, match=r"does not trace paths from the camera.*'path' or 'volpath'"):
         render_stack(load_scene(scene_file(integrator="ptracer")), 1)
@@ -149,7 +156,8 @@ def test_integrators_without_camera_paths(scene_file):
     ],
 )
 def test_bad_options(renderer, options, message):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     with pytest.raises(NgptError, match=message):
         render_stack(load_scene("diffuse", (4, 4)), **options)
@@ -178,13 +186,16 @@ def test_inspection_names_what_matters(scene_file):
 def test_media_are_refused_by_name(renderer):
     from data_gen_scenes import within_fog
 
-    from data_gen.render import choose_sampler, describe, render_stack, set_film_size
+    from data_gen.render import render_stack
+    from data_gen.samplers import choose
+    from data_gen.scenes.facts import scene_facts
+    from data_gen.scenes.load import set_film_size
 
     description = within_fog()
     description["integrator"]["type"] = "path"
     scene = renderer.load_dict(description)
     set_film_size(scene, (6, 4))
-    assert describe(scene)[1] == ["air"] and choose_sampler(*describe(scene))[0] == "gpt-basic"
+    assert scene_facts(scene).media == ("air",) and choose(scene_facts(scene))[0] == "gpt-basic"
     with pytest.raises(NgptError, match=r"media \(air\).*gpt-basic, or primal"):
         render_stack(scene, 1, sampler="gpt")
     assert render_stack(scene, 1, sampler="primal").attributes["ngpt:sampler"] == "primal"
@@ -207,7 +218,8 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
 
 @pytest.mark.parametrize("size", [(1, 1), (3, 2), (1, 7), (5, 1), (2, 2)])
 def test_tiny_images(renderer, size):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     stack = render_stack(load_scene("diffuse", size), 2)
     assert stack["dx"].shape == (size[1], size[0], 3)

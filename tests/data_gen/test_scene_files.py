@@ -20,7 +20,7 @@ LEVEL = 1 - 0.99 ** (1 / (3 * max(1, len(FILES))))
 @pytest.mark.skipif(not FILES, reason="NGPT_SCENES names no folder of scenes")
 @pytest.mark.parametrize("path", FILES, ids=lambda path: f"{path.parent.name}-{path.stem}")
 def test_unbiased(renderer, path):
-    from data_gen.render import load_scene
+    from data_gen.scenes.load import load_scene
 
     scene = load_scene(str(path), (32, 24))
     references = render_references(renderer, scene, spp=192)

@@ -20,7 +20,8 @@ SHIPPED = [
 @pytest.fixture(scope="module")
 def views(renderer):
     """A stack of 8 samples and a reference of each built-in scene."""
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     result = {}
     for name in ("diffuse", "lens"):

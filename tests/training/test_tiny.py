@@ -10,7 +10,8 @@ TRAINING, HELD_OUT = ("diffuse", "glossy", "environment"), "lens"
 
 
 def render_views(folder):
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     for name in (*TRAINING, HELD_OUT):
         view = folder / name

@@ -36,17 +36,21 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
+import re
+
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
-from data_gen.paths.camera import CameraSamples, render_passes
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
+from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
 
 # α of Beckmann and GGX above which a material is connectable.
@@ -90,8 +94,7 @@ class GPT(GradientIntegrator):
         path = mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters, **depths})
         return path.sample(scene, sampler, ray, medium, active)
 
-    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
-        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
+    def prepare(self, scene) -> SamplePass:
         if mi.is_polarized:
             raise NgptError(
                 f"sampler 'gpt' does not follow polarised light (variant '{mi.variant()}'); "
@@ -105,9 +108,7 @@ class GPT(GradientIntegrator):
             shift=self.shift,
             hide_emitters=self.hide_emitters,
         )
-        return render_passes(
-            lambda camera, film: self.sample_pass(scene, plan, camera, film), sensor, seed, spp, **progress
-        )
+        return lambda camera, film: self.sample_pass(scene, plan, camera, film)
 
     def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
@@ -195,6 +196,26 @@ def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f
 
 def count(flags: list[mi.Bool]) -> mi.Float:
     return sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``gpt``: our integrator with the parameters of the scene's own ``path``, and options of the class."""
+    return stand_in(scene, **options).prepare(scene)
+
+
+def stand_in(scene: mi.Scene, **options) -> GPT:
+    """The plugin with the parameters of the scene's own ``path``; raises NgptError where they cannot be read."""
+    path = reference_integrator(scene)
+    # Mitsuba exposes neither depth as a parameter, only in print.
+    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
+    if depths.keys() != {"max_depth", "rr_depth"}:
+        raise NgptError(
+            f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
+            "use --sampler gpt-basic"
+        )
+    unlimited = depths["max_depth"] >= 0x7FFFFFFF
+    depths["max_depth"] = -1 if unlimited else depths["max_depth"]
+    return mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths, **options})
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))

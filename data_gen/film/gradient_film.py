@@ -2,15 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# The four neighbours of a base pixel, as offsets (x, y) in pixels, y down. The film keeps the differences
-# "neighbour - base" at the base pixel and combines both sides afterwards, so no sample is ever splatted.
-SHIFTS = {"right": (1, 0), "left": (-1, 0), "down": (0, 1), "up": (0, -1)}
+from data_gen.film.moments import Moments, accumulate, no_moments, one_more
+from data_gen.film.splats import splat_sums
+from ngpt.layers import DIFFERENCES
+
+# What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
+# differences "neighbour - base" at the base pixel and combines both directions when it develops.
+SHIFTS = {
+    f"{layer}{sign}": (factor * x, factor * y)
+    for layer, (x, y, _) in DIFFERENCES.items()
+    for sign, factor in (("+", 1), ("-", -1))
+}
 
 # What is put under these names becomes a diagnostic image, not a layer of the stack: name -> name of the image.
 DIAGNOSTICS = {"shift_failures": "diagnostics.shiftFailures"}
@@ -20,18 +26,10 @@ _WITH_VARIANCE = frozenset({"primal", *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
+# Per pixel, of a pass that is one batch: the mean over the batch, and two sums of splats, of one name.
+_BATCH_BYTES = 3 * 8 + 3 * 3 * 8
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
-
-
-@dataclass
-class Moments:
-    """Running statistics of one value, for all strands: counts UInt32, a Float64 for each channel of the others."""
-
-    count: mi.UInt32  # samples that count
-    lost: mi.UInt32  # samples left out because they were not finite
-    mean: list
-    m2: list  # sum of squared deviations from the mean; empty where nobody asks for a variance
 
 
 class GradientFilm:
@@ -39,18 +37,24 @@ class GradientFilm:
 
     Samples that are not finite get zero weight: they are left out of the mean and counted. Which sample is added to
     which sum, and in what order, depends on its number alone: the same samples give the same bits, whatever the passes.
+
+    Variances are over samples, which are taken for independent. Where those of a pass are not, because they share
+    photons, reservoirs or the state of a chain, or because lanes splat onto pixels of others, the film is made with
+    ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over batches.
     """
 
-    def __init__(self, width: int, height: int):
-        self.width, self.height = width, height
+    def __init__(self, width: int, height: int, batches: bool = False):
+        self.width, self.height, self.batches = width, height, batches
         self.pixels = width * height
-        self.strands = max(1, _STRANDS // self.pixels)
+        self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel
         self.blocks = 0  # of samples, each of which goes to one strand
         # Dr.Jit gives each array the next power of two of bytes.
-        self.bytes = _STRAND_BYTES * (1 << (self.pixels * self.strands - 1).bit_length())
+        bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0)
+        self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
         self.moments: dict[str, Moments] = {}
         self._pass: dict[str, tuple] = {}
+        self._splats: dict[str, tuple] = {}
 
     def put(self, name: str, value, active: bool | mi.Bool = True) -> None:
         """Adds the samples of one pass.
@@ -60,47 +64,86 @@ class GradientFilm:
         """
         if name in self._pass:
             self.end_pass()
-        components = [value] if isinstance(value, mi.Float) else list(value)
-        self._pass[name] = (components, active)
+        self._pass[name] = (_components(value), active)
 
     def put_all(self, values: dict) -> None:
         """``put`` for several values: name -> samples."""
         for name, value in values.items():
             self.put(name, value)
 
+    def splat(self, name: str, pixel: mi.UInt32, value, active: bool | mi.Bool = True) -> None:
+        """Adds values to any pixel: the ``pixel`` of each lane, numbered row by row. Only films with ``batches`` can.
+
+        Over a pass with n samples per pixel, a pixel's value is the mean of what was put for it, plus the sum of its
+        splats over n. So a lane's splat counts like its put: one light path per camera sample, each worth the
+        contribution to its pixel over its density, fills the image. Several splats of a name in a pass add up.
+        """
+        if not self.batches:
+            raise ValueError("this film takes samples for independent, which splats are not: make it with batches")
+        sums, lost = splat_sums(self.pixels, pixel, _components(value), mi.Bool(active))
+        if name in self._splats:
+            before, already = self._splats[name]
+            sums, lost = [a + b for a, b in zip(before, sums, strict=True)], already + lost
+            dr.eval(sums, lost)
+        self._splats[name] = (sums, lost)
+
     def end_pass(self, block: int | None = None) -> None:
         """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
 
-        ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side.
+        ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side. Of a film with
+        ``batches`` it is all samples of the pass, and must be given where there are splats alone.
         """
-        if not self._pass:
+        if not self._pass and not self._splats:
             return
         values, self._pass = self._pass, {}
+        splats, self._splats = self._splats, {}
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
         dr.eval(values)
-        lanes = dr.width(values)
+        lanes = dr.width(values) if values else self.pixels * (block or 0)
         spp = lanes // self.pixels
         block = block or spp
-        # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
-        pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
-        strand, pixel = pixel // self.pixels, pixel % self.pixels
-        behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
-        first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
-        dr.eval(first)
-        where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
-        for name, (components, active) in values.items():
-            moments = self.moments.get(name) or self._nothing(len(components), name in _WITH_VARIANCE)
-            self.moments[name] = accumulate(moments, components, active, *where)
-            # One by one: the old moments and the new ones are in memory together.
-            dr.eval(self.moments[name])
+        if self.batches:
+            self._add_batch(values, splats, spp)
+        else:
+            # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
+            pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
+            strand, pixel = pixel // self.pixels, pixel % self.pixels
+            behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
+            first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
+            dr.eval(first)
+            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
+            for name, (components, active) in values.items():
+                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, *where)
+                # One by one: the old moments and the new ones are in memory together.
+                dr.eval(self.moments[name])
         self.samples += spp
         self.blocks += spp // block
 
-    def _nothing(self, channels: int, variance: bool) -> Moments:
+    def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
+        """One more value for each pixel and name: the mean over the pass, splats included."""
+        first = dr.arange(mi.UInt32, self.pixels) * dr.opaque(mi.UInt32, spp)
+        where = (first, first + dr.opaque(mi.UInt32, spp), *(dr.opaque(mi.UInt32, n) for n in (spp, spp)))
+        for name in dict.fromkeys((*values, *splats)):
+            mean, exists, lost = None, mi.Bool(True), mi.UInt32(0)
+            if name in values:
+                components, active = values[name]
+                batch = accumulate(no_moments(self.pixels, len(components), False), components, active, *where)
+                mean, exists, lost = batch.mean, batch.count > 0, batch.lost
+            if name in splats:
+                sums, lost_splats = splats[name]
+                share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
+                # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
+                mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
+                lost = lost + lost_splats
+            moments = one_more(self._moments(name, len(mean)), mean, exists)
+            moments.lost += lost
+            dr.eval(moments)
+            self.moments[name] = moments
+
+    def _moments(self, name: str, channels: int) -> Moments:
+        """The statistics so far of what is put under a name."""
         width = self.pixels * self.strands
-        Float64 = dr.float64_array_t(mi.Float)
-        mean, m2 = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(2))
-        return Moments(dr.zeros(mi.UInt32, width), dr.zeros(mi.UInt32, width), mean, m2 if variance else [])
+        return self.moments.get(name) or no_moments(width, channels, name in _WITH_VARIANCE)
 
     @property
     def discarded(self) -> int:
@@ -121,9 +164,9 @@ class GradientFilm:
                 layers[name] = self._image(self._statistics(name)[1])
         count, _, variance = self._statistics("primal")
         variances = {"primal_var": self._image(variance)}
-        for layer, forward, backward, axis in (("dx", "right", "left", 1), ("dy", "down", "up", 0)):
-            if forward in self.moments:
-                layers[layer], variances[f"{layer}_var"] = self._gradient(forward, backward, axis)
+        for layer in DIFFERENCES:
+            if f"{layer}+" in self.moments:
+                layers[layer], variances[f"{layer}_var"] = self._gradient(layer)
         if np.max(count) > 1:
             layers |= variances
         return {name: np.ascontiguousarray(layer, np.float32) for name, layer in layers.items()}
@@ -167,17 +210,17 @@ class GradientFilm:
                     variances.append(np.where(count > 1, m2 / (count - 1) / count, np.nan))
         return count[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
 
-    def _gradient(self, forward: str, backward: str, axis: int) -> tuple[np.ndarray, np.ndarray]:
+    def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
         from the successor by the backward shift.
         """
-        ahead = np.s_[:, 1:] if axis == 1 else np.s_[1:]
-        behind = np.s_[:, :-1] if axis == 1 else np.s_[:-1]
+        x, y = SHIFTS[f"{layer}+"]
+        behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]
         gradient = np.zeros((self.height, self.width, 3))
         variance = np.zeros((self.height, self.width, 3))
-        (_, one, one_var), (_, other, other_var) = self._statistics(forward), self._statistics(backward)
+        (_, one, one_var), (_, other, other_var) = self._statistics(f"{layer}+"), self._statistics(f"{layer}-")
         gradient[behind] = 0.5 * (self._image(one)[behind] - self._image(other)[ahead])
         variance[behind] = 0.25 * (self._image(one_var)[behind] + self._image(other_var)[ahead])
         return gradient, variance
@@ -186,29 +229,6 @@ class GradientFilm:
         return columns.reshape(self.height, self.width, -1)
 
 
-def accumulate(moments: Moments, components: list, active, first, end, block, stride) -> Moments:
-    """Adds samples to each lane's moments: ``block`` of them from ``first`` on, again from ``first + stride`` on, and
-    so forth below ``end``, all UInt32.
-
-    Welford 1962, "Note on a method for calculating corrected sums of squares and products", in double precision: sums
-    of squares would lose all digits where the variance is small beside the mean.
-    """
-    Float64 = dr.float64_array_t(mi.Float)
-
-    def add(i: mi.UInt32, n: mi.UInt32, old: Moments):
-        x = [dr.gather(mi.Float, component, i) for component in components]
-        exists = mi.Bool(True) if active is True else dr.gather(mi.Bool, active, i)
-        finite = dr.all([dr.isfinite(component) for component in x])
-        good = exists & finite
-        count = dr.select(good, old.count + 1, old.count)
-        lost = dr.select(exists & ~finite, old.lost + 1, old.lost)
-        share = 1 / Float64(dr.maximum(count, 1))
-        deviations = [dr.select(good, Float64(c) - m, 0) for c, m in zip(x, old.mean, strict=True)]
-        mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
-        # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
-        m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
-        last = n + 1 == block
-        i = i + dr.select(last, stride - block + 1, 1)  # not in place: that would move `first` too
-        return i, dr.select(last, 0, n + 1), Moments(count, lost, mean, m2)
-
-    return dr.while_loop((first, mi.UInt32(0), moments), lambda i, *_: i < end, add, label="film")[2]
+def _components(value) -> list:
+    """The channels of a Float or a colour."""
+    return [value] if isinstance(value, mi.Float) else list(value)

@@ -1,0 +1,58 @@
+"""Running mean and variance of many lanes at once.
+
+Welford 1962, "Note on a method for calculating corrected sums of squares and products", in double precision: sums of
+squares would lose all digits where the variance is small beside the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Moments:
+    """Running statistics of one value, for all strands: counts UInt32, a Float64 for each channel of the others."""
+
+    count: mi.UInt32  # samples that count
+    lost: mi.UInt32  # samples left out because they were not finite
+    mean: list
+    m2: list  # sum of squared deviations from the mean; empty where nobody asks for a variance
+
+
+def no_moments(width: int, channels: int, variance: bool) -> Moments:
+    """The statistics of no sample, for ``width`` strands."""
+    Float64 = dr.float64_array_t(mi.Float)
+    mean, m2 = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(2))
+    return Moments(dr.zeros(mi.UInt32, width), dr.zeros(mi.UInt32, width), mean, m2 if variance else [])
+
+
+def one_more(old: Moments, x: list, exists) -> Moments:
+    """The statistics with one more sample ``x`` for each strand where it ``exists``; one that is not finite is lost."""
+    Float64 = dr.float64_array_t(mi.Float)
+    finite = dr.all([dr.isfinite(component) for component in x])
+    good = exists & finite
+    count = dr.select(good, old.count + 1, old.count)
+    lost = dr.select(exists & ~finite, old.lost + 1, old.lost)
+    share = 1 / Float64(dr.maximum(count, 1))
+    deviations = [dr.select(good, Float64(c) - m, 0) for c, m in zip(x, old.mean, strict=True)]
+    mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
+    # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
+    m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
+    return Moments(count, lost, mean, m2)
+
+
+def accumulate(moments: Moments, components: list, active, first, end, block, stride) -> Moments:
+    """Adds samples to each strand's moments: ``block`` of them from ``first`` on, again from ``first + stride`` on, and
+    so forth below ``end``, all UInt32."""
+
+    def add(i: mi.UInt32, n: mi.UInt32, old: Moments):
+        x = [dr.gather(mi.Float, component, i) for component in components]
+        exists = mi.Bool(True) if active is True else dr.gather(mi.Bool, active, i)
+        last = n + 1 == block
+        # Not in place: that would move `first` too.
+        return i + dr.select(last, stride - block + 1, 1), dr.select(last, 0, n + 1), one_more(old, x, exists)
+
+    return dr.while_loop((first, mi.UInt32(0), moments), lambda i, *_: i < end, add, label="film")[2]

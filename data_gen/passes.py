@@ -1,0 +1,128 @@
+"""Rendering pass by pass: within a given memory and time, the same bits whatever the passes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import GradientFilm
+from data_gen.paths.camera import CameraSamples
+from ngpt.errors import NgptError
+
+Progress = Callable[[int, int], None]
+# What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
+SamplePass = Callable[[CameraSamples, GradientFilm], None]
+
+# What a render may use, in MiB, beside the scene itself; see blocks_within().
+DEFAULT_MEMORY = 6144
+# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more.
+LANE_BYTES = 256
+# Rays of lanes side by side are traced together, and do best where they start from one pixel.
+_PACKET = 16
+_BLOCK_LANES = 1 << 21
+# Lanes are numbered with 32 bits.
+_MOST_LANES = 1 << 30
+# Lanes of the first pass: enough to render small images at one go, and to judge how long the next may be.
+_FIRST_LANES = 1 << 20
+# A pass this long makes little of the time that it takes to start one, and reacts soon enough.
+_PASS_SECONDS = 2.0
+
+
+def render_passes(
+    sample: SamplePass,
+    sensor: mi.Sensor,
+    seed: int,
+    spp: int | None,
+    progress: Progress = lambda done, total: None,
+    seconds: float | None = None,
+    memory: int = DEFAULT_MEMORY,
+    stop: Callable[[], bool] = lambda: False,
+    lane_bytes: int = LANE_BYTES,
+    batch: int = 0,
+) -> GradientFilm:
+    """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
+
+    Rendered are ``spp`` samples per pixel, or as many as ``seconds`` of wall-clock time allow, compilation of kernels
+    included; with both, whichever comes first. Time is kept in whole passes: the first is always rendered, and no
+    further one that is expected to take longer than the time left. ``stop`` is asked after each pass whether to end
+    there. ``progress`` is called with (samples per pixel so far, spp) before the first pass and after each, or, where
+    there are ``seconds``, with whole (seconds gone, seconds).
+
+    How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
+    takes ``lane_bytes``. That changes no bit of the result, which depends on the seed, the size and the number of
+    samples alone. With a ``batch``, the samples of a pass depend on each other: each pass is one block of so many
+    samples per pixel, and the film's variances are over passes. Such a ``sample`` may keep a state from pass to pass;
+    ``CameraSamples.first`` tells it where it is.
+
+    Raises NgptError where one block of samples does not fit into ``memory``.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    film = GradientFilm(width, height, batches=bool(batch))
+    total = spp if spp is not None else 1 << 31
+    block = batch or block_of_samples(film.pixels)
+    most = blocks_within(memory, film, min(block, total), lane_bytes)
+    if batch:
+        most = 1
+    start = now = time.perf_counter()
+
+    def report(finished: bool = False) -> None:
+        if seconds is None:
+            progress(film.samples, total)
+        else:
+            limit = math.ceil(seconds)
+            progress(limit if finished else min(limit - 1, int(now - start)), limit)
+
+    blocks = _FIRST_LANES // (film.pixels * block) if seconds is None else 1
+    report()
+    while film.samples < total:
+        left = total - film.samples
+        # What is left over at the end is a block of its own.
+        n = left if left < block else block * max(1, min(blocks, most, left // block))
+        begin = now
+        sample(CameraSamples(sensor, seed, n, film.samples, min(n, block)), film)
+        film.end_pass(min(n, block))
+        dr.sync_thread()
+        now = time.perf_counter()
+        time_left = float("inf") if seconds is None else seconds - (now - start)
+        each = (now - begin) / n * block
+        finished = film.samples >= total or stop() or time_left < each
+        report(finished)
+        if finished:
+            break
+        blocks = int(min(time_left, _PASS_SECONDS) / each)
+    return film
+
+
+def block_of_samples(pixels: int) -> int:
+    """How many samples of a pixel go side by side: as many as are traced together, or fewer where images are large.
+
+    The results of a ray depend, in the last bits, on the rays traced with it. So which they are must not depend on how
+    a render is split into passes, and passes consist of whole blocks.
+    """
+    block = _PACKET
+    while block > 1 and pixels * block > _BLOCK_LANES:
+        block //= 2
+    return block
+
+
+def blocks_within(memory: int, film: GradientFilm, block: int, lane_bytes: int = LANE_BYTES) -> int:
+    """How many blocks of ``block`` samples a pass may have, so that it and the film stay within ``memory`` MiB.
+
+    Raises NgptError where not even one fits.
+    """
+    lanes = film.pixels * block
+    # Dr.Jit gives each array the next power of two of bytes.
+    available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
+    blocks = (1 << (available.bit_length() - 1)) // lanes if available > 0 else 0
+    if blocks < 1:
+        needed = -(-(film.bytes + lane_bytes * (1 << (lanes - 1).bit_length())) // 2**20)
+        raise NgptError(
+            f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {memory} MiB are "
+            f"allowed; pass --memory {needed}, or render a smaller image"
+        )
+    # A block that ends amid a packet would push the next one to another place in its own.
+    return blocks if lanes % _PACKET == 0 else 1

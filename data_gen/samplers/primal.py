@@ -1,0 +1,31 @@
+"""The scene's own integrator without gradients: references, and images for denoisers that need none."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import mitsuba as mi
+
+from data_gen.film import GradientFilm
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features as feature_layers
+from data_gen.paths.lights import emission_seen
+from data_gen.paths.spectrum import to_rgb
+from data_gen.scenes.load import reference_integrator
+
+
+def make(scene: mi.Scene, features: bool = True) -> SamplePass:
+    """The sampler ``primal``; without ``features`` it holds the primal alone."""
+    return partial(sample_pass, scene, reference_integrator(scene), features)
+
+
+def sample_pass(scene, integrator, features: bool, camera: CameraSamples, film: GradientFilm) -> None:
+    """One sample of radiance, and of features, for each camera sample, by Mitsuba's integrator alone."""
+    ray, importance, _ = camera.rays()
+    L, _, _ = integrator.sample(scene, camera.random.clone(), ray, camera.sensor.get_medium())
+    film.put("primal", to_rgb(L * importance, ray.wavelengths))
+    if features:
+        Le = emission_seen(scene, integrator, camera.sensor.get_medium(), ray, mi.Bool(True))
+        film.put("direct", to_rgb(Le * importance, ray.wavelengths))
+        film.put_all(feature_layers(scene, camera.sensor, camera.random.clone(), ray))

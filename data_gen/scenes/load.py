@@ -1,0 +1,67 @@
+"""Scenes: loaded from a Mitsuba file or built in, with errors that say what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import mitsuba as mi
+
+from data_gen.scenes.builtin import SCENES
+from ngpt.errors import NgptError
+
+
+def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
+    """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
+
+    ``size`` is (width, height) in pixels and replaces that of the scene's film, crop window included; ``parameters``
+    sets the file's ``<default>`` values. Raises NgptError with the file and Mitsuba's own complaint when it cannot.
+    """
+    parameters = parameters or {}
+    try:
+        if Path(name).is_file():
+            # Merged as Mitsuba would, shapes and emitters come in another order each time, and with them other bits.
+            scene = mi.load_file(name, optimize=False, **parameters)
+        elif name in SCENES:
+            if parameters:
+                raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
+            scene = mi.load_dict(SCENES[name](), optimize=False)
+        else:
+            raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
+    except (RuntimeError, TypeError, ValueError) as error:
+        if isinstance(error, NgptError):
+            raise
+        raise NgptError(f"{name}: Mitsuba cannot load it: {complaint(error)}") from error
+    if not isinstance(scene, mi.Scene):
+        raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")
+    if not scene.sensors():
+        raise NgptError(f"{name}: the scene has no sensor (camera)")
+    if size is not None:
+        set_film_size(scene, size)
+    return scene
+
+
+def complaint(error: Exception) -> str:
+    """What Mitsuba says is wrong with a scene, in one line, and in our words where its own do not help."""
+    text = " ".join(str(error).split())
+    if "<animation>" in text:
+        return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
+    return text
+
+
+def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
+    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels, without a crop window."""
+    sensor = scene.sensors()[0]
+    params = mi.traverse(sensor)
+    params["film.size"] = list(size)
+    params.update()
+
+
+def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
+    """The scene's own integrator, or Mitsuba's ``path`` if it has none; it decides what transport is rendered."""
+    integrator = scene.integrator() or mi.load_dict({"type": "path"})
+    if not isinstance(integrator, mi.SamplingIntegrator):
+        raise NgptError(
+            f"integrator '{integrator.class_name()}' does not trace paths from the camera, so it has no gradients; "
+            "give the scene a 'path' or 'volpath' integrator"
+        )
+    return integrator
