@@ -55,7 +55,7 @@ TOY = Sampler(
     lambda facts: [f"a note on {facts.integrator}"],
     {"shy": "does nothing"},
     rank=5,
-    batch=16,
+    batch=8,
 )
 
 

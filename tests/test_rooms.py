@@ -1,0 +1,135 @@
+"""The house: rooms stand on rooms below them, no import leads up, and none in a circle.
+
+Imports inside functions count like those at the top: what is late is quick to start, not independent.
+"""
+
+import ast
+from graphlib import CycleError, TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+# From the ground up; rooms of one line do not know each other. A name stands for a file, or a folder and all in it; the
+# longest that fits counts.
+FLOORS = """
+ngpt.errors ngpt.version
+ngpt.system
+ngpt.layers ngpt.testing
+ngpt.stack
+ngpt.repair ngpt.io
+ngpt.merging
+ngpt.classical
+ngpt.denoisers
+ngpt.network
+ngpt.methods
+ngpt.denoiser
+ngpt.report
+ngpt.measure
+ngpt.report.evaluation
+ngpt.training
+ngpt.export
+data_gen data_gen.llvm
+data_gen.scenes data_gen.scenes.procedural
+data_gen.film data_gen.paths
+data_gen.passes
+data_gen.samplers
+data_gen.backend
+data_gen.render data_gen.inspect
+data_gen.costs
+data_gen.dataset
+ngpt.evaluation
+ngpt.cli
+ngpt
+ngpt.__main__ data_gen.__main__ train eval export
+bench scripts
+"""
+
+# The only rooms of ngpt that render: commands, and what compares renderers. All others know nothing of Mitsuba.
+RENDERING = ("ngpt.cli", "ngpt.evaluation")
+
+
+def modules(root: Path) -> dict[str, Path]:
+    """Name -> file of all code but the tests'."""
+    folders = [root / name for name in ("ngpt", "data_gen", "export", "bench")]
+    files = [file for folder in folders for file in folder.rglob("*.py") if "node_modules" not in file.parts]
+    files += [root / "train.py", root / "eval.py"]
+    names = {".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): file for file in files}
+    return {name: file for name, file in names.items() if file.exists()}
+
+
+def imports(name: str, file: Path, known: dict[str, Path]) -> set[str]:
+    """The modules that a file imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(file.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            for alias in node.names:
+                inner = f"{node.module}.{alias.name}"
+                found.add(inner if inner in known else node.module)
+    return (found & known.keys()) - {name}
+
+
+def floor_of(name: str) -> tuple[int, str]:
+    """The floor and the room of a module."""
+    rooms = {room: floor for floor, line in enumerate(FLOORS.strip().splitlines()) for room in line.split()}
+    parts = name.split(".")
+    # The face of the package is a room of its own: it hands on what all others have.
+    for end in range(len(parts), 0, -1):
+        room = ".".join(parts[:end])
+        if room in rooms and (room != "ngpt" or name == "ngpt"):
+            return rooms[room], room
+    raise AssertionError(f"{name} stands in no room: give it one in FLOORS")
+
+
+def faults(graph: dict[str, set[str]]) -> list[str]:
+    """What is wrong with a house, a line each: arrows up, arrows between rooms of one floor, a circle of files."""
+    wrong = []
+    for name, targets in sorted(graph.items()):
+        floor, room = floor_of(name)
+        for target in sorted(targets):
+            below, other = floor_of(target)
+            if below > floor or (below == floor and other != room):
+                wrong.append(f"{name} imports {target}, which does not stand below it")
+            if target.startswith("data_gen") and name.startswith("ngpt") and not name.startswith(RENDERING):
+                wrong.append(f"{name} imports {target}: only commands and the evaluation may render")
+    try:
+        TopologicalSorter(graph).prepare()
+    except CycleError as error:
+        wrong.append(f"a circle: {' -> '.join(error.args[1])}")
+    return wrong
+
+
+def the_house() -> dict[str, set[str]]:
+    known = modules(ROOT)
+    return {name: imports(name, file, known) for name, file in known.items()}
+
+
+def test_every_import_leads_down():
+    assert not faults(the_house())
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "complaint"),
+    [
+        ("ngpt.io.exr", "ngpt.methods", "ngpt.io.exr imports ngpt.methods, which does not stand below it"),
+        ("ngpt.repair", "ngpt.io.exr", "ngpt.repair imports ngpt.io.exr, which does not stand below it"),
+        ("ngpt.training.trainer", "data_gen.render", "only commands and the evaluation may render"),
+        ("ngpt.io.openexr", "ngpt.io.exr", "a circle: "),
+        ("ngpt.stack", "ngpt", "ngpt.stack imports ngpt, which"),
+    ],
+)
+def test_a_wrong_import_is_found(name, target, complaint):
+    graph = the_house()
+    assert target not in graph[name]
+    graph[name] = graph[name] | {target}
+    assert any(complaint in line for line in faults(graph))
+
+
+def test_late_imports_count(tmp_path):
+    (tmp_path / "ngpt").mkdir()
+    (tmp_path / "ngpt" / "late.py").write_text("def f():\n    from ngpt import methods\n    import ngpt.stack\n")
+    known = {"ngpt": None, "ngpt.late": None, "ngpt.methods": None, "ngpt.stack": None}
+    assert imports("ngpt.late", tmp_path / "ngpt/late.py", known) == {"ngpt.methods", "ngpt.stack"}
