@@ -30,7 +30,8 @@ import numpy as np
 import ngpt
 from bench.common import measure, metadata, save, summary
 from bench.reconstruction import synthetic
-from ngpt.methods import METHODS, WEIGHTS, reconstruct
+from ngpt.methods import METHODS, reconstruct
+from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Network, planes
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -109,8 +110,8 @@ def torch_calls(data) -> dict:
         import torch
     except ModuleNotFoundError:
         return {}
+    from ngpt.network.run_torch import layers_of
     from ngpt.network.weights import load_weights
-    from ngpt.training.examples import layers_of
 
     model, _ = load_weights(WEIGHTS / "ngpt-fast.safetensors")
     layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}

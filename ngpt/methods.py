@@ -6,17 +6,14 @@ A new method is one more entry in ``METHODS``; the command line, the reports and
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.util import find_spec
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ngpt.classical import controlvariates, poisson, weighted
-from ngpt.classical.variances import auto_alpha
+from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import nfor, nlm, oidn
 from ngpt.errors import NgptError
-from ngpt.network import combine, run_onnx
+from ngpt.network.run import OPTIONS, Shipped
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 
@@ -61,115 +58,46 @@ def _primal(data: Repaired) -> np.ndarray:
     return data.image
 
 
-def _l2(data: Repaired, alpha: float | str) -> np.ndarray:
-    return poisson.l2(data.image, data.dx, data.dy, _alpha(data, alpha, norm=2), data.trusted)
-
-
-def _l1(data: Repaired, alpha: float | str) -> np.ndarray:
-    return poisson.l1(data.image, data.dx, data.dy, _alpha(data, alpha, norm=1), data.trusted)
-
-
-def _cv(data: Repaired) -> np.ndarray:
-    return controlvariates.cv(data.image, data.dx, data.dy, data.trusted)
-
-
 def _nfor(data: Repaired) -> np.ndarray:
     assert data.noise is not None
     return nfor.nfor(data.image, data.noise, [data.features[name] for name in _FEATURES])
 
 
-def _with_variances(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
-    return lambda data: solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
+def _classical(name: str, summary: str) -> Method:
+    entry = CLASSICAL[name]
+    return Method(summary, entry.needs, entry.solve, entry.options)
 
 
-def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
-    """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
-    if not isinstance(alpha, str):
-        return alpha
-    if alpha != "auto":
-        raise NgptError(f"alpha '{alpha}': must be a number, or 'auto' to derive it from the variances")
-    if data.variances is None:
-        return poisson.DEFAULT_ALPHA
-    primal_var, dx_var, dy_var = data.variances
-    return auto_alpha(primal_var, dx_var, dy_var, norm)
+def _network(name: str, summary: str, needs: tuple[str, ...], also_missing: Callable[[], str] = lambda: "") -> Method:
+    network = Shipped(name, also_missing)
+    return Method(summary, needs, network.run, OPTIONS, network.missing)
 
 
-def _neural(name: str, also_missing: Callable[[], str] = lambda: "") -> dict[str, Any]:
-    """What the entries of all networks share; they take the network of that name in the package, or a file.
-
-    A .onnx runs in ONNX Runtime, .safetensors in PyTorch, each on the devices it has. ``also_missing`` is asked for
-    what else the method cannot do without.
-    """
-    shipped = WEIGHTS / f"{name}.onnx"
-
-    def missing() -> str:
-        if find_spec("onnxruntime") is None:
-            return "ONNX Runtime is not installed: pip install onnxruntime"
-        if not shipped.is_file():
-            return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
-        return also_missing()
-
-    def run(data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
-        path = Path(weights or shipped)
-        if path.suffix == ".safetensors":
-            if find_spec("torch") is None or find_spec("safetensors") is None:
-                raise NgptError(f"method '{name}': {path.name} needs PyTorch: pip install 'ngpt-recon[train]'")
-            # torch takes seconds to come in.
-            from ngpt.network import run_torch
-
-            return run_torch.run(data, path, device)
-        return _by_onnx(data, path, device, memory)
-
-    return {"run": run, "options": {"weights": "", "device": "auto", "memory": run_onnx.MEMORY}, "missing": missing}
-
-
-def _by_onnx(data: Repaired, path: Path, device: str, memory: int) -> np.ndarray:
-    network = run_onnx.Network(path, device)
-    layers = {"primal": data.image, **data.features, **data.known_variances()}
-    if data.dx is not None:
-        layers |= {"dx": data.dx, "dy": data.dy}
-    if lacking := [name for name in network.needs if name not in layers]:
-        raise NgptError(f"weights {path} need layers {', '.join(lacking)}, which the stack lacks")
-    # NumPy does these sweeps several times faster than the graph would.
-    base = METHODS[network.base].run(data, **METHODS[network.base].options) if network.base else None
-    layers |= combine.images(data, base, network.inputs)
-    return network.reconstruct(layers, base, memory=memory)
-
-
-WEIGHTS = Path(__file__).parent / "weights"
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 METHODS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
-    # The derived alpha lowers the error of l2 by half, and is no better than the fixed one for l1.
-    "l2": Method("screened Poisson, least squares: unbiased, fast", _GRADIENTS, _l2, {"alpha": "auto"}),
-    "l1": Method(
-        "screened Poisson, least norms: robust to outliers", _GRADIENTS, _l1, {"alpha": poisson.DEFAULT_ALPHA}
-    ),
-    "cv": Method("uniform control variates: close to l2, unbiased", _GRADIENTS, _cv, {}),
-    "wcv": Method(
-        "control variates weighted by variance: the best of these",
-        (*_GRADIENTS, *_VARIANCES),
-        _with_variances(controlvariates.wcv),
-        {},
-    ),
-    "wl2": Method("least squares weighted by variance", (*_GRADIENTS, *_VARIANCES), _with_variances(weighted.wl2), {}),
-    "ngpt-fast": Method(
-        "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES), **_neural("ngpt-fast")
-    ),
-    "ngpt-combine": Method(
+    "l2": _classical("l2", "screened Poisson, least squares: unbiased, fast"),
+    "l1": _classical("l1", "screened Poisson, least norms: robust to outliers"),
+    "cv": _classical("cv", "uniform control variates: close to l2, unbiased"),
+    "wcv": _classical("wcv", "control variates weighted by variance: the best of these"),
+    "wl2": _classical("wl2", "least squares weighted by variance"),
+    "ngpt-fast": _network("ngpt-fast", "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES)),
+    "ngpt-combine": _network(
+        "ngpt-combine",
         "OIDN's images and the gradients, weighed and corrected by a small network",
         (*_GRADIENTS, *_FEATURES, *_VARIANCES),
-        **_neural("ngpt-combine", oidn.missing),
+        oidn.missing,
     ),
-    "ngpt-primal": Method(
+    "ngpt-primal": _network(
+        "ngpt-primal",
         "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
         ("primal", *_FEATURES, "primal_var"),
-        **_neural("ngpt-primal", oidn.missing),
+        oidn.missing,
     ),
-    "ngpt": Method("neural network of the paper's size", (*_GRADIENTS, *_FEATURES), **_neural("ngpt")),
+    "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES)),
     # Those below see no gradients.
     "nlm": Method(
         "peer: joint non-local means of scikit-image",

@@ -7,7 +7,7 @@
     depth        1   over the image's largest, [0, 1]; 0 where the path escapes
     base         3   as primal: a classical reconstruction the network starts from
     denoised, denoised_base
-                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.network.combine``
+                 3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.network.inputs``
     primal_se, dx_se, dy_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
@@ -32,8 +32,8 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
-from ngpt.network import combine
 from ngpt.network.exposure import BLOCK, KEY
+from ngpt.network.inputs import DENOISED, MADE
 from ngpt.network.transfer import signed_log
 
 CHANNELS = {
@@ -66,15 +66,12 @@ CHANNELS = {
 # What is computed of other layers: of which, beside ``compared``.
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
-    **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *combine.IMAGES)},
+    **{f"{axis}_{name}": (axis, name) for axis in ("dx", "dy") for name in ("base", *DENOISED)},
     **{f"{name}_noise": (f"{name}_se",) for name in ("primal", "dx", "dy")},
 }
 
 # The layers that grow with the light of the scene.
 RADIANCE = frozenset({"primal", "dx", "dy", "base", "denoised", "denoised_base", "primal_se", "dx_se", "dy_se"})
-
-# Those that are no layers of a stack, but made of them.
-MADE = ("base", *combine.IMAGES)
 
 # Those that are images of the scene: what a network may start from.
 IMAGES = ("primal", *MADE)

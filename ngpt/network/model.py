@@ -9,14 +9,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d
 
+from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import features, padding
+from ngpt.network import features, inputs, padding
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import DenseUNet, PlainUNet
 
 NETWORKS = ("dense", "plain")
-# The classical reconstructions a network can start from: those that cost less than itself.
-BASES = ("l2", "cv", "wcv")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
@@ -98,23 +97,13 @@ class ModelConfig:
 
     @property
     def layers(self) -> tuple[str, ...]:
-        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.training.examples``)."""
+        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.inputs``)."""
         return features.sources(self.inputs)
 
     @property
     def needs(self) -> tuple[str, ...]:
         """The layers a stack must hold, by the names of the contract."""
-        names = {"primal"}
-        for name in self.layers:
-            names |= {name.replace("_se", "_var")} - set(features.MADE)
-        if {"denoised", "denoised_base"} & set(self.layers):
-            names |= {"albedo", "normal"}
-        if self.base:
-            names |= {"dx", "dy"}
-        if self.base == "wcv":
-            names |= {"primal_var", "dx_var", "dy_var"}
-        order = ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var")
-        return tuple(name for name in order if name in names)
+        return inputs.needs(self.layers, self.base)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as TOML and JSON have them."""

@@ -15,14 +15,12 @@ from pathlib import Path
 
 import numpy as np
 
+from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import combine
 from ngpt.network.exposure import statistics
 
 # MiB that the network may use beside the image's own layers.
 MEMORY = 2048
-# What a network may start from, "" for nothing.
-BASES = ("", "l2", "cv", "wcv")
 DEVICES = {
     "cpu": "CPUExecutionProvider",
     "cuda": "CUDAExecutionProvider",
@@ -75,7 +73,7 @@ class Network:
         for name, value, most in (("alignment", self.alignment, 2**12), ("overlap", self.overlap, 2**12)):
             if not (name == "overlap" or value) or not 0 <= value <= most:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
-        if self.bytes < 1 or self.base not in BASES:
+        if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
         own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}
@@ -86,11 +84,6 @@ class Network:
                 f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, its metadata tell of "
                 f"{', '.join(sorted(own))}; export it anew"
             )
-
-    @property
-    def needs(self) -> tuple[str, ...]:
-        """The layers of a stack that its inputs are, or are made of."""
-        return tuple(name for name in self.inputs if name not in combine.IMAGES)
 
     def reconstruct(
         self,

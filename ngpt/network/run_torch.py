@@ -10,12 +10,11 @@ import torch
 from torch import Tensor
 
 from ngpt.errors import NgptError
-from ngpt.network import features, padding
-from ngpt.network.model import Reconstructor
+from ngpt.network import features, inputs, padding
+from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.network.weights import load_weights
 from ngpt.repair import Repaired
-from ngpt.training.examples import layers_of
 
 # Padded pixels of a tile's side. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
 TILE = 640
@@ -28,14 +27,14 @@ def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE
     their size does not change the result. Raises NgptError for weights that cannot be read, and layers they need.
     """
     model = _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
-    held = {"primal", *data.features}
-    held |= {"dx", "dy"} if data.dx is not None else set()
-    held |= data.known_variances().keys()
-    missing = [name for name in model.config.needs if name not in held]
-    if missing:
-        raise NgptError(f"weights {path} need layers {', '.join(missing)}, which the stack lacks")
-    layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
+    layers = {name: layer[None] for name, layer in layers_of(data, model.config, f"weights {path}").items()}
     return reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
+
+
+def layers_of(data: Repaired, config: ModelConfig, reader: str = "the network's settings") -> dict[str, Tensor]:
+    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); see ``inputs.gather``."""
+    arrays = inputs.gather(data, config.layers, config.base, reader)
+    return {name: torch.from_numpy(np.array(array.transpose(2, 0, 1), order="C")) for name, array in arrays.items()}
 
 
 @torch.inference_mode()

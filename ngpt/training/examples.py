@@ -10,10 +10,10 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import read
-from ngpt.methods import METHODS
-from ngpt.network import combine, features, padding
+from ngpt.network import features, padding
 from ngpt.network.model import ModelConfig
-from ngpt.repair import Repaired, repair
+from ngpt.network.run_torch import layers_of
+from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter
 
@@ -105,27 +105,6 @@ def open_crops(folder: str | Path) -> Iterable[Any]:
 
         return Dataset(path)
     return StackFolder(path)
-
-
-def layers_of(data: Repaired, config: ModelConfig) -> Layers:
-    """What a network of that configuration reads of a repaired stack, as tensors (C, H, W)."""
-    arrays: dict[str, np.ndarray] = {"primal": data.image, **data.features}
-    if data.dx is not None:
-        arrays |= {"dx": data.dx, "dy": data.dy}
-    for name, variance in data.known_variances().items():
-        # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
-        arrays[name.replace("_var", "_se")] = np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))
-    if config.base:
-        arrays["base"] = base_image(data, config)
-    arrays |= combine.images(data, arrays.get("base"), config.layers)
-    return {name: torch.from_numpy(np.array(arrays[name].transpose(2, 0, 1), order="C")) for name in config.layers}
-
-
-def base_image(data: Repaired, config: ModelConfig) -> np.ndarray:
-    """The reconstruction the network starts from, (H, W, 3), without direct emission."""
-    method = METHODS[config.base]
-    with np.errstate(over="ignore", invalid="ignore"):
-        return method.run(data, **method.options).astype(np.float32, copy=False)
 
 
 class Mixture(Sequence[Any]):

@@ -9,12 +9,13 @@ import numpy as np
 import torch
 
 from ngpt.measure.metrics import relmse_trimmed
+from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
+from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.files import atomic_output
-from ngpt.training.examples import base_image, layers_of
 
 # Rows of the picture of a validation.
 _PICTURES = 6
@@ -59,7 +60,7 @@ def validate(
         primal.append(relmse_trimmed(data.image, reference))
         network.append(relmse_trimmed(image, reference))
         if model.config.base:
-            base.append(relmse_trimmed(base_image(data, model.config), reference))
+            base.append(relmse_trimmed(base_image(data, model.config.base), reference))
         if picture and index in shown:
             stops = auto_exposure(reference)
             rows.append(np.hstack([to_srgb8(i, stops) for i in (data.image, image, reference)]))

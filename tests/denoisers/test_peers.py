@@ -13,7 +13,7 @@ from ngpt.denoisers import nlm, oidn
 from ngpt.denoisers.nfor import nfor
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, reconstruct
-from ngpt.network import combine
+from ngpt.network import inputs
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -150,8 +150,8 @@ def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
     """As `--method oidn` has them, though the features are filtered once for both."""
     data = repair(full_stack(40, 50))
     base = 0.9 * data.image
-    images = combine.images(data, base, combine.IMAGES)
+    images = inputs.denoised(data, base, inputs.DENOISED)
     for name, image in (("denoised", data.image), ("denoised_base", base)):
         expected = oidn.oidn(replace(data, image=image), "prefiltered", "high")
         assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
-    assert combine.images(data, base, ("primal",)) == {} == combine.images(data, None, ("denoised_base",))
+    assert inputs.denoised(data, base, ("primal",)) == {} == inputs.denoised(data, None, ("denoised_base",))

@@ -20,11 +20,12 @@ from export.__main__ import main
 from ngpt.errors import NgptError
 from ngpt.export.network import network_model, overlap, statistics_model
 from ngpt.export.vector import example_layers, quiet
-from ngpt.methods import WEIGHTS, reconstruct
-from ngpt.network import combine
+from ngpt.methods import reconstruct
+from ngpt.network import inputs
 from ngpt.network.exposure import statistics
 from ngpt.network.features import SOURCES, exposure
 from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.run import WEIGHTS
 from ngpt.network.weights import load_weights, save_weights
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -114,11 +115,11 @@ def pair(request, weights):
 @pytest.fixture
 def other_denoiser(monkeypatch):
     """In OIDN's place, which is not everywhere: a blur. Returns the images a combiner is given of it."""
-    monkeypatch.setattr(combine, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
+    monkeypatch.setattr(inputs, "oidn", lambda data, *_: uniform_filter(data.image, (3, 3, 1)))
 
     def images(layers):
         data = repair(stack_of(layers))
-        made = combine.images(data, reconstruct(stack_of(layers), "wcv").image, combine.IMAGES)
+        made = inputs.denoised(data, reconstruct(stack_of(layers), "wcv").image, inputs.DENOISED)
         return {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in made.items()}
 
     return images

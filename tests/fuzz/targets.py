@@ -21,7 +21,8 @@ from full_stack import full_stack
 import ngpt
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, write
-from ngpt.methods import WEIGHTS, reconstruct
+from ngpt.methods import reconstruct
+from ngpt.network.run import WEIGHTS
 
 CONFIGS = Path(__file__).resolve().parents[2] / "configs"
 

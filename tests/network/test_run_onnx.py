@@ -10,7 +10,8 @@ import pytest
 from full_stack import full_layers, full_stack
 
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS, WEIGHTS, reconstruct
+from ngpt.methods import METHODS, reconstruct
+from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Cancelled, Network
 from ngpt.stack import GradientStack
 

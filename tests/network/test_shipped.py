@@ -7,7 +7,8 @@ import torch
 import ngpt
 from ngpt.classical.gradients import forward_differences
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.methods import METHODS, WEIGHTS
+from ngpt.methods import METHODS
+from ngpt.network.run import WEIGHTS
 from ngpt.network.weights import load_weights
 
 SHIPPED = [
@@ -95,8 +96,8 @@ def test_sizes_and_extremes(name, size, value):
 @pytest.mark.parametrize("name", SHIPPED)
 def test_sixteen_bits_cost_little(views, name):
     """Of the body; the error of the image, where it matters most to a user."""
+    from ngpt.network.run_torch import layers_of
     from ngpt.repair import repair
-    from ngpt.training.examples import layers_of
 
     stack, reference = views["lens"]
     model, _ = load_weights(WEIGHTS / f"{name}.safetensors")

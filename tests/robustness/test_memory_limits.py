@@ -12,8 +12,8 @@ from reliability import record
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.methods import WEIGHTS
 from ngpt.network import run_onnx
+from ngpt.network.run import WEIGHTS
 from ngpt.network.run_onnx import Network
 
 FAST = WEIGHTS / "ngpt-fast.onnx"

@@ -1,0 +1,100 @@
+"""What a network may read, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
+
+    primal, dx, dy, albedo, normal, depth      layers of the stack
+    primal_var, dx_var, dy_var                 variances of its layers, NaN where not known (ONNX graphs read these)
+    primal_se, dx_se, dy_se                    standard errors, their roots, 0 where not known (PyTorch reads these)
+    base                                       a classical reconstruction of ``ngpt.classical.bases``
+    denoised, denoised_base                    OIDN's images of the primal and of the base
+
+OIDN sees no gradients, and removes what it takes for noise; control variates keep every gradient, and their noise.
+OIDN's image of the control variates has less noise to remove, so that it errs elsewhere than its image of the primal. A
+network that sees all three, and the gradients, tells in each pixel whom to believe [after Back et al. 2020, "Deep
+Combiner for Independent and Correlated Pixel Estimates", with a denoiser's image of the correlated estimate for a
+kernel].
+"""
+
+from collections.abc import Collection
+from dataclasses import replace
+
+import numpy as np
+
+from ngpt.classical.bases import BASES
+from ngpt.denoisers.oidn import oidn, prefiltered
+from ngpt.errors import NgptError
+from ngpt.repair import Repaired
+
+# The layers of a stack that networks know, in the order in which they are listed.
+LAYERS = ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var")
+
+# Images made by another denoiser: of the primal, and of the base.
+DENOISED = ("denoised", "denoised_base")
+
+# The inputs that are no layers of a stack, but made of them.
+MADE = ("base", *DENOISED)
+
+
+def needs(names: Collection[str], base: str) -> tuple[str, ...]:
+    """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
+
+    Names that no stack has come last, and so does "base" where an input is made of it and there is none.
+    """
+    wanted = {"primal"} | {_layer(name) for name in names if name not in MADE}
+    if set(DENOISED) & set(names):
+        wanted |= {"albedo", "normal"}
+    if base:
+        wanted |= set(BASES[base].needs)
+    elif {"base", "denoised_base"} & set(names):
+        wanted |= {"base"}
+    return tuple(name for name in LAYERS if name in wanted) + tuple(sorted(wanted - set(LAYERS)))
+
+
+def gather(data: Repaired, names: Collection[str], base: str, reader: str = "the network's settings") -> dict:
+    """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
+
+    Radiance is without direct emission. Raises NgptError where the stack lacks layers they are made of (``reader`` is
+    what the message says needs them), and where OIDN is needed and not installed.
+    """
+    held = {"primal": data.image, **data.features, **data.known_variances()}
+    if data.dx is not None:
+        held |= {"dx": data.dx, "dy": data.dy}
+    if lacking := [name for name in needs(names, base) if name not in held]:
+        raise NgptError(f"{reader} need layers {', '.join(lacking)}, which the stack lacks")
+    made = {name: _standard_error(held[_layer(name)]) for name in names if name.endswith("_se")}
+    if {"base", "denoised_base"} & set(names):
+        made["base"] = base_image(data, base)
+    arrays = held | made | denoised(data, made.get("base"), names)
+    return {name: arrays[name] for name in names}
+
+
+def base_image(data: Repaired, base: str) -> np.ndarray:
+    """The reconstruction a network starts from, (H, W, 3) float32, without direct emission."""
+    # Extreme values may leave the range of float32 inside.
+    with np.errstate(over="ignore", invalid="ignore"):
+        return BASES[base](data).astype(np.float32, copy=False)
+
+
+def denoised(data: Repaired, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
+    """Those of ``DENOISED`` that are among ``names`` and have a source: (H, W, 3) without direct emission.
+
+    Raises NgptError where OIDN is not installed.
+    """
+    sources = dict(zip(DENOISED, (data.image, base), strict=True))
+    if not sources.keys() & set(names):
+        return {}
+    # Once for both images: this is most of the time.
+    data = replace(data, features=data.features | prefiltered(data.features))
+    return {
+        name: oidn(replace(data, image=np.ascontiguousarray(image, np.float32)), "clean", "high")
+        for name, image in sources.items()
+        if name in names and image is not None
+    }
+
+
+def _layer(name: str) -> str:
+    """The layer of a stack that an input is, or is the root of."""
+    return name.replace("_se", "_var")
+
+
+def _standard_error(variance: np.ndarray) -> np.ndarray:
+    # What is not known is where an emitter is seen: the rest of that pixel hardly matters.
+    return np.sqrt(np.nan_to_num(np.maximum(variance, 0), nan=0, posinf=0))

@@ -1,0 +1,62 @@
+"""The networks that come with the package, as reconstructions of a repaired stack."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.network import inputs, run_onnx
+from ngpt.repair import Repaired
+
+WEIGHTS = Path(__file__).parents[1] / "weights"
+
+# The options of all networks, with their defaults.
+OPTIONS: dict[str, Any] = {"weights": "", "device": "auto", "memory": run_onnx.MEMORY}
+
+
+@dataclass(frozen=True)
+class Shipped:
+    """The network of that name in the package, or a file in its place.
+
+    ``also_missing``  says what else it cannot do without, and this machine lacks; "" for nothing
+    """
+
+    name: str
+    also_missing: Callable[[], str] = lambda: ""
+
+    @property
+    def path(self) -> Path:
+        return WEIGHTS / f"{self.name}.onnx"
+
+    def missing(self) -> str:
+        """Why it cannot be used here, "" if it can."""
+        if find_spec("onnxruntime") is None:
+            return "ONNX Runtime is not installed: pip install onnxruntime"
+        if not self.path.is_file():
+            return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
+        return self.also_missing()
+
+    def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
+        """The image (H, W, 3) float32, scene-linear, without direct emission.
+
+        ``weights``  a file instead of the shipped one: .onnx runs in ONNX Runtime, .safetensors in PyTorch
+        ``device``   one of the runtime's, or "auto"
+        ``memory``   MiB that tiles may take (ONNX Runtime)
+        """
+        path = Path(weights or self.path)
+        if path.suffix != ".safetensors":
+            network = run_onnx.Network(path, device)
+            # NumPy makes the base several times faster than the graph would.
+            names = (*network.inputs, "base") if network.base else network.inputs
+            layers = inputs.gather(data, names, network.base, f"weights {path}")
+            return network.reconstruct(layers, memory=memory)
+        if find_spec("torch") is None or find_spec("safetensors") is None:
+            raise NgptError(f"method '{self.name}': {path.name} needs PyTorch: pip install 'ngpt-recon[train]'")
+        # torch takes seconds to come in.
+        from ngpt.network import run_torch
+
+        return run_torch.run(data, path, device)
