@@ -1,22 +1,10 @@
 """Transfer functions: between radiance, of any magnitude, and the range that networks and losses are good at.
 
-Each is a pair, ``forward`` and its exact inverse, elementwise on tensors of any shape.
+All are elementwise, on tensors of any shape, and odd: f(-x) = -f(x).
 """
-
-from collections.abc import Callable
-from dataclasses import dataclass
 
 import torch
 from torch import Tensor
-
-
-@dataclass(frozen=True)
-class Transfer:
-    """A transfer function and its inverse; ``inverse(forward(x)) == x`` for x in the ``domain``."""
-
-    forward: Callable[[Tensor], Tensor]
-    inverse: Callable[[Tensor], Tensor]
-    domain: str
 
 
 def signed_log(x: Tensor) -> Tensor:
@@ -40,26 +28,3 @@ def srgb(x: Tensor) -> Tensor:
     # The power has an infinite slope at 0, which would reach the other branch's gradient as 0 * inf.
     curve = 1.055 * torch.clamp(a, min=0.0031308) ** (1 / 2.4) - 0.055
     return torch.where(a <= 0.0031308, 12.92 * x, torch.sign(x) * curve)
-
-
-def inverse_srgb(y: Tensor) -> Tensor:
-    """The inverse of ``srgb``."""
-    a = torch.abs(y)
-    return torch.sign(y) * torch.where(a <= 12.92 * 0.0031308, a / 12.92, ((a + 0.055) / 1.055) ** 2.4)
-
-
-def reinhard(x: Tensor) -> Tensor:
-    """x / (1 + |x|) for each channel: all of the reals to (-1, 1)."""
-    return x / (1 + torch.abs(x))
-
-
-def inverse_reinhard(y: Tensor) -> Tensor:
-    """y / (1 - |y|), the inverse of ``reinhard``; |y| < 1."""
-    return y / (1 - torch.abs(y))
-
-
-TRANSFERS = {
-    "signed-log": Transfer(signed_log, signed_exp, "all reals"),
-    "srgb": Transfer(srgb, inverse_srgb, "all reals, made for [0, 1]"),
-    "reinhard": Transfer(reinhard, inverse_reinhard, "all reals"),
-}
