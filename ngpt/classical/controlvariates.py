@@ -55,11 +55,16 @@ def wcv(
     """
     equations = Equations(primal, dx, dy, trusted)
     variances = smooth_variances(primal_var, dx_var, dy_var, trusted)
-    decay, factors = 1.0, []
+    return _sweep(equations, *variances, decay(sweeps))
+
+
+def decay(sweeps: int) -> list[float]:
+    """f_n for the iterations n = 0 .. sweeps - 1, the factors of the primal's variance."""
+    f, factors = 1.0, []
     for n in range(sweeps):
-        decay /= 1.01 + 4 * 0.5**n
-        factors.append(decay)
-    return _sweep(equations, *variances, factors)
+        f /= 1.01 + 4 * 0.5**n
+        factors.append(f)
+    return factors
 
 
 def _sweep(equations: Equations, primal_var: Array, difference_var: Array, factors: list[float]) -> Array:

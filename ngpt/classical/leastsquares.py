@@ -16,6 +16,9 @@ from ngpt.errors import NgptError
 # over the other: such inputs are solved in double precision.
 FLOAT32_RANGE = 2.0**16
 
+# How many times the mean a value counts at most, see ``robust_mean``.
+CLIP = 100
+
 
 class Equations:
     """The right-hand sides as planes (C, H, W), in double precision where their range asks for it.
@@ -236,13 +239,13 @@ def total_of(bands: list) -> float:
 
 
 def robust_mean(values: Array) -> float:
-    """The mean of values >= 0 when none counts as more than a hundred times this mean.
+    """The mean of values >= 0 when none counts as more than ``CLIP`` times this mean.
 
     Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
     """
     mean = math.inf
     while True:
-        clipped = float(values.clip(None, 100 * mean).mean(dtype=module(values).float64)) if values.shape[-1] else 0.0
+        clipped = float(values.clip(None, CLIP * mean).mean(dtype=module(values).float64)) if values.shape[-1] else 0.0
         if not clipped < 0.5 * mean:
             return clipped
         mean = clipped

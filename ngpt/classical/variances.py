@@ -17,6 +17,9 @@ from ngpt.classical.leastsquares import robust_mean
 # What is added to every variance, as a share of the mean over primal and differences.
 FLOOR = 1e-3
 
+# What a count of values that are there, a mean, is divided by at least.
+FEW = 1e-9
+
 # Share of the largest variances that do not count for α.
 OUTLIERS = 1e-4
 
@@ -94,7 +97,7 @@ def _smoothed(variance: Array, good: Array) -> Array:
     mean = float(variance.sum()) / max(float(count.sum()), 1)
     for _ in range(2):
         variance, count = _box(variance), _box(count)
-    return module(variance).where(count > 0, variance / count.clip(1e-9, None), mean)
+    return module(variance).where(count > 0, variance / count.clip(FEW, None), mean)
 
 
 def _box(values: Array) -> Array:

@@ -7,15 +7,15 @@ from functools import partial
 from pathlib import Path
 
 import onnx
-import onnx.compose
 import torch
 
 from ngpt.classical.controlvariates import SWEEPS
 from ngpt.errors import NgptError
-from ngpt.export import stages
-from ngpt.export.text import IR_VERSION, OPSET, finish, parse
+from ngpt.export.builder import IR_VERSION, OPSET
+from ngpt.export.graphs.exposure import STATISTICS
+from ngpt.export.graphs.model import layers, reconstruction, statistics
 from ngpt.network import features
-from ngpt.network.model import WINDOW, Reconstructor
+from ngpt.network.model import Reconstructor
 from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
 from ngpt.version import __version__
@@ -32,32 +32,23 @@ def network_model(weights: str | Path, name: str, precision: str = "float32") ->
     Raises NgptError for weights that cannot be read, and for those that start from a base that has no graph.
     """
     model, header = _load(weights)
-    config = model.config
-    text = stages.before(config).replace("$ALIGNMENT", str(model.alignment))
-    before = parse(text, stages.FUNCTIONS + stages.CONTROL_VARIATES)
-    passed_on = [output.name for output in before.graph.output if output.name != "channels"]
-    body = onnx.compose.add_prefix(network_body(model, precision), "network/")
-    after = onnx.compose.add_prefix(parse(stages.after(config), stages.FUNCTIONS), "after/", rename_outputs=False)
-    model_proto = onnx.compose.merge_models(before, body, [("channels", "network/channels")])
-    links = [("network/prediction", "after/prediction"), *((name, f"after/{name}") for name in passed_on)]
-    model_proto = onnx.compose.merge_models(model_proto, after, links, name="reconstruction")
-    return finish(model_proto, metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))})
+    tell = metadata(model, name, precision) | {"training": json.dumps(header.get("training", {}))}
+    return reconstruction(model.config, model.alignment, network_body(model, precision)).model(tell)
 
 
 def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
     """The graph that tells what the tiles of an image share, for the model of these weights."""
     model, _ = _load(weights)
-    graph = parse(stages.alone(model.config), stages.FUNCTIONS)
-    return finish(graph, {"version": __version__, "method": name, "statistics": ", ".join(stages.STATISTICS)})
+    tell = {"version": __version__, "method": name, "statistics": ", ".join(STATISTICS)}
+    return statistics(model.config).model(tell)
 
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
-    inputs = stages.layers(model.config)
     return {
         "version": __version__,
         "method": name,
-        "inputs": ", ".join(inputs),
+        "inputs": ", ".join(layers(model.config)),
         "layout": "NCHW, float32, row 0 on top, scene-linear",
         "gradient": "forward: dx[y, x] = I[y, x + 1] - I[y, x], last column 0; dy alike",
         "normal": "camera space, +x right, +y up, +z toward the viewer",
@@ -65,7 +56,7 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
         "overlap": str(overlap(model)),
         "overlap with base": str(overlap(model, given_base=True)),
         "bytes per pixel": str(bytes_per_pixel(model)),
-        "statistics": ", ".join(stages.STATISTICS),
+        "statistics": ", ".join(STATISTICS),
         "precision": precision,
         "base": model.config.base,
     }
@@ -76,7 +67,7 @@ def overlap(model: Reconstructor, given_base: bool = False) -> int:
 
     What the network sees, and before it what the control variates and the smoothing of their weights do.
     """
-    reach = max(model.network.radius, WINDOW // 2 if model.config.quiet else 0)
+    reach = model.radius
     if model.config.base and not given_base:
         reach += SWEEPS + 2
     return -(-reach // model.alignment) * model.alignment

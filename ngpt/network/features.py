@@ -63,6 +63,9 @@ CHANNELS = {
     "dy_noise": 1,
 }
 
+# What differences to an image, and relative noise, are enlarged by; what is added to depth before division.
+ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
+
 # What is computed of other layers: of which, beside ``compared``.
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
@@ -124,9 +127,9 @@ def _encoded(name: str, layer: Tensor) -> Tensor:
     if name in ("dx", "dy"):
         return signed_log(layer)
     if name.endswith("_noise"):
-        return torch.log1p(100 * layer)
+        return torch.log1p(NOISE_ENLARGED * layer)
     if name in SOURCES:
-        return signed_log(20 * layer)
+        return signed_log(ENLARGED * layer)
     if name.endswith("_se"):
         return torch.log1p(torch.mean(layer, 1, keepdim=True))
     return layer
@@ -157,5 +160,5 @@ def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]
     for name in RADIANCE & result.keys():
         result[name] = result[name] / scale
     if "depth" in result:
-        result["depth"] = result["depth"] / (1e-10 + torch.amax(result["depth"], (1, 2, 3), keepdim=True))
+        result["depth"] = result["depth"] / (LEAST_DEPTH + torch.amax(result["depth"], (1, 2, 3), keepdim=True))
     return result, scale

@@ -12,12 +12,15 @@ from torch.nn.functional import avg_pool2d
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network import features, inputs, padding
+from ngpt.network.heads import Head, head_of
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import DenseUNet, PlainUNet
 
 NETWORKS = ("dense", "plain")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
+# Kernels reach no further than the padding.
+MAX_KERNEL = 2 * padding.MARGIN + 1
 # Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
 # too little; what is added to radiance before noise is divided by it; the largest number whose square is no overflow.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
@@ -38,6 +41,8 @@ class ModelConfig:
     ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
+    ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
+                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel
     """
 
     network: str
@@ -47,6 +52,7 @@ class ModelConfig:
     base: str = ""
     start: tuple[str, ...] = ()
     quiet: float = 0.0
+    kernel: int = 0
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
@@ -81,7 +87,10 @@ class ModelConfig:
                 raise NgptError(
                     f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
                 )
-
+        if type(self.kernel) is not int or self.kernel not in (0, *range(1, MAX_KERNEL + 1, 2)):
+            raise NgptError(f"kernel = {self.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
+        if self.kernel and not self.start:
+            raise NgptError(f"kernel = {self.kernel}: there is no image to average; give a base, or start")
         if not isinstance(self.quiet, int | float) or isinstance(self.quiet, bool) or not 0 <= self.quiet < math.inf:
             raise NgptError(f"quiet = {self.quiet!r}: must be a finite relative standard error, 0 for none")
         if self.quiet and not {"base", "primal_se"} <= set(self.layers):
@@ -91,9 +100,9 @@ class ModelConfig:
             )
 
     @property
-    def outputs(self) -> int:
-        """Channels the network predicts: RGB, and the logits of weights where there is a choice."""
-        return 3 + (len(self.start) if len(self.start) > 1 else 0)
+    def head(self) -> Head:
+        """What makes an image of the network's prediction."""
+        return head_of(self.start, self.kernel)
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -117,7 +126,7 @@ def _whole(numbers: tuple[Any, ...], most: int) -> bool:
 class Reconstructor(nn.Module):
     """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear, without direct emission.
 
-        exposure, depth scale -> padding -> channels -> network -> (+ log of the start) -> exp -> crop -> exposure
+        exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 
     Any H and W. Proportional to the exposure: what goes in ``k`` times as bright comes out ``k`` times as bright. The
     result is bounded by the range of the primal, and 0. Layers hold finite values; see ``ModelConfig.inputs``.
@@ -126,17 +135,22 @@ class Reconstructor(nn.Module):
     def __init__(self, config: ModelConfig):
         super().__init__()
         self.config = config
-        inputs, correction = features.channels(config.inputs), bool(config.start)
+        channels, head = features.channels(config.inputs), config.head
         self.network = (
-            DenseUNet(inputs, config.channels, config.units, config.outputs, zero=correction)
+            DenseUNet(channels, config.channels, config.units, head.outputs, zero=head.neutral)
             if config.network == "dense"
-            else PlainUNet(inputs, config.channels, config.outputs, zero=correction)
+            else PlainUNet(channels, config.channels, head.outputs, zero=head.neutral)
         )
 
     @property
     def alignment(self) -> int:
         """What both sides of the padded image are divisible by."""
         return self.network.alignment
+
+    @property
+    def radius(self) -> int:
+        """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
+        return max(self.network.radius, self.config.head.radius, WINDOW // 2 if self.config.quiet else 0)
 
     def forward(self, layers: Mapping[str, Tensor]) -> Tensor:
         height, width = layers["primal"].shape[-2:]
@@ -152,15 +166,8 @@ class Reconstructor(nn.Module):
         # Channels last is the layout convolutions are fastest in, by half on CPUs.
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
         prediction = self.network(x).float()
-        if not self.config.start:
-            return prediction
-        images = [scaled[name] for name in self.config.start]
-        if len(images) == 1:
-            result = prediction + signed_log(images[0])
-        else:
-            weights = torch.softmax(prediction[:, 3:], 1)
-            mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
-            result = prediction[:, :3] + signed_log(mean)
+        head = self.config.head
+        result = head.forward(prediction, [padding.extended(scaled[name], head.radius) for name in head.start])
         if not self.config.quiet:
             return result
         base = signed_log(scaled["base"])

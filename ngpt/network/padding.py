@@ -4,6 +4,7 @@ from collections.abc import Mapping
 
 import torch
 from torch import Tensor
+from torch.nn.functional import pad as replicated
 
 # Pixels added on every side at least, so that borders look like the inside of an image [NGPT's code].
 MARGIN = 8
@@ -47,6 +48,12 @@ def crop(image: Tensor, pads: Pads) -> Tensor:
     """What ``pad`` was given, back from (..., H + top + bottom, W + left + right)."""
     top, bottom, left, right = pads
     return image[..., top : image.shape[-2] - bottom, left : image.shape[-1] - right]
+
+
+def extended(image: Tensor, radius: int) -> Tensor:
+    """(N, C, H, W) padded already, with ``radius`` more pixels on every side. What they hold is for pixels that
+    ``crop`` takes away."""
+    return replicated(image, 4 * (radius,), "replicate") if radius else image
 
 
 def _mirror(size: int, before: int, after: int, device: torch.device) -> Tensor:

@@ -51,7 +51,7 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
     padded = padding.pad(features.completed(scaled, model.config.inputs), pads)
     rows, columns = padded["primal"].shape[-2:]
     logarithm = padded["primal"].new_empty(len(padded["primal"]), 3, rows, columns)
-    spans = (_spans(length, tile, model.alignment, model.network.radius) for length in (rows, columns))
+    spans = (_spans(length, tile, model.alignment, model.radius) for length in (rows, columns))
     for (y, y_around), (x, x_around) in product(*spans):
         part = {name: layer[..., y_around, x_around].to(device) for name, layer in padded.items()}
         inner = np.s_[..., _within(y, y_around), _within(x, x_around)]

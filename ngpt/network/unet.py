@@ -63,11 +63,12 @@ class Convolution(nn.Module):
         return leaky_relu(x, SLOPE) if self.activation else x
 
 
-class Head(nn.Module):
-    """The last 1x1 convolution, to ``outputs`` channels: float32, whatever autocast does, and not activated.
+class LastConvolution(nn.Module):
+    """The 1x1 convolution to ``outputs`` channels: float32, whatever autocast does, and not activated.
 
-    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for networks that predict a correction: it
-    starts as none, and its weights are not normalised, since what is to be small should not need a direction first.
+    It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions of which 0 is a sensible
+    one, such as corrections: it starts there, and its weights are not normalised, since what is to be small should not
+    need a direction first.
     """
 
     def __init__(self, inputs: int, outputs: int, zero: bool):
@@ -109,7 +110,8 @@ class DenseUNet(nn.Module):
     """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
 
     ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` as of ``Head``. ``radius`` is that of the receptive field.
+    on the way down and again on the way up. ``zero`` is that of ``LastConvolution``, ``radius`` that of the receptive
+    field.
     """
 
     def __init__(
@@ -135,7 +137,7 @@ class DenseUNet(nn.Module):
                 dense[level] += 2 * g
             self.up.insert(0, nn.ModuleList(Unit(dense[level] + i * g, g) for i in range(n)))
             dense[level] += n * g
-        self.head = Head(dense[0], outputs, zero)
+        self.head = LastConvolution(dense[0], outputs, zero)
 
     def forward(self, x: Tensor) -> Tensor:
         lists = []
@@ -174,7 +176,7 @@ class PlainUNet(nn.Module):
                 self.unpool.append(Convolution(widths[level + 1], width, "unpool"))
                 self.up.append(nn.Sequential(Convolution(2 * width, width, "3x3"), Convolution(width, width, "3x3")))
             channels = width
-        self.head = Head(widths[0], outputs, zero)
+        self.head = LastConvolution(widths[0], outputs, zero)
 
     def forward(self, x: Tensor) -> Tensor:
         skips = []

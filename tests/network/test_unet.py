@@ -347,7 +347,7 @@ def test_what_a_stack_must_hold():
     # The other denoiser wants features, though the network does not read them.
     twin = ModelConfig("plain", (4,), (), ("primal", "primal_change", "primal_noise"), start=("primal", "denoised"))
     assert twin.layers == ("primal", "denoised", "primal_se")
-    assert twin.needs == ("primal", "albedo", "normal", "primal_var") and twin.outputs == 5
+    assert twin.needs == ("primal", "albedo", "normal", "primal_var") and twin.head.outputs == 5
 
 
 def test_alignment_and_padding_fit():

@@ -1,0 +1,66 @@
+"""After ``ngpt.classical.controlvariates``: wcv, with its four neighbours as channels: right, below, left, above."""
+
+import numpy as np
+
+from ngpt.classical.controlvariates import SWEEPS, decay
+from ngpt.classical.variances import FLOOR
+from ngpt.export.builder import FLOAT, Value, channels, op, repeat
+from ngpt.export.graphs import variances
+from ngpt.export.graphs.repair import finite
+
+IMAGE = ("tiles", 3, "height", "width")
+# A variance so large that its weight is 0.
+_NEVER = 3e38
+
+
+def wcv(
+    primal: Value, dx: Value, dy: Value, trusted: tuple[Value, Value], variance: tuple[Value, ...], mean: Value
+) -> Value:
+    """The base (N, 3, H, W) of finite layers.
+
+    ``trusted``   (N, 1, H, W) for dx and dy, 1 where they are
+    ``variance``  of primal, dx and dy, as renderers give them
+    ``mean``      what it is relative to, a scalar: the mean variance of the whole image
+    """
+    smooth, inside = variances.smoothed(primal, *variance)
+    noisy = op.Greater(mean, 0.0)
+    relative = op.Where(noisy, smooth / op.Where(noisy, mean, 1.0) + FLOOR, 1.0)
+    v = channels(relative, 0, 1)
+    vx, vy = (
+        op.Where(op.Greater(channels(inside, i, i + 1) * known, 0.0), channels(relative, i, i + 1), _NEVER)
+        for i, known in ((1, trusted[0]), (2, trusted[1]))
+    )
+    V = op.Concat(vx, vy, _before(vx, 3, _NEVER), _before(vy, 2, _NEVER), axis=1)
+    G = op.Concat(dx, dy, -_before(dx, 3, 0.0), -_before(dy, 2, 0.0), axis=1)
+    R = G - _slopes(primal)
+    factors = np.array(decay(SWEEPS), np.float32)
+
+    def sweep(n: Value, u: Value) -> tuple[Value, bool]:
+        own = v * op.Gather(factors, n, axis=0)
+        A = own / (own + V)
+        E = _slopes(u) - R
+        said = op.Reshape(A, [0, 4, 1, -1]) * op.Reshape(E, [0, 4, 3, -1])
+        change = op.Reshape(op.ReduceSum(said, [1], keepdims=0), op.Shape(primal))
+        return u + change / (op.ReduceSum(A, [1], keepdims=1) + 1.0), True
+
+    return primal + repeat(SWEEPS, sweep, primal * 0.0, IMAGE)
+
+
+def trusted(gradient: Value) -> Value:
+    """(N, 1, H, W): 1 where a gradient is finite in all colours, else 0."""
+    return op.ReduceMin(op.Cast(finite(gradient), to=FLOAT), [1], keepdims=1)
+
+
+def _before(x: Value, axis: int, border: float) -> Value:
+    """What the pixel on the left (above) has, ``border`` where there is none."""
+    return op.Pad(op.Slice(x, [0], [-1], [axis]), [1, 0], border, [axis])
+
+
+def _slopes(image: Value) -> Value:
+    """(N, 12, H, W): what the pixels right, below, left and above are more than a pixel, RGB each."""
+    weights = np.zeros((12, 3, 3, 3), np.float32)
+    for direction, (y, x) in enumerate(((1, 2), (2, 1), (1, 0), (0, 1))):
+        for colour in range(3):
+            kernel = weights[3 * direction + colour, colour]
+            kernel[1, 1], kernel[y, x] = -1, 1
+    return op.Conv(image, weights, pads=[1, 1, 1, 1])

@@ -1,0 +1,56 @@
+"""After ``ngpt.network.features``: from layers to the channels a network reads."""
+
+from collections.abc import Mapping
+
+from ngpt.export.builder import END, Value, op
+from ngpt.export.graphs.repair import clean
+from ngpt.export.graphs.transfer import log_for_networks, signed_log, signed_log_for_networks
+from ngpt.network.features import ENLARGED, IMAGES, LEAST_DEPTH, NOISE_ENLARGED, RADIANCE, SOURCES, compared
+
+
+def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Value, depth: Value) -> dict[str, Value]:
+    """Those of the layers ``names`` that are inputs of the graph (the base is none), or the roots of such.
+
+    Radiance is over the exposure, depth over the image's largest. ``finite`` are the inputs, all but variances finite.
+    """
+    scaled = {}
+    for name in names:
+        if name.endswith("_se"):
+            scaled[name] = op.Sqrt(op.Max(clean(finite[name.replace("_se", "_var")]), 0.0)) / exposure
+        elif name in finite:
+            scaled[name] = finite[name] / exposure if name in RADIANCE else finite[name]
+    if "depth" in scaled:
+        scaled["depth"] = scaled["depth"] / (depth + LEAST_DEPTH)
+    return scaled
+
+
+def completed(scaled: Mapping[str, Value], inputs: tuple[str, ...]) -> dict[str, Value]:
+    """The layers with what is computed of them, for those of ``inputs`` that are; before any padding."""
+    return dict(scaled) | {name: _computed(name, scaled, compared(inputs)) for name in inputs if name in SOURCES}
+
+
+def _computed(name: str, layers: Mapping[str, Value], compared_with: str) -> Value:
+    other, source = layers[compared_with], layers[SOURCES[name][0]]
+    if name.endswith("_change"):
+        return signed_log(source) - signed_log(other)
+    if name.endswith("_noise"):
+        return op.ReduceMean(source, [1], keepdims=1) / (op.ReduceMean(abs(other), [1], keepdims=1) + 1.0)
+    axis = 3 if name.startswith("dx") else 2
+    image = layers[SOURCES[name][1]]
+    following = op.Concat(op.Slice(image, [1], [END], [axis]), op.Slice(image, [-1], [END], [axis]), axis=axis)
+    return (source - (following - image)) / (abs(other) + 1.0)
+
+
+def encoded(name: str, layer: Value) -> Value:
+    """The channels of one input, from its layer normalised and completed."""
+    if name in IMAGES:
+        return log_for_networks(op.Max(layer, 0.0))
+    if name in ("dx", "dy"):
+        return signed_log_for_networks(layer)
+    if name.endswith("_noise"):
+        return log_for_networks(layer * float(NOISE_ENLARGED))
+    if name in SOURCES:
+        return signed_log(layer * float(ENLARGED))
+    if name.endswith("_se"):
+        return log_for_networks(op.ReduceMean(layer, [1], keepdims=1))
+    return layer

@@ -1,0 +1,51 @@
+"""After ``ngpt.classical.variances``: variances made fit for weights. Channels: of the primal, of dx, of dy."""
+
+from ngpt.classical.leastsquares import CLIP
+from ngpt.classical.variances import FEW
+from ngpt.export.builder import FLOAT, Value, channels, op, repeat
+from ngpt.export.graphs.repair import finite
+
+
+def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
+    """Twice the mean over 3x3 values that are known, where there are none the mean of all; and ``inside``."""
+    there = inside(primal)
+    (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
+    known = op.Concat(gp, gx, gy, axis=1) * there
+    values = op.Concat(vp, vx, vy, axis=1) * known
+    sums, counts = (op.ReduceSum(x, [2, 3], keepdims=1) for x in (values, known))
+    typical = sums / op.Max(counts, 1.0)
+    # Nothing may pass through the column and the row that do not exist.
+    v, n = (_box(_box(x) * there) for x in (values, known))
+    # A count is at least a ninth of a ninth; rounding may leave less.
+    return op.Where(op.Greater(n, 1e-3), v / op.Max(n, FEW), typical), there
+
+
+def inside(primal: Value) -> Value:
+    """(N, 3, H, W) of 0 and 1: where there is a pixel, a difference to the right, a difference downwards."""
+    there = channels(primal, 0, 1) * 0.0 + 1.0
+    right, below = (op.Pad(op.Slice(there, [0], [-1], [axis]), [0, 1], 0.0, [axis]) for axis in (3, 2))
+    return op.Concat(there, right, below, axis=1)
+
+
+def robust_mean(values: Value, there: Value) -> Value:
+    """``ngpt.classical.leastsquares.robust_mean`` of the values that are ``there`` (1, and 0 elsewhere), a scalar."""
+    count, used = op.ReduceSum(there, keepdims=0), values * there
+
+    def clipped(_: Value, last: Value) -> tuple[Value, Value]:
+        mean = op.ReduceSum(op.Min(used, last * float(CLIP)), keepdims=0) / count
+        return mean, op.Less(mean, last * 0.5)
+
+    # In place of infinity, the largest number of which CLIP times are one.
+    return repeat(64, clipped, count * 0.0 + 3e36, ())
+
+
+def _over_colours(variance: Value) -> tuple[Value, Value]:
+    """Sums over RGB where all three are known (1): what is not finite or negative is not (0)."""
+    usable = op.And(finite(variance), op.GreaterOrEqual(variance, 0.0))
+    good = op.ReduceMin(op.Cast(usable, to=FLOAT), [1], keepdims=1)
+    return op.ReduceSum(op.Where(usable, variance, 0.0), [1], keepdims=1) * good, good
+
+
+def _box(x: Value) -> Value:
+    """Means over 3x3 values, with 0 beyond the border."""
+    return op.AveragePool(x, kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=1)
