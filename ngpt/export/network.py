@@ -76,12 +76,14 @@ def overlap(model: Reconstructor, given_base: bool = False) -> int:
 def bytes_per_pixel(model: Reconstructor) -> int:
     """What a run takes at most for each pixel, beside the image's layers; measured in tests/network/test_run_onnx.py.
 
-    The head reads the longest list of tensors there is; it exists as the list, as one tensor, and about once more in
-    units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor. ONNX Runtime's
-    arena, without which a run takes twice as long, gets half as much again and more.
+    The last convolution reads the longest list of tensors there is; it exists as the list, as one tensor, and about
+    once more in units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor.
+    When these are gone, the head has the prediction, cropped, as weights, and once more. ONNX Runtime's arena, without
+    which a run takes twice as long, gets half as much again and more.
     """
     listed = next(model.network.head.parameters()).shape[1]
-    return 7 * (3 * listed + 6 * features.channels(model.config.inputs))
+    body = 3 * listed + 6 * features.channels(model.config.inputs)
+    return 7 * max(body, 4 * model.config.head.outputs)
 
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:

@@ -127,7 +127,7 @@ class Kernels(Head):
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
         height, width = prediction.shape[-2:]
         weights = torch.softmax(prediction, 1)
-        mean = torch.zeros_like(prediction[:, :3])
+        mean = torch.zeros_like(images[0][..., :height, :width])
         # One tap after the other: all of them at once would be size² images.
         for tap, (i, y, x) in enumerate(self._taps):
             mean = mean + weights[:, tap : tap + 1] * images[i][..., y : y + height, x : x + width]

@@ -49,6 +49,12 @@ CONFIGS = {
     "of a primal alone": ModelConfig(
         *("dense", (4, 6), (1, 1), ("primal", "primal_change", "primal_noise")), start=("primal", "denoised")
     ),
+    "by kernels": ModelConfig(
+        *("dense", (4, 6), (1, 1), ("primal", "base", "dx_se", "primal_se"), "wcv"),
+        start=("primal", "base"),
+        quiet=1.0,
+        kernel=5,
+    ),
     "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
     "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
     "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),

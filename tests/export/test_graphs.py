@@ -1,0 +1,174 @@
+"""Each graph beside the function it repeats, by itself: where the whole differs, this says which part does."""
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnx")
+torch = pytest.importorskip("torch")
+
+# ruff: noqa: E402
+import onnxruntime
+from full_stack import full_layers
+
+from ngpt.classical import controlvariates as numpy_controlvariates
+from ngpt.classical.leastsquares import robust_mean
+from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
+from ngpt.export.graphs import controlvariates, exposure, features, padding, transfer, variances
+from ngpt.export.graphs.model import _OperatorsOfHeads
+from ngpt.export.graphs.repair import clean
+from ngpt.network import features as torch_features
+from ngpt.network import padding as torch_padding
+from ngpt.network import transfer as torch_transfer
+from ngpt.network.heads import Direct, Kernels, Mixture, Residual
+
+
+def planes(layer):
+    return np.ascontiguousarray(layer.transpose(2, 0, 1)[None], np.float32)
+
+
+def evaluate(function, *arrays):
+    """What a graph of values makes of arrays, in ONNX Runtime."""
+    graph = Graph("test")
+    values = [graph.input(f"x{i}", [f"d{i}_{axis}" for axis in range(a.ndim)]) for i, a in enumerate(arrays)]
+    result = function(*values)
+    results = result if isinstance(result, tuple) else (result,)
+    # An output must have a shape, which tests need not know before.
+    for i, value in enumerate(results):
+        graph.output(f"values{i}", op.Reshape(value, [-1]), (f"count{i}",))
+        graph.output(f"shape{i}", op.Cast(op.Shape(value), to=FLOAT), (f"axes{i}",))
+    session = onnxruntime.InferenceSession(graph.model({}).SerializeToString(), providers=["CPUExecutionProvider"])
+    made = session.run(None, {f"x{i}": np.asarray(a, np.float32) for i, a in enumerate(arrays)})
+    shaped = tuple(values.reshape(shape.astype(int)) for values, shape in zip(made[::2], made[1::2], strict=True))
+    return shaped if isinstance(result, tuple) else shaped[0]
+
+
+@pytest.mark.parametrize("name", ["signed_log", "signed_exp"])
+def test_transfer_is_exact_to_rounding(name):
+    x = np.float32([0, 1e-38, 1e-12, 1e-4, 0.3, 1, 20, 80] if name == "signed_exp" else [0, 1e-38, 1e-9, 0.3, 1, 1e12])
+    x = np.concatenate([-x, x])
+    expected = getattr(torch_transfer, name)(torch.from_numpy(x)).numpy()
+    assert np.allclose(evaluate(getattr(transfer, name), x), expected, rtol=1e-6, atol=0)
+
+
+def test_clean_keeps_what_is_finite():
+    x = np.float32([np.nan, np.inf, -np.inf, -0.0, 3e38, -2])
+    assert np.array_equal(evaluate(clean, x), np.float32([0, 0, 0, 0, 3e38, -2]))
+
+
+@pytest.mark.parametrize("values", [[0.0], [1, 2, 3], [1] * 500 + [1e12], [1e30, 1e30, 0], [0] * 300 + [5]])
+def test_the_robust_mean(values):
+    values = np.float32(values)
+    ours = evaluate(lambda x: variances.robust_mean(x, x * 0.0 + 1.0), values)
+    assert ours == pytest.approx(robust_mean(values), rel=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (9, 1), (24, 31)])
+def test_control_variates_are_those_of_numpy(size):
+    layers = full_layers(*size)
+    names = ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
+    layers["primal_var"][0, 0] = np.nan
+    layers["dx_var"][size[0] // 2, 0] = -1
+
+    def graph(*values):
+        given = dict(zip(names, values, strict=True))
+        noise = tuple(given[name] for name in names[3:])
+        trusted = controlvariates.trusted(given["dx"]), controlvariates.trusted(given["dy"])
+        mean = variances.robust_mean(*variances.smoothed(given["primal"], *noise))
+        return controlvariates.wcv(given["primal"], given["dx"], given["dy"], trusted, noise, mean)
+
+    ours = evaluate(graph, *(planes(layers[name]) for name in names))
+    assert np.allclose(ours, planes(numpy_controlvariates.wcv(*(layers[name] for name in names))), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (12, 5)])
+@pytest.mark.parametrize("name", ["primal", "dx", "dy", "dx_se", "dy_noise", "dx_base"])
+def test_padding_and_what_it_is_cropped_to(size, name):
+    rng = np.random.default_rng(0)
+    layer = rng.normal(size=(1, 3, *size)).astype(np.float32)
+    pads = torch_padding.pads(*size, 4)
+    expected = torch_padding.pad({name: torch.from_numpy(layer)}, pads)[name]
+
+    def graph(x):
+        mirror = padding.Mirror(x, 4)
+        padded = mirror.pad(x, name)
+        return padded, mirror.crop(padded), mirror.around(x, 0), mirror.around(x, 3)
+
+    padded, cropped, same, around = evaluate(graph, layer)
+    assert np.array_equal(padded, expected)
+    assert np.array_equal(cropped, torch_padding.crop(expected, pads)) and np.array_equal(same, layer)
+    image = torch_padding.pad({"primal": torch.from_numpy(layer)}, (3, 3, 3, 3))["primal"]
+    assert np.array_equal(around, image)
+
+
+@pytest.mark.parametrize("beside", ["base", "denoised"])
+def test_every_input_of_a_network_is_encoded_as_in_torch(beside):
+    given = {name: planes(layer) for name, layer in full_layers(10, 13).items()}
+    given |= {name: given["primal"] * k for name, k in (("denoised", 0.9), ("denoised_base", 1.1), ("base", 0.8))}
+    inputs = tuple(name for name in torch_features.CHANNELS if beside == "base" or name != "base")
+    assert torch_features.compared(inputs) == beside
+    layers = {name: torch.from_numpy(layer) for name, layer in given.items() if not name.endswith("_var")}
+    layers |= {f"{n}_se": torch.from_numpy(np.sqrt(given[f"{n}_var"])) for n in ("primal", "dx", "dy")}
+    scaled, scale = torch_features.normalised(layers)
+    completed = torch_features.completed(scaled, inputs)
+
+    def graph(*values):
+        raw = dict(zip(given, values, strict=True))
+        primal_exposure = exposure.exposure(raw["primal"])
+        depth = op.ReduceMax(raw["depth"], keepdims=0)
+        names = torch_features.sources(inputs)
+        ours = features.completed(features.normalised(raw, (*names, "base"), primal_exposure, depth), inputs)
+        return (primal_exposure, *(features.encoded(name, ours[name]) for name in inputs))
+
+    ours_scale, *encoded = evaluate(graph, *given.values())
+    assert ours_scale == pytest.approx(scale.item(), rel=1e-6)
+    for name, ours in zip(inputs, encoded, strict=True):
+        theirs = torch_features.encode(completed, (name,)).numpy()
+        assert ours.shape == theirs.shape and np.allclose(ours, theirs, rtol=1e-5, atol=2e-6), name
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        Direct(),
+        Residual(("base",)),
+        Mixture(("primal", "base")),
+        Kernels(("primal",), 1),
+        Kernels(("primal", "base"), 5),
+    ],
+    ids=repr,
+)
+def test_heads_are_the_same_as_graphs(head):
+    torch.manual_seed(0)
+    prediction, r = 2 * torch.randn(2, head.outputs, 6, 9), head.radius
+    images = [10 ** torch.randn(2, 3, 6 + 2 * r, 9 + 2 * r) for _ in head.start]
+    expected = head.forward(prediction, images).numpy()
+    graph = lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others))  # noqa: E731
+    assert np.allclose(evaluate(graph, prediction, *images), expected, rtol=1e-5, atol=1e-6)
+
+
+def test_expressions():
+    x, y = np.float32([[1, -2], [3, 4]]), np.float32([[5, 6], [7, 8]])
+    assert np.array_equal(evaluate(lambda a, b: -a * b + abs(a) / b - 2.0, x, y), -x * y + np.abs(x) / y - 2)
+    assert np.array_equal(evaluate(lambda a: op.Concat(a, np.float32([[9, 9]]), axis=0), x), [[1, -2], [3, 4], [9, 9]])
+
+
+def test_choices_and_loops_read_what_is_around_them():
+    def graph(x):
+        total = op.ReduceSum(x, keepdims=0)
+        doubled = repeat(9, lambda n, s: (s * 2.0 + total * 0.0, op.Less(s, 10.0)), total, ())
+        return doubled, choose(op.Greater(total, 0.0), lambda: x, lambda: x + total, ("n",))
+
+    doubled, chosen = evaluate(graph, np.float32([1, 2]))
+    assert doubled == 24 and np.array_equal(chosen, [1, 2])
+    assert np.array_equal(evaluate(graph, np.float32([-1, -2]))[1], [-4, -5])
+
+
+def test_what_no_output_needs_is_left_out_and_equal_constants_are_one():
+    graph = Graph("small")
+    x = graph.input("x", ("n",))
+    unused = (x * 7.0) / 5.0
+    graph.output("y", (x + 3.0) * 3.0, ("n",))
+    model = graph.model({"method": "small"})
+    assert [node.op_type for node in model.graph.node] == ["Add", "Mul", "Identity"] and unused.name
+    assert len(model.graph.initializer) == 1
+    assert {item.key: item.value for item in model.metadata_props} == {"ngpt.method": "small"}

@@ -1,0 +1,78 @@
+"""What networks read of a stack: the same for both runtimes, and refused by name where the stack lacks it."""
+
+import numpy as np
+import pytest
+import torch
+from full_stack import full_stack
+
+from ngpt.classical.bases import BASES
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS, reconstruct
+from ngpt.network import inputs
+from ngpt.network.model import ModelConfig
+from ngpt.network.run_torch import layers_of
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+GRADIENTS = {"dx", "dy", "dx_var", "dy_var"}
+
+
+def without(stack, *names):
+    return GradientStack({name: layer for name, layer in stack.layers.items() if name not in names})
+
+
+@pytest.mark.parametrize("base", BASES)
+def test_a_base_is_what_the_method_of_that_name_makes(base):
+    stack = full_stack(12, 17)
+    assert np.array_equal(inputs.base_image(repair(stack), base), reconstruct(stack, base).image)
+    assert BASES[base].needs == METHODS[base].needs == inputs.needs(("primal", "base"), base)
+
+
+def test_what_a_stack_must_hold_is_listed_in_order():
+    assert inputs.needs(("dy_se", "depth"), "") == ("primal", "depth", "dy_var")
+    assert inputs.needs(("denoised",), "") == ("primal", "albedo", "normal")
+    assert inputs.needs(("base",), "wcv") == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
+
+
+def test_standard_errors_are_roots_and_0_where_nothing_is_known():
+    stack = full_stack(9, 8)
+    variance = stack["primal_var"].copy()
+    variance[1, 2], variance[3, 4, 0], variance[5, 6, 1] = np.nan, -1, np.inf
+    given = inputs.gather(repair(stack.replace(primal_var=variance)), ("primal_se", "primal_var"), "")
+    assert np.array_equal(given["primal_var"], variance, equal_nan=True)
+    known = np.isfinite(variance) & (variance >= 0)
+    assert np.array_equal(given["primal_se"], np.where(known, np.sqrt(np.where(known, variance, 0)), 0))
+
+
+def test_only_what_is_asked_for_is_given_in_that_order():
+    assert list(inputs.gather(repair(full_stack(5, 6)), ("depth", "base", "primal"), "cv")) == [
+        "depth",
+        "base",
+        "primal",
+    ]
+
+
+def test_tensors_are_the_same_arrays():
+    config = ModelConfig("plain", (4,), (), ("primal", "base", "dx_se", "normal"), "wcv")
+    data = repair(full_stack(11, 7))
+    arrays = inputs.gather(data, config.layers, config.base)
+    tensors = layers_of(data, config)
+    assert list(tensors) == list(arrays) == list(config.layers)
+    for name, tensor in tensors.items():
+        assert tensor.dtype == torch.float32 and np.array_equal(tensor.permute(1, 2, 0).numpy(), arrays[name])
+
+
+@pytest.mark.parametrize(
+    ("absent", "names", "base", "message"),
+    [
+        (GRADIENTS, ("primal", "dx", "dy_se"), "", "the file need layers dx, dy_var, which the stack lacks"),
+        (GRADIENTS, ("base",), "cv", "need layers dx, dy, which"),
+        ({"dx_var"}, ("base",), "wcv", "need layers primal_var, dx_var, dy_var, which|need layers dx_var, dy_var"),
+        ({"albedo"}, ("denoised",), "", "need layers albedo, which"),
+        ((), ("primal", "denoised_base"), "", "need layers base, which"),
+        ((), ("primal", "colour"), "", "need layers colour, which"),
+    ],
+)
+def test_what_is_lacking_is_named(absent, names, base, message):
+    with pytest.raises(NgptError, match=message):
+        inputs.gather(repair(without(full_stack(6, 5), *absent)), names, base, "the file")
