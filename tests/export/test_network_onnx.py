@@ -63,7 +63,9 @@ CONFIGS = {
 
 
 def session(model):
-    return onnxruntime.InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])
+    """Of a model, or of a file."""
+    source = model if isinstance(model, Path) else model.SerializeToString()
+    return onnxruntime.InferenceSession(source, quiet(), providers=["CPUExecutionProvider"])
 
 
 @pytest.fixture(scope="module")
@@ -159,6 +161,15 @@ def test_a_combiner_is_the_same_by_either_runtime(tmp_path, weights, other_denoi
 def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
     layers = noisy(*size)
     assert_close(run(fast, layers), in_torch(layers, FAST))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal"])
+def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
+    layers = noisy(37, 53)
+    layers |= {other: k * layers["primal"] for other, k in (("denoised", 0.98), ("denoised_base", 0.99))}
+    today, shipped = session(network_model(WEIGHTS / f"{name}.safetensors", name)), session(WEIGHTS / f"{name}.onnx")
+    assert np.abs(run(today, layers) - run(shipped, layers)).max() <= 1e-6 * run(shipped, layers).max()
 
 
 @pytest.mark.slow
