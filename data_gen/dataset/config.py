@@ -8,7 +8,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
-from ngpt.system.records import read_toml, table
+from ngpt.system.records import from_table, read_toml
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Job:
 
 def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    return table(Config, read_toml(path), str(path))
+    return from_table(Config, read_toml(path), str(path))
 
 
 def as_json(config: Config) -> dict:

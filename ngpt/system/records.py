@@ -81,7 +81,7 @@ def _shown(value: Any) -> str:
         return "a number of thousands of digits"
 
 
-def table(kind: type[T], values: Any, where: str) -> T:
+def from_table(kind: type[T], values: Any, where: str) -> T:
     """The dataclass ``kind`` of a table of settings, each of them of the type of its annotation.
 
     Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
@@ -119,7 +119,7 @@ def _converted(value: Any, hint: Any, where: str) -> Any:
     """``value`` as the annotation has it."""
     kinds = get_args(hint)
     if is_dataclass(hint):
-        return table(hint, value, where)  # type: ignore[arg-type]
+        return from_table(hint, value, where)  # type: ignore[arg-type]
     if hint is Any:
         return value
     if get_origin(hint) is tuple and isinstance(value, list | tuple):

@@ -10,7 +10,7 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.measure.distances import perceptual
 from ngpt.measure.distances.perceptual import PerceptualDistance
-from ngpt.system.records import table
+from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 
 KINDS = (*perceptual.KINDS, "l1")
@@ -81,7 +81,7 @@ class Loss:
 
 def make_loss(settings: dict[str, Any]) -> Loss:
     """The loss of a table [loss]. Raises NgptError for unknown keys and kinds, negative weights, and missing files."""
-    result = table(LossSettings, settings, "[loss]")
+    result = from_table(LossSettings, settings, "[loss]")
     for name, value in settings.items():
         if isinstance(value, int | float) and not 0 <= value < math.inf:
             raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")

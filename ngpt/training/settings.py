@@ -8,7 +8,7 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.network.model import ModelConfig
-from ngpt.system.records import read_toml, table
+from ngpt.system.records import from_table, read_toml
 from ngpt.training.augment import Augmentation
 
 
@@ -103,7 +103,7 @@ def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # typ
 
 def from_dict(values: dict[str, Any], path: str) -> Settings:
     """Settings of nested dicts; ``path`` is for messages."""
-    settings = table(Settings, values, path)
+    settings = from_table(Settings, values, path)
     _check(settings, path)
     return settings
 

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from ngpt.errors import LONGEST, NgptError
-from ngpt.system.records import check, parse_json, read_json, read_toml, table
+from ngpt.system.records import check, from_table, parse_json, read_json, read_toml
 
 
 @pytest.mark.parametrize(
@@ -95,10 +95,10 @@ DOOR = {"door": {"pane": "glass"}}
 
 def test_a_table_becomes_a_dataclass():
     door = Window("glass")
-    assert table(House, DOOR, "h.toml") == House(door)
+    assert from_table(House, DOOR, "h.toml") == House(door)
     values = {"height": 7, "size": [3, 4.5], "years": [1900, 1950], "windows": [{"pane": "oak", "open": True}]}
     values |= {"names": {"a": "b"}, "anything": {"x": [1]}}
-    house = table(House, DOOR | values, "h.toml")
+    house = from_table(House, DOOR | values, "h.toml")
     assert house == House(door, 2, 7, "", (3, 4.5), (1900, 1950), (Window("oak", 4, True),), {"a": "b"}, {"x": [1]})
 
 
@@ -126,7 +126,7 @@ def test_a_table_becomes_a_dataclass():
 )
 def test_a_table_that_is_none_of_it_is_refused_in_one_line(values, message):
     with pytest.raises(NgptError) as caught:
-        table(House, values, "h.toml")
+        from_table(House, values, "h.toml")
     assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
     assert len(str(caught.value)) < 200
 
