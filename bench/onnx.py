@@ -38,6 +38,8 @@ from ngpt.stack import GradientStack
 
 SIZES = ("1280x720", "1920x1080")
 FAST = WEIGHTS / "ngpt-fast.onnx"
+# The file of weights that it was made of.
+TWIN = Path(__file__).parents[1] / "export" / "weights" / "ngpt-fast.safetensors"
 
 
 def main() -> None:
@@ -80,7 +82,7 @@ def half_precision(folder: Path) -> Path | None:
         from ngpt.export.network import network_model
     except ModuleNotFoundError:
         return None
-    path, weights = folder / "half.onnx", WEIGHTS / "ngpt-fast.safetensors"
+    path, weights = folder / "half.onnx", TWIN
     path.write_bytes(network_model(weights, "ngpt-fast", "float16").SerializeToString())
     return path
 
@@ -113,7 +115,7 @@ def torch_calls(data) -> dict:
     from ngpt.network.run_torch import layers_of
     from ngpt.network.weights import load_weights
 
-    model, _ = load_weights(WEIGHTS / "ngpt-fast.safetensors")
+    model, _ = load_weights(TWIN)
     layers = {name: layer[None] for name, layer in layers_of(data, model.config).items()}
 
     def run(half: bool) -> None:

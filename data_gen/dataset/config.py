@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from glob import glob
 from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
-from ngpt.system.records import Shape, check, read_toml
+from ngpt.system.records import from_table, read_toml
 
 
 @dataclass(frozen=True)
@@ -97,29 +97,9 @@ class Job:
         return f"shards/{self.scene}-{self.batch:03d}.safetensors"
 
 
-_NUMBER = (int, float)
-_SHAPES: dict[str, Shape] = {
-    **{f.name: type(f.default) for f in fields(Config) if isinstance(f.default, int | str)},
-    "roll": _NUMBER,
-    "lens": _NUMBER,
-    "spp": [int],
-    "files": [{"pattern": str, "crops": int}],
-}
-
-
-def read_config(path: Path) -> Config:
+def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    values = read_toml(path)
-    for name, value in values.items():
-        if name in _SHAPES:
-            check(value, _SHAPES[name], f"{path}: '{name}'")
-    try:
-        files = tuple(Files(**table) for table in values.pop("files", []))
-        if "spp" in values:
-            values["spp"] = tuple(values["spp"])
-        return Config(**values, files=files)
-    except (TypeError, ValueError) as error:
-        raise NgptError(f"{path}: {error}; the entries are {', '.join(Config.__dataclass_fields__)}") from error
+    return from_table(Config, read_toml(path), str(path))
 
 
 def as_json(config: Config) -> dict:

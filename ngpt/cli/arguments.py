@@ -7,6 +7,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
+from ngpt.system import configs
 
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
 RESULT_SUFFIX = "_denoised"
@@ -14,6 +15,12 @@ RESULT_SUFFIX = "_denoised"
 
 def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+
+
+def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
+    """``--config``, for one of the kinds of ``ngpt.system.configs``."""
+    known = ", ".join(configs.names(kind))
+    parser.add_argument("--config", required=True, metavar="CONFIG", help=f"{what}: a TOML file, or one of: {known}")
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

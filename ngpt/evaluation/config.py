@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from dataclasses import asdict, dataclass, field
 from glob import glob, has_magic
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import FORMULAS
 from ngpt.methods import METHODS
+from ngpt.system.records import from_table, read_toml
 
 # What a method is given, and what the renderer makes for it:
 #   gradients  a gradient stack of the nominal samples per pixel
@@ -117,24 +117,4 @@ def scene_name(scene: str) -> str:
 
 def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    try:
-        values = tomllib.loads(Path(path).read_text())
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{path}: cannot be read: {error}") from error
-    known = Config.__dataclass_fields__
-    for name, value in values.items():
-        if name not in known:
-            raise NgptError(f"{path}: unknown entry '{name}'; there are: {', '.join(known)}")
-        default = getattr(Config(scenes=("",)), name)
-        wanted: Any = {tuple: list, float: (int, float)}.get(type(default), type(default))
-        if not isinstance(value, wanted) or (isinstance(value, bool) and wanted is not bool):
-            raise NgptError(f"{path}: {name} = {value!r}: must be like {default!r}")
-        if isinstance(value, list):
-            kind = str if name in ("scenes", "methods", "metrics") else int
-            if any(type(item) is not kind for item in value):
-                raise NgptError(f"{path}: {name} = {value!r}: must be a list of {kind.__name__}")
-            values[name] = tuple(value)
-    try:
-        return Config(**values)
-    except NgptError as error:
-        raise NgptError(f"{path}: {error}") from error
+    return from_table(Config, read_toml(path), str(path))

@@ -3,10 +3,13 @@
 import json
 import tomllib
 from collections.abc import Callable
+from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ngpt.errors import NgptError
+
+T = TypeVar("T")
 
 # A type, several of them, [shape]: a list of such, {name: shape}: a table with at least these entries, {str: shape}: a
 # table of any names. Whole numbers are those of 64 bits.
@@ -67,4 +70,92 @@ def check(value: Any, shape: Shape, where: str) -> None:
 
 def _demand(condition: bool, value: Any, wanted: str, where: str) -> None:
     if not condition:
-        raise NgptError(f"{where} is {repr(value)[:60]}; it must be {wanted}")
+        raise NgptError(f"{where} is {_shown(value)}; it must be {wanted}")
+
+
+def _shown(value: Any) -> str:
+    """The beginning of what Python calls it."""
+    try:
+        return repr(value)[:60]
+    except ValueError:  # so does Python, of whole numbers of more than 4300 digits
+        return "a number of thousands of digits"
+
+
+def from_table(kind: type[T], values: Any, where: str) -> T:
+    """The dataclass ``kind`` of a table of settings, each of them of the type of its annotation.
+
+    Lists become tuples, tables become dataclasses, where the annotations say so: ``tuple[int, ...]``,
+    ``tuple[Files, ...]``. A whole number does where a number is asked for. What ``kind`` refuses itself, it refuses by
+    NgptError.
+
+    Raises NgptError, which begins with ``where``, for settings that are unknown, missing, or of another type.
+    """
+    if not isinstance(values, dict):
+        raise NgptError(f"{where} = {_shown(values)}: must be a table")
+    known: dict[str, Field] = {field.name: field for field in fields(kind)}  # type: ignore[arg-type]
+    hints, read = get_type_hints(kind), {}
+    for name, value in values.items():
+        if name not in known:
+            raise NgptError(f"{where}: unknown key '{name}'; there are: {', '.join(known)}")
+        try:
+            read[name] = _converted(value, hints[name], f"{where}: [{name}]")
+        except _OtherType:
+            wanted = f"{_described(hints[name])}{_example(known[name].default)}"
+            raise NgptError(f"{where}: {name} = {_shown(value)}: must be {wanted}") from None
+    for name, field in known.items():
+        if name not in read and field.default is MISSING and field.default_factory is MISSING:
+            raise NgptError(f"{where}: lacks '{name}'")
+    try:
+        return kind(**read)
+    except NgptError as error:
+        raise NgptError(f"{where}: {error}") from error
+
+
+class _OtherType(Exception):
+    """A value is not what its annotation says."""
+
+
+def _converted(value: Any, hint: Any, where: str) -> Any:
+    """``value`` as the annotation has it."""
+    kinds = get_args(hint)
+    if is_dataclass(hint):
+        return from_table(hint, value, where)  # type: ignore[arg-type]
+    if hint is Any:
+        return value
+    if get_origin(hint) is tuple and isinstance(value, list | tuple):
+        if kinds[-1] is ...:
+            kinds = kinds[:1] * len(value)
+        if len(value) != len(kinds):
+            raise _OtherType
+        return tuple(_converted(v, kind, f"{where}[{i}]") for i, (v, kind) in enumerate(zip(value, kinds, strict=True)))
+    if get_origin(hint) is dict and isinstance(value, dict):
+        return {name: _converted(item, kinds[1], f"{where}: [{name}]") for name, item in value.items()}
+    # To Python, true is a number.
+    if isinstance(value, bool) and hint is not bool:
+        raise _OtherType
+    right = (int, float) if hint is float else get_origin(hint) or hint
+    if not isinstance(value, right) or (isinstance(value, int) and abs(value) >= 2**63):
+        raise _OtherType
+    return value
+
+
+_NAMES = {int: "whole number", float: "number", str: "string", dict: "table", list: "list"}
+
+
+def _described(hint: Any, many: bool = False) -> str:
+    """What an annotation asks for, in the words of those who write a TOML file."""
+    kind, kinds = get_origin(hint) or hint, get_args(hint)
+    if kind is bool:
+        return "true or false"
+    name = {tuple: "list"}.get(kind) or _NAMES.get(kind, "table")
+    text = f"{name}s" if many else f"a {name}"
+    if kind is tuple:
+        return f"{text} of {'' if kinds[-1] is ... else f'{len(kinds)} '}{_described(kinds[0], many=True)}"
+    return f"{text} of {_described(kinds[1], many=True)}" if kind is dict and kinds and kinds[1] is not Any else text
+
+
+def _example(default: Any) -> str:
+    """The default, which shows what is meant unless it is empty."""
+    if default is MISSING or not default:
+        return ""
+    return f", like {list(default) if isinstance(default, tuple) else repr(default)}"

@@ -1,7 +1,7 @@
 """What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it."""
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -10,6 +10,7 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.measure.distances import perceptual
 from ngpt.measure.distances.perceptual import PerceptualDistance
+from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 
 KINDS = (*perceptual.KINDS, "l1")
@@ -80,17 +81,10 @@ class Loss:
 
 def make_loss(settings: dict[str, Any]) -> Loss:
     """The loss of a table [loss]. Raises NgptError for unknown keys and kinds, negative weights, and missing files."""
-    known = {f.name: f for f in fields(LossSettings)}
+    result = from_table(LossSettings, settings, "[loss]")
     for name, value in settings.items():
-        if name not in known:
-            raise NgptError(f"[loss]: unknown key '{name}'; there are: {', '.join(known)}")
-        default = known[name].default
-        wanted = (int, float) if isinstance(default, float) else type(default)
-        if not isinstance(value, wanted) or isinstance(value, bool):
-            raise NgptError(f"[loss]: {name} = {value!r}: must be like {default!r}")
         if isinstance(value, int | float) and not 0 <= value < math.inf:
             raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")
-    result = LossSettings(**settings)
     if result.kind not in KINDS:
         raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join(KINDS)}")
     if result.evaluations < 1 or result.scales < 1:

@@ -4,14 +4,12 @@ import dataclasses
 import tomllib
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.network.model import ModelConfig
-from ngpt.system.records import check, read_toml
+from ngpt.system.records import from_table, read_toml
 from ngpt.training.augment import Augmentation
-
-T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -92,15 +90,6 @@ class Settings:
         return dataclasses.asdict(self)
 
 
-_TABLES: dict[str, type] = {
-    "model": ModelConfig,
-    "data": DataSettings,
-    "augmentation": Augmentation,
-    "optimizer": OptimizerSettings,
-    "run": RunSettings,
-}
-
-
 def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # type: ignore[assignment]
     """The settings of a TOML file, after ``changes`` of the form "run.steps=100".
 
@@ -114,17 +103,7 @@ def read_settings(path: str | Path, changes: list[str] = ()) -> Settings:  # typ
 
 def from_dict(values: dict[str, Any], path: str) -> Settings:
     """Settings of nested dicts; ``path`` is for messages."""
-    check(values, {"model": dict}, path)
-    known: dict[str, Any] = {}
-    for name, value in values.items():
-        if name in _TABLES:
-            known[name] = _table(_TABLES[name], value, f"{path}: [{name}]")
-        elif name in ("loss", "initial"):
-            check(value, dict if name == "loss" else str, f"{path}: '{name}'")
-            known[name] = value
-        else:
-            raise NgptError(f"{path}: unknown '{name}'; there may be: {', '.join([*_TABLES, 'loss', 'initial'])}")
-    settings = Settings(**known)
+    settings = from_table(Settings, values, path)
     _check(settings, path)
     return settings
 
@@ -143,34 +122,6 @@ def _check(settings: Settings, path: str) -> None:
         raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
 
 
-def _table(kind: type[T], values: Any, where: str) -> T:
-    """A dataclass of a table, with lists made tuples, and types checked against the defaults'."""
-    fields = {f.name: f for f in dataclasses.fields(kind)}  # type: ignore[arg-type]
-    if not isinstance(values, dict):
-        raise NgptError(f"{where}: must be a table, not {values!r}")
-    for name, value in values.items():
-        if name not in fields:
-            raise NgptError(f"{where}: unknown key '{name}'; there are: {', '.join(fields)}")
-        default = fields[name].default
-        if default is not dataclasses.MISSING and not _fits(value, default):
-            raise NgptError(f"{where}: {name} = {value!r}: must be like {default!r}")
-    converted = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    try:
-        return kind(**converted)
-    except (TypeError, NgptError) as error:
-        raise NgptError(f"{where}: {error}") from error
-
-
-def _fits(value: Any, default: Any) -> bool:
-    if isinstance(default, bool) or isinstance(value, bool):
-        return isinstance(value, bool) and isinstance(default, bool)
-    if isinstance(default, float):
-        return isinstance(value, int | float)
-    if isinstance(default, tuple):
-        return isinstance(value, list | tuple)
-    return isinstance(value, type(default))
-
-
 def _change(values: dict[str, Any], change: str) -> None:
     name, equals, text = change.partition("=")
     if not equals:
@@ -180,8 +131,8 @@ def _change(values: dict[str, Any], change: str) -> None:
     except tomllib.TOMLDecodeError:
         value = text  # a string without quotes, as people type it in a shell
     *tables, key = name.strip().split(".")
-    for table in tables:
-        values = values.setdefault(table, {})
+    for name in tables:
+        values = values.setdefault(name, {})
         if not isinstance(values, dict):
-            raise NgptError(f"--set {change}: '{table}' is not a table")
+            raise NgptError(f"--set {change}: '{name}' is not a table")
     values[key] = value

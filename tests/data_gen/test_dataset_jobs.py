@@ -48,10 +48,22 @@ def test_configurations_can_be_read():
         assert config.files or config.plan()
 
 
-@pytest.mark.parametrize("text", ["spp = [1, 4]\nscenes = 1", "scenes = 0", "scene = 3", "seed = ", "spp = 3"])
-def test_bad_configurations(tmp_path, text):
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("spp = [1, 4]\nscenes = 1", "at least 2"),
+        ("scenes = 0", "no scenes"),
+        ("scene = 3", "unknown key 'scene'; there are: seed, size"),
+        ("seed = ", "cannot be read"),
+        ("spp = 3", r"spp = 3: must be a list of 2 whole numbers, like \[2, 64\]"),
+        ("[[files]]\npattern = 3\ncrops = 1", r"\[files\]\[0\]: pattern = 3: must be a string"),
+        ("[[files]]\ncrops = 1", r"\[files\]\[0\]: lacks 'pattern'"),
+        ("files = 1", "files = 1: must be a list of tables"),
+    ],
+)
+def test_bad_configurations(tmp_path, text, message):
     (tmp_path / "c.toml").write_text(text)
-    with pytest.raises(NgptError):
+    with pytest.raises(NgptError, match=rf"c\.toml: .*{message}"):
         read_config(tmp_path / "c.toml")
 
 

@@ -173,9 +173,9 @@ def test_a_stack_without_features_is_an_absent_cell(room):
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
-        ("colour = 1", "unknown entry 'colour'"),
-        ('spp = "4"', "spp = '4': must be like"),
-        ("spp = [4.5]", "must be a list of int"),
+        ("colour = 1", "unknown key 'colour'"),
+        ('spp = "4"', "spp = '4': must be a list of whole numbers, like [4, 16, 64]"),
+        ("spp = [4.5]", "spp = [4.5]: must be a list of whole numbers"),
         ("seeds = 0", "must be at least 1"),
         ('metrics = ["beauty"]', "no metric 'beauty'"),
         ('primary = "SSIM"', "primary = 'SSIM' is not among metrics"),

@@ -30,7 +30,7 @@ from ngpt.network.weights import load_weights, save_weights
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
-FAST = WEIGHTS / "ngpt-fast.safetensors"
+FAST = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
 ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
 CONFIGS = {
     "with a base": ModelConfig("dense", (4, 6), (1, 1), (*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),

@@ -4,6 +4,7 @@ import shutil
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -92,6 +93,7 @@ def test_memory_stays_within_the_bound(bound):
     code = f"""
 import sys
 from dataclasses import replace
+from pathlib import Path
 sys.path.insert(0, "tests")
 from full_stack import full_layers
 from ngpt.network.run_onnx import Network
@@ -118,6 +120,7 @@ def test_8192x4320_pixels_in_4_gib():
     code = """
 import sys
 from dataclasses import replace
+from pathlib import Path
 sys.path.insert(0, "tests")
 import numpy as np
 from full_stack import full_layers
@@ -171,10 +174,8 @@ def test_missing_layers_are_named(network):
 def test_the_method_takes_files_of_both_kinds():
     pytest.importorskip("torch")
     stack = full_stack(20, 30)
-    images = [
-        reconstruct(stack, "ngpt-fast", weights=str(WEIGHTS / f"ngpt-fast.{kind}")).image
-        for kind in ("onnx", "safetensors")
-    ]
+    twin = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
+    images = [reconstruct(stack, "ngpt-fast", weights=str(path)).image for path in (FAST, twin)]
     assert np.allclose(*images, rtol=1e-4, atol=1e-5)
 
 

@@ -1,4 +1,6 @@
-"""The weights that come with the package."""
+"""The networks that come with the package, and the weights in the repository that they were made of."""
+
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,13 +10,13 @@ import ngpt
 from ngpt.classical.gradients import forward_differences
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
-from ngpt.network.run import WEIGHTS
 from ngpt.network.weights import load_weights
 
+TWINS = Path(__file__).parents[2] / "export" / "weights"
 SHIPPED = [
     pytest.param(name, marks=pytest.mark.skipif(bool(METHODS[name].missing()), reason=METHODS[name].missing()))
     for name in ("ngpt-fast", "ngpt-combine", "ngpt-primal", "ngpt")
-    if (WEIGHTS / f"{name}.safetensors").is_file()
+    if (TWINS / f"{name}.safetensors").is_file()
 ]
 
 
@@ -37,7 +39,7 @@ def test_networks_are_shipped():
 
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_method_needs_what_its_weights_read_and_says_how_they_were_made(name):
-    model, header = load_weights(WEIGHTS / f"{name}.safetensors")
+    model, header = load_weights(TWINS / f"{name}.safetensors")
     assert set(METHODS[name].needs) == set(model.config.needs)
     assert {"step", "hours", "settings", "torch", "version"} <= header["training"].keys()
     assert "/" not in str(header["training"]["settings"]["data"]["folders"]), "paths of the machine it was trained on"
@@ -69,7 +71,7 @@ def test_a_firefly_stays_where_it_is(views, name):
     primal = stack["primal"].copy()
     primal[20, 10] += 1e6
     before, after = ngpt.denoise(stack, name), ngpt.denoise(stack.replace(primal=primal), name)
-    model, _ = load_weights(WEIGHTS / f"{name}.safetensors")
+    model, _ = load_weights(TWINS / f"{name}.safetensors")
     # 50 sweeps of its base, and what the network sees.
     far = np.s_[:, 10 + model.network.radius + 1 :]
     assert np.isfinite(after).all()
@@ -100,7 +102,7 @@ def test_sixteen_bits_cost_little(views, name):
     from ngpt.repair import repair
 
     stack, reference = views["lens"]
-    model, _ = load_weights(WEIGHTS / f"{name}.safetensors")
+    model, _ = load_weights(TWINS / f"{name}.safetensors")
     layers = {layer: tensor[None] for layer, tensor in layers_of(repair(stack), model.config).items()}
     errors = {}
     for precision in (torch.float32, torch.bfloat16, torch.float16):

@@ -1,9 +1,14 @@
 """Records in JSON and TOML, and the errors about them: short, of one line, and with the place."""
 
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
 import pytest
 
 from ngpt.errors import LONGEST, NgptError
-from ngpt.system.records import check, parse_json, read_json, read_toml
+from ngpt.system.records import check, from_table, parse_json, read_json, read_toml
 
 
 @pytest.mark.parametrize(
@@ -59,3 +64,73 @@ def test_errors_are_one_short_line_whatever_they_quote():
     error = NgptError("a.exr: layer 'x\ny\r\nz' is wrong; " + "w" * 5000 + "; render it again")
     assert "\n" not in str(error) and len(str(error)) <= LONGEST
     assert str(error).startswith("a.exr: layer 'x y z'") and str(error).endswith("; render it again")
+
+
+@dataclass
+class Window:
+    pane: str
+    panes: int = 4
+    open: bool = False
+
+
+@dataclass
+class House:
+    door: Window
+    floors: int = 2
+    height: float = 6.5
+    name: str = ""
+    size: tuple[float, float] = (8.0, 9.0)
+    years: tuple[int, ...] = ()
+    windows: tuple[Window, ...] = ()
+    names: dict[str, str] = field(default_factory=dict)
+    anything: dict[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self):
+        if self.floors < 1:
+            raise NgptError("a house has a floor")
+
+
+DOOR = {"door": {"pane": "glass"}}
+
+
+def test_a_table_becomes_a_dataclass():
+    door = Window("glass")
+    assert from_table(House, DOOR, "h.toml") == House(door)
+    values = {"height": 7, "size": [3, 4.5], "years": [1900, 1950], "windows": [{"pane": "oak", "open": True}]}
+    values |= {"names": {"a": "b"}, "anything": {"x": [1]}}
+    house = from_table(House, DOOR | values, "h.toml")
+    assert house == House(door, 2, 7, "", (3, 4.5), (1900, 1950), (Window("oak", 4, True),), {"a": "b"}, {"x": [1]})
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        (3, "h.toml = 3: must be a table"),
+        ({}, "h.toml: lacks 'door'"),
+        (DOOR | {"flours": 3}, "h.toml: unknown key 'flours'; there are: door, floors, height, "),
+        (DOOR | {"floors": 2.5}, "h.toml: floors = 2.5: must be a whole number, like 2"),
+        (DOOR | {"floors": True}, "h.toml: floors = True: must be a whole number, like 2"),
+        (DOOR | {"floors": 2**63}, "h.toml: floors = 9223372036854775808: must be a whole number, like 2"),
+        (DOOR | {"floors": 16**5000}, "h.toml: floors = a number of thousands of digits: must be a whole number"),
+        (DOOR | {"height": "tall"}, "h.toml: height = 'tall': must be a number, like 6.5"),
+        (DOOR | {"name": ["x"]}, "h.toml: name = ['x']: must be a string"),
+        (DOOR | {"size": [3]}, "h.toml: size = [3]: must be a list of 2 numbers, like [8.0, 9.0]"),
+        (DOOR | {"years": [1900, "x"]}, "h.toml: years = [1900, 'x']: must be a list of whole numbers"),
+        (DOOR | {"years": 1900}, "h.toml: years = 1900: must be a list of whole numbers"),
+        (DOOR | {"names": {"a": 1}}, "h.toml: names = {'a': 1}: must be a table of strings"),
+        (DOOR | {"windows": [{"pane": "oak"}, {"open": 1}]}, "h.toml: [windows][1]: open = 1: must be true or false"),
+        (DOOR | {"windows": [3]}, "h.toml: [windows][0] = 3: must be a table"),
+        ({"door": {}}, "h.toml: [door]: lacks 'pane'"),
+        (DOOR | {"floors": 0}, "h.toml: a house has a floor"),
+    ],
+)
+def test_a_table_that_is_none_of_it_is_refused_in_one_line(values, message):
+    with pytest.raises(NgptError) as caught:
+        from_table(House, values, "h.toml")
+    assert str(caught.value).startswith(message) and "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 200
+
+
+def test_numbers_of_thousands_of_digits_are_no_traceback():
+    with pytest.raises(NgptError, match="thousands of digits"):
+        check(16**5000, int, "a.json")

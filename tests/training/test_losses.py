@@ -343,7 +343,7 @@ def test_no_code_is_run_from_weight_files(tmp_path, capsys, monkeypatch):
         ({"kinds": "l1"}, "unknown key 'kinds'"),
         ({"l1": -1.0}, "not negative"),
         ({"l1": float("nan")}, "must be finite"),
-        ({"l1": "much"}, "must be like 0.01"),
+        ({"l1": "much"}, "must be a number, like 0.01"),
         ({"evaluations": 0}, "at least 1"),
     ],
 )

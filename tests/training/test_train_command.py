@@ -90,6 +90,9 @@ def test_views_of_ones_own_train_a_network(train, tmp_path):
     assert "finished at step 2" in output and "relMSE" in output
     _, output, _ = train("--config", "configs/fast.toml", "--out", str(out), *arguments, "--set", "run.steps=3")
     assert "at step 2 of 3" in output and "finished at step 3" in output
+    # By name, and without a word.
+    quietly = train("--config", "fast", "--out", str(out), *arguments, "--set", "run.steps=4", "-q")
+    assert quietly == (0, "", "")
     image = ngpt.denoise(SyntheticCrop("", 2).stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
     assert image.shape == (32, 32, 3)
 

@@ -256,11 +256,14 @@ def test_settings_are_checked(tmp_path):
     assert read_settings(path, ["run.steps=7", "optimizer.schedule=cosine"]).run.steps == 7
     for change, complaint in [
         ("run.stepz=7", "unknown key 'stepz'"),
-        ("run.steps=many", "must be like 600000"),
+        ("run.steps=many", "steps = 'many': must be a whole number, like 600000"),
         ("run.steps=0", "at least 1"),
+        ("model.channels=[1.5]", r"\[model\]: channels = \[1.5\]: must be a list of whole numbers"),
+        ("augmentation.depth=[1]", r"depth = \[1\]: must be a list of 2 numbers, like \[0.1, 1.1\]"),
+        ("model=3", r"a\.toml: \[model\] = 3: must be a table"),
         ("optimizer.schedule=steep", "choose one of"),
         ("optimizer.ema=1.0", "below 1"),
-        ("runs.steps=7", "unknown 'runs'"),
+        ("runs.steps=7", "unknown key 'runs'"),
         ("run", r"table\.key=value"),
         ("model.inputs=['primal', 'x']", "input 'x'"),
     ]:

@@ -1,0 +1,43 @@
+"""``ngpt evaluate``: every method on the same scenes with the same clock."""
+
+import argparse
+from dataclasses import replace
+from pathlib import Path
+
+from ngpt.cli.arguments import add_config
+from ngpt.system import configs
+from ngpt.system.console import Console
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Writes results.json, results.csv, results.md, plots, pictures and report.html into DIR. What is done is kept "
+        "in DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew."
+    )
+    add_config(parser, configs.EVALUATION, "scenes, methods and metrics")
+    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the results")
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
+    parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
+    parser.add_argument("--advice", type=Path, metavar="FILE", help="also write the table that `ngpt advise` reads")
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    path = configs.find_config(args.config, configs.EVALUATION)
+    # Here and not above: a mistyped option is said at once.
+    from ngpt.evaluation.config import read_config
+    from ngpt.evaluation.run import evaluate
+    from ngpt.evaluation.stacks import write_json
+    from ngpt.measure.advice import make_table
+    from ngpt.report.evaluation import write_evaluation_report
+
+    config = read_config(path)
+    config = replace(config, scenes=(*config.scenes, *args.scenes))
+    results = evaluate(config, args.out, console, args.command, args.cache)
+    write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
+    if args.advice:
+        write_json(args.advice, make_table(results))
+    absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
+    if absent:
+        console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")
+    console.say(f"{args.out}/results.md, {args.out}/report.html")
+    return 1 if absent else 0

@@ -1,0 +1,56 @@
+"""``ngpt export``: writes a reconstruction as an ONNX file."""
+
+import argparse
+from pathlib import Path
+
+from ngpt.classical.poisson import DEFAULT_ALPHA
+from ngpt.cli.arguments import add_force
+from ngpt.errors import NgptError
+from ngpt.system.console import Console
+from ngpt.system.files import atomic_output, check_output
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as `ngpt train` makes them")
+    what.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
+    parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
+    parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
+    parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
+    parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.onnx", help="model to write")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    for path in (args.output, args.statistics):
+        if path is not None:
+            check_output(path, args.force)
+    if not args.weights and (args.statistics or args.vector):
+        raise NgptError("--statistics and --vector belong to networks; leave them out for a classical method")
+    for path in write(args):
+        console.say(f"{path}: {path.stat().st_size} bytes")
+    return 0
+
+
+def write(args: argparse.Namespace) -> list[Path]:
+    """Writes what the arguments ask for; returns the files."""
+    if not args.weights:
+        from ngpt.export.poisson import l2_model
+
+        models = {args.output: l2_model(args.alpha)}
+    else:
+        from ngpt.export.network import network_model, statistics_model
+
+        name = args.weights.stem
+        models = {args.output: network_model(args.weights, name, args.precision)}
+        if args.statistics:
+            models[args.statistics] = statistics_model(args.weights, name)
+    for path, model in models.items():
+        with atomic_output(path, args.force) as temporary:
+            temporary.write_bytes(model.SerializeToString())
+    if args.vector:
+        from ngpt.export.vector import write_vector
+
+        write_vector(models[args.output], args.vector, args.force)
+    return list(models)

@@ -1,0 +1,79 @@
+"""``ngpt train``: trains a network, or continues a run."""
+
+import argparse
+import json
+from contextlib import ExitStack
+from pathlib import Path
+
+from ngpt.cli.arguments import add_config
+from ngpt.errors import NgptError
+from ngpt.system import configs
+from ngpt.system.console import Console
+from ngpt.system.files import atomic_output, exclusive
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Run the same command again to continue a run that was stopped. Several GPUs: "
+        "torchrun --nproc-per-node N train.py ..., or torchrun --nproc-per-node N -m ngpt train ..."
+    )
+    add_config(parser, configs.TRAINING, "settings")
+    parser.add_argument("--out", help="folder of the run: checkpoint, weights, log; made if it is not there")
+    parser.add_argument(
+        "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, for example run.steps=1000"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    config = configs.find_config(args.config, configs.TRAINING)
+    # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
+    from ngpt.training.cost import cost
+    from ngpt.training.distributed import Processes
+    from ngpt.training.examples import Mixture, open_crops, split
+    from ngpt.training.loss import make_loss
+    from ngpt.training.settings import read_settings
+    from ngpt.training.trainer import Trainer, show
+
+    settings = read_settings(config, args.set)
+    if args.dry_run:
+        print(cost(settings))
+        return 0
+    if not args.out:
+        raise NgptError("--out is missing: the folder for checkpoint, weights and log")
+    out = Path(args.out)
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{out}: cannot be made: {error.strerror}; name another folder with --out") from error
+    say = (lambda text: None) if console.quiet else show
+    loss = make_loss(settings.loss)
+    processes = Processes()
+    with ExitStack() as stack:
+        if processes.rank == 0:
+            stack.enter_context(exclusive(out))
+        on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
+        crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
+        streams = [stack.enter_context(stream(f)) for f in settings.data.folders if f.endswith(".toml")]
+        training = Mixture(crops, *streams)
+        # What is read from a stream is replaced: it must not be kept.
+        trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams, say=say)
+        if trainer.checkpoint.exists():
+            trainer.resume()
+            say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
+        if processes.rank == 0:
+            with atomic_output(out / "settings.json", overwrite=True) as temporary:
+                temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+        finished = trainer.run()
+    processes.close()
+    say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
+    return 0 if finished or not trainer.signal else 128 + trainer.signal
+
+
+def stream(config: str):
+    """Crops of that dataset configuration, rendered in another process while they are trained on."""
+    from data_gen.dataset.config import read_config
+    from data_gen.dataset.jobs import processes
+    from data_gen.dataset.stream import Stream
+
+    return Stream(read_config(configs.find_config(config, configs.DATASET)), processes(1))

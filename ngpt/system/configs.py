@@ -1,0 +1,34 @@
+"""The configurations that come with ngpt, by name, wherever it is installed."""
+
+import os
+from pathlib import Path
+
+from ngpt.errors import NgptError
+
+# In an installed package they lie inside of it, in the repository beside it.
+_PACKAGE = Path(__file__).parents[1]
+FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if f.is_dir()), _PACKAGE / "configs")
+
+# Three kinds, by what their names begin with; those of training begin with neither of the others.
+DATASET, EVALUATION, TRAINING = "data-", "eval-", ""
+
+
+def names(kind: str) -> list[str]:
+    """The configurations of one kind: ``DATASET``, ``EVALUATION`` or ``TRAINING``."""
+    found = sorted(path.stem for path in FOLDER.glob("*.toml"))
+    if kind == TRAINING:
+        return [name for name in found if not name.startswith((DATASET, EVALUATION))]
+    return [name for name in found if name.startswith(kind)]
+
+
+def find_config(name: str, kind: str) -> Path:
+    """The file called ``name``; where there is none, the configuration of that name that comes with ngpt.
+
+    Raises NgptError where there is neither, with the names of that kind.
+    """
+    if os.path.exists(name) and not os.path.isdir(name):
+        return Path(name)
+    stem, known = name.removesuffix(".toml"), names(kind)
+    if stem in known:
+        return FOLDER / f"{stem}.toml"
+    raise NgptError(f"{name}: cannot be read: no such file; configurations that come with ngpt: {', '.join(known)}")

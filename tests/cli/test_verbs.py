@@ -1,0 +1,117 @@
+"""Verbs as a whole: what they import, the scripts that are doors to some of them, and what they say when stopped."""
+
+import importlib
+import re
+import runpy
+import subprocess
+import sys
+
+import pytest
+
+from ngpt.cli import VERBS, main
+
+DOORS = {"dataset": "data_gen/__main__.py", "train": "train.py", "evaluate": "eval.py", "export": "export/__main__.py"}
+
+
+def run_python(code, *arguments):
+    return subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True, check=False)
+
+
+def stopped(function, arguments, capfd):
+    """Standard output and error of a command that ends before it works."""
+    with pytest.raises(SystemExit) as exit:
+        function(arguments)
+    return exit.value.code, *capfd.readouterr()
+
+
+def test_no_help_imports_what_is_heavy():
+    code = (
+        "import contextlib, io, sys\n"
+        "from ngpt.cli import main\n"
+        "heavy = {'torch', 'mitsuba', 'drjit', 'onnx', 'skimage'}\n"
+        "for verb in ['', *sys.argv[1:]]:\n"
+        "    arguments, unwanted = ([verb, '--help'], heavy) if verb else (['--help'], heavy | {'numpy'})\n"
+        "    with contextlib.suppress(SystemExit), contextlib.redirect_stdout(io.StringIO()): main(arguments)\n"
+        "    assert not unwanted & set(sys.modules), (arguments, unwanted & set(sys.modules))\n"
+    )
+    run = run_python(code, *VERBS)
+    assert run.returncode == 0, run.stderr
+
+
+def test_a_verb_imports_no_other(tmp_path):
+    code = (
+        "import sys\n"
+        "from ngpt.cli import main\n"
+        "main(['merge', 'nowhere.exr', '-o', sys.argv[1]])\n"
+        "print(*sorted(m for m in sys.modules if m.startswith('ngpt.cli.')))"
+    )
+    assert run_python(code, str(tmp_path / "x.exr")).stdout.split() == ["ngpt.cli.arguments", "ngpt.cli.merge"]
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_wrong_option_is_said_in_one_line(verb, capfd):
+    status, output, errors = stopped(main, [verb, "--nonsense"], capfd)
+    assert status == 2 and output == "" and errors.count("\n") == 1
+    assert re.match(rf"ngpt: error: .*; see `ngpt( {verb})? --help`\n", errors)
+
+
+@pytest.mark.parametrize("verb", DOORS)
+def test_a_door_takes_what_its_verb_takes(verb, capfd):
+    door = runpy.run_path(DOORS[verb])["main"]
+    helps = [stopped(door, ["--help"], capfd), stopped(main, [verb, "--help"], capfd)]
+    assert [status for status, *_ in helps] == [0, 0]
+    ours, theirs = (output[output.index("\n\n") :] for _, output, _ in helps)
+    assert ours == theirs and "--help" in ours
+    status, _, errors = stopped(door, ["--nonsense"], capfd)
+    assert (
+        status == 2 and errors.startswith("usage: python ") and "error: the following arguments are required" in errors
+    )
+
+
+@pytest.mark.parametrize(
+    ("verb", "arguments", "message"),
+    [
+        ("dataset", ["--config", "x", "--out", "y"], "interrupted; run the same command to continue"),
+        ("train", ["--config", "x"], "interrupted; run the same command to continue"),
+        ("evaluate", ["--config", "x", "--out", "y"], "interrupted; the same command goes on from here"),
+        ("export", ["-o", "x.onnx"], "interrupted"),
+    ],
+)
+def test_ctrl_c_says_what_becomes_of_the_work(verb, arguments, message, capfd, monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(importlib.import_module(f"ngpt.cli.{verb}"), "run", interrupt)
+    assert main([verb, *arguments]) == 130
+    assert capfd.readouterr().err == f"ngpt: error: {message}\n"
+    assert runpy.run_path(DOORS[verb])["main"](arguments) == 130
+    assert capfd.readouterr().err.endswith(f": error: {message}\n")
+
+
+def test_results_name_the_command_that_made_them(monkeypatch):
+    told, arguments = [], ["--config", "x", "--out", "a folder"]
+    monkeypatch.setattr("ngpt.cli.evaluate.run", lambda args, console: told.append(args.command) or 0)
+    assert main(["evaluate", *arguments]) == 0 == runpy.run_path("eval.py")["main"](arguments)
+    assert told == [f"{program} --config x --out 'a folder'" for program in ("ngpt evaluate", "python eval.py")]
+
+
+@pytest.mark.parametrize(
+    ("lacking", "arguments", "extra"),
+    [
+        ("torch", ["train", "--config", "tiny", "--dry-run"], "train"),
+        ("onnx", ["export", "-o", "{out}"], "export"),
+    ],
+)
+def test_a_package_that_is_not_installed_is_named_with_its_extra(lacking, arguments, extra, tmp_path):
+    code = f"import sys; sys.modules['{lacking}'] = None; from ngpt.cli import main; sys.exit(main(sys.argv[1:]))"
+    run = run_python(code, *(a.format(out=tmp_path / "x.onnx") for a in arguments))
+    told = f"ngpt: error: {arguments[0]} needs the package '{lacking}'; `pip install 'ngpt-recon[{extra}]'`\n"
+    assert (run.returncode, run.stderr) == (2, told)
+
+
+@pytest.mark.parametrize("verb", ["dataset", "train", "evaluate"])
+def test_a_configuration_that_is_not_there_is_told_what_there_is(verb, tmp_path, capfd):
+    assert main([verb, "--config", "nowhere", "--out", str(tmp_path / "out")]) == 2
+    errors = capfd.readouterr().err
+    assert errors.startswith("ngpt: error: nowhere: cannot be read: no such file; configurations that come with ngpt: ")
+    assert "tiny" in errors and errors.count("\n") == 1 and not (tmp_path / "out").exists()
