@@ -17,7 +17,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     parser.add_argument("--pilot", type=positive, default=4, metavar="SPP", help="samples of the pilot (default: 4)")
     parser.add_argument("--seed", type=natural, default=0, help="of the pilot (default: 0)")
-    parser.add_argument("--table", metavar="FILE", help="measurements, as `python eval.py --advice FILE` writes them")
+    parser.add_argument("--table", metavar="FILE", help="measurements, as `ngpt evaluate --advice FILE` writes them")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
