@@ -1,15 +1,13 @@
 """What every benchmark records: versions, threads, medians and spread, so that a result can be judged later."""
 
-import json
-import os
-import platform
 import statistics
-import subprocess
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+
+from ngpt.system import machine
+from ngpt.system.writing import write_json
 
 
 def measure(calls: dict[str, Callable[[], object]], repeats: int) -> dict[str, dict]:
@@ -33,33 +31,11 @@ def summary(values: list[float]) -> dict[str, float]:
 
 
 def metadata(*packages: str) -> dict:
-    """Where and with what a benchmark ran."""
-    versions = {}
-    for package in ("ngpt-recon", "numpy", "scipy", *packages):
-        try:
-            versions[package] = version(package)
-        except PackageNotFoundError:
-            versions[package] = None
-    commit = subprocess.run(["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False)
-    return {
-        "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "commit": commit.stdout.strip() or None,
-        "python": platform.python_version(),
-        "versions": versions,
-        "machine": platform.machine(),
-        "cpu": _cpu(),
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-    }
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()
+    """Where, when and with what a benchmark ran."""
+    return {"date": datetime.now(UTC).strftime("%Y-%m-%d"), **machine.metadata("numpy", "scipy", *packages)}
 
 
 def save(path: str | Path, result: dict) -> None:
+    """Writes or replaces a JSON file, and makes its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
-    Path(path).write_text(json.dumps(result, indent=2) + "\n")
+    write_json(Path(path), result)

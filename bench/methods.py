@@ -15,14 +15,14 @@ import numpy as np
 import ngpt
 from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
-from ngpt.evaluation.results import write_text
-from ngpt.evaluation.stacks import reference_noise
+from ngpt.evaluation.references import reference_noise
 from ngpt.measure.metrics import compare, relative_squared_error
 from ngpt.methods import METHODS, reconstruct
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_text
 
 METRIC = "relMSE trimmed"
 CROP = 48  # pixels, shown four times as large

@@ -31,11 +31,11 @@ import ngpt
 from bench.common import metadata, save, summary
 from ngpt.evaluation.config import scene_name
 from ngpt.evaluation.gradientmap import variances_of_differences, write_map
-from ngpt.evaluation.results import write_text
-from ngpt.evaluation.stacks import reference_noise
+from ngpt.evaluation.references import reference_noise
 from ngpt.measure.metrics import compare
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.system.writing import write_text
 
 METHODS = ("l2", "l1", "wcv")
 METRIC = "relMSE trimmed"

@@ -1,8 +1,9 @@
-"""What samples cost on this machine: the kinds of stacks that are compared at equal time, and their seconds."""
+"""What samples cost on this machine: stacks that are compared at equal time, and their seconds."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import mitsuba as mi
@@ -10,38 +11,37 @@ import mitsuba as mi
 from data_gen.render import render_stack
 from ngpt.stack import GradientStack
 
-# Kind of stack -> how it is rendered: with gradients; path tracing with albedo, normal and depth; path tracing alone.
-KINDS: dict[str, dict[str, Any]] = {
-    "gradients": {"sampler": "auto"},
-    "features": {"sampler": "primal"},
-    "path": {"sampler": "primal", "with_features": False},
-}
+
+def warm_up(scene: mi.Scene, options: Mapping[str, Any]) -> GradientStack:
+    """Has the kernels of a render compiled, of which the number of samples is no part; its stack of one sample.
+
+    ``options`` are those of ``render_stack``. Raises NgptError for a sampler that cannot render this scene.
+    """
+    return render_stack(scene, 1, 0, **options)
 
 
-def warm_up(scene: mi.Scene, kind: str) -> None:
-    """Has the kernels of a kind compiled; the number of samples is no part of them."""
-    render_stack(scene, 1, 0, **KINDS[kind])
-
-
-def timed(scene: mi.Scene, kind: str, spp: int, seed: int) -> tuple[GradientStack, float]:
+def timed(scene: mi.Scene, options: Mapping[str, Any], spp: int, seed: int) -> tuple[GradientStack, float]:
     """A stack and its wall-clock seconds."""
     start = time.perf_counter()
-    stack = render_stack(scene, spp, seed, **KINDS[kind])
+    stack = render_stack(scene, spp, seed, **options)
     return stack, time.perf_counter() - start
 
 
-def measure(scene: mi.Scene, spp: int, repeats: int) -> tuple[dict[str, list[float]], GradientStack]:
-    """Seconds per sample per pixel count of each kind, ``repeats`` times in turn, and the last stack with gradients.
+def measure(
+    scene: mi.Scene, renders: Mapping[str, Mapping[str, Any]], spp: int, repeats: int
+) -> tuple[dict[str, list[float]], GradientStack]:
+    """Seconds per sample of the whole image for each render, name -> options, and the last stack of the first of them.
 
-    In turn, so that a busy moment hits all kinds alike.
+    Each is rendered ``repeats`` times, in turn, so that a busy moment hits all alike.
     """
-    seconds: dict[str, list[float]] = {kind: [] for kind in KINDS}
-    for kind in KINDS:
-        warm_up(scene, kind)
+    seconds: dict[str, list[float]] = {name: [] for name in renders}
+    first = next(iter(renders))
+    for options in renders.values():
+        warm_up(scene, options)
     for seed in range(repeats):
-        for kind in KINDS:
-            rendered, duration = timed(scene, kind, spp, seed)
-            seconds[kind].append(duration / spp)
-            if kind == "gradients":
+        for name, options in renders.items():
+            rendered, duration = timed(scene, options, spp, seed)
+            seconds[name].append(duration / spp)
+            if name == first:
                 stack = rendered
     return seconds, stack

@@ -33,10 +33,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.costs import measure
     from data_gen.scenes.load import load_scene
+    from ngpt.evaluation.renders import DEFAULTS
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))
-    seconds, pilot = measure(scene, max(args.pilot, 2), 1)
+    # Gradients first, whose stack is the pilot.
+    seconds, pilot = measure(scene, {render.name: render.options for render in DEFAULTS}, max(args.pilot, 2), 1)
     pixels = pilot.width * pilot.height
     cost = {kind: min(values) / pixels for kind, values in seconds.items()}
     advices = advise(table, describe(pilot), cost, pixels, seconds=args.seconds, error=args.error)

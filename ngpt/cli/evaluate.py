@@ -26,9 +26,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Here and not above: a mistyped option is said at once.
     from ngpt.evaluation.config import read_config
     from ngpt.evaluation.run import evaluate
-    from ngpt.evaluation.stacks import write_json
     from ngpt.measure.advice import make_table
     from ngpt.report.evaluation import write_evaluation_report
+    from ngpt.system.writing import write_json
 
     config = read_config(path)
     config = replace(config, scenes=(*config.scenes, *args.scenes))

@@ -64,12 +64,13 @@ class Axes:
             f'<text x="{self.left + 6}" y="{y - 4:.1f}" fill="{color}" font-size="11">{escape(label)}</text>'
         )
 
-    def legend(self, names: list[tuple[str, str]]) -> list[str]:
-        """Names with their colours, at the right."""
+    def legend(self, names: list[tuple[str, str, str]]) -> list[str]:
+        """Names with their colours and dashes, at the right."""
         parts = []
-        for i, (name, color) in enumerate(names):
+        for i, (name, color, dash) in enumerate(names):
             y = 40 + 17 * i
-            parts.append(f'<path d="M{self.right + 10} {y}h18" stroke="{color}" stroke-width="3"/>')
+            dashes = f' stroke-dasharray="{dash}"' if dash else ""
+            parts.append(f'<path d="M{self.right + 10} {y}h18" stroke="{color}" stroke-width="3"{dashes}/>')
             parts.append(f'<text x="{self.right + 34}" y="{y + 4}">{escape(name)}</text>')
         return parts
 

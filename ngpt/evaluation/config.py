@@ -8,15 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.measure.metrics import FORMULAS
+from ngpt.evaluation.renders import KINDS, Render
+from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.system.records import from_table, read_toml
-
-# What a method is given, and what the renderer makes for it:
-#   gradients  a gradient stack of the nominal samples per pixel
-#   features   path tracing with albedo, normal and depth, as many samples as the gradient stack's time buys
-#   path       path tracing alone, likewise
-KINDS = ("gradients", "features", "path")
 
 # Of which seeds pictures are kept.
 IMAGES = ("first", "all", "none")
@@ -24,17 +19,19 @@ IMAGES = ("first", "all", "none")
 
 @dataclass(frozen=True)
 class Column:
-    """A method as the tables have it: one of the registry's, with options, on a kind of stack.
+    """A method as the tables have it: one of the registry's, with options, on a kind of stack by a sampler.
 
-    ``name``     in tables and file names
+    ``name``     in tables: the family, and the sampler in brackets where several are compared
+    ``family``   what the configuration calls it: a method or a variant
     ``method``   in ``ngpt.methods.METHODS``; another name makes a row that says so
-    ``stack``    one of ``KINDS``
+    ``render``   what it is given
     ``options``  of the method
     """
 
     name: str
+    family: str
     method: str
-    stack: str
+    render: Render
     options: dict[str, Any] = field(default_factory=dict)
 
 
@@ -48,6 +45,9 @@ class Config:
     spp: tuple[int, ...] = (4, 16, 64)
     seeds: int = 3
     methods: tuple[str, ...] = ("primal", "l1", "wcv")
+    samplers: tuple[str, ...] = (KINDS["gradients"],)
+    rivals: tuple[str, ...] = (KINDS["features"],)
+    clock: str = KINDS["gradients"]
     metrics: tuple[str, ...] = ("relMSE", "relMSE trimmed", "relMSE NGPT", "SMAPE", "PSNR", "SSIM", "FLIP")
     primary: str = "relMSE trimmed"
     reference_spp: int = 0
@@ -56,21 +56,23 @@ class Config:
     timing_repeats: int = 3
     images: str = "first"
     elpips: dict[str, str] = field(default_factory=dict)
-    references: dict[str, str] = field(default_factory=dict)
+    references: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         low = min((*self.spp, self.seeds, *self.size, self.timing_spp, self.timing_repeats), default=0)
-        unknown = [name for name in (*self.metrics, self.primary) if name not in FORMULAS]
+        unknown = [name for name in (*self.metrics, self.primary) if name not in METRICS]
         for bad, text in (
             (not self.scenes, "no scenes: name built-in scenes, scene files, patterns or folders of stacks"),
             (not self.spp or not self.methods, "spp and methods must not be empty"),
             (low < 1, "spp, seeds, size and timing must be at least 1"),
             (self.reference_spp <= 0 and self.reference_seconds <= 0, "set reference_spp or reference_seconds"),
-            (bool(unknown), f"no metric '{''.join(unknown[:1])}'; there are: {', '.join(FORMULAS)}"),
+            (bool(unknown), f"no metric '{''.join(unknown[:1])}'; there are: {', '.join(METRICS)}"),
             (self.primary not in self.metrics, f"primary = '{self.primary}' is not among metrics"),
             (self.images not in IMAGES, f"images = '{self.images}': choose one of: {', '.join(IMAGES)}"),
             (len(set(self.methods)) < len(self.methods), "a method is listed twice"),
+            (not self.samplers or not self.rivals, "samplers and rivals must not be empty"),
+            (len({*self.samplers, *self.rivals}) < len(self.samplers) + len(self.rivals), "a sampler is listed twice"),
         ):
             if bad:
                 raise NgptError(f"evaluation: {text}")
@@ -79,17 +81,28 @@ class Config:
                 raise NgptError(f"evaluation: variants.{name}: stack must be one of {', '.join(KINDS)}")
             if "method" not in table:
                 raise NgptError(f"evaluation: variants.{name}: method is missing: which one it is a variant of")
+        for name, files in self.references.items():
+            if not isinstance(files, str) and (not isinstance(files, list) or [type(f) for f in files] != [str, str]):
+                raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two halves")
+        parts = [file_part(column.name) for column in self.columns()]
+        if repeated := next((part for i, part in enumerate(parts) if part in parts[:i]), ""):
+            raise NgptError(f"evaluation: two columns would be called '{repeated}'; name the variant otherwise")
 
     def columns(self) -> list[Column]:
-        """The methods in the order of the tables."""
-        return [self._column(name) for name in self.methods]
+        """Methods and samplers in the order of the tables."""
+        return [column for name in self.methods for column in self._columns(name)]
 
-    def _column(self, name: str) -> Column:
+    def _columns(self, name: str) -> list[Column]:
+        """A method or variant with each of the samplers that are listed for its kind of stack, or with its own."""
         table = dict(self.variants.get(name, {}))
-        method, stack = table.pop("method", name), table.pop("stack", "")
+        method, kind, sampler = table.pop("method", name), table.pop("stack", ""), table.pop("sampler", "")
         needs = METHODS[method].needs if method in METHODS else ()
-        default = "gradients" if "dx" in needs else "features" if len(needs) > 1 else "path"
-        return Column(name, method, stack or default, table)
+        kind = kind or ("gradients" if "dx" in needs else "features" if len(needs) > 1 else "path")
+        if sampler:
+            return [Column(name, name, method, Render(kind, sampler), table)]
+        samplers = self.samplers if kind == "gradients" else self.rivals
+        names = [f"{name} ({sampler})" if len(samplers) > 1 else name for sampler in samplers]
+        return [Column(n, name, method, Render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
 
     def scene_files(self) -> dict[str, str]:
         """Name -> built-in scene, scene file or folder of stacks; patterns are resolved."""
@@ -107,6 +120,11 @@ class Config:
 
     def to_dict(self) -> dict:
         return asdict(self)
+
+
+def file_part(column: str) -> str:
+    """What file names call a column: "wcv (gpt-basic)" is wcv-gpt-basic."""
+    return column.replace(" (", "-").removesuffix(")")
 
 
 def scene_name(scene: str) -> str:

@@ -7,17 +7,20 @@ from html import escape
 
 from ngpt.evaluation.axes import Axes
 
+# Of the samplers of one method.
+DASHES = ("", "7 3", "2 3", "7 3 2 3", "12 4", "1 5")
 COLORS = ("#777777", "#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#c9a400", "#17a2a8", "#8a5a2b", "#d62f45", "#5b4fd6")
 
 
 @dataclass(frozen=True)
 class Point:
-    """A method at a sample count: total seconds and error, both positive."""
+    """A method at a sample count: total seconds and error, both positive; one colour for each ``family``."""
 
     method: str
     spp: int
     seconds: float
     error: float
+    family: str = ""
 
 
 def pareto(points: list[Point]) -> list[bool]:
@@ -31,33 +34,47 @@ def pareto(points: list[Point]) -> list[bool]:
     ]
 
 
-def draw(points: list[Point], title: str, metric: str, noise: float | None = None) -> str:
+def draw(points: list[Point], title: str, metric: str, doubt: float | None = None) -> str:
     """An SVG: a line for each method over its sample counts, filled rings for the Pareto set, the line through it.
 
-    ``noise`` is the reference's, below which errors mean nothing: a dashed line, where it is in the picture.
+    Samplers of one method share its colour, and differ in dashes. ``doubt`` is the error below which the reference
+    cannot tell methods apart: a dashed line, where it is in the picture.
     """
     x = [p.seconds for p in points]
     y = [p.error for p in points]
-    axes = Axes((min(x) / 1.15, max(x) * 1.15), (min(y) / 1.2, max(y) * 1.2))
+    margin = max(160, 40 + 7 * max(len(p.method) for p in points))
+    axes = Axes((min(x) / 1.15, max(x) * 1.15), (min(y) / 1.2, max(y) * 1.2), width=520 + margin, margin=margin)
     parts = axes.frame("seconds, rendering and reconstruction", metric, title)
     best = sorted((p for p, is_best in zip(points, pareto(points), strict=True) if is_best), key=lambda p: p.seconds)
     path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in best)
     parts.append(f'<path d="M{path}" fill="none" stroke="#000000" stroke-width="7" stroke-opacity="0.12"/>')
-    if noise and axes.y_range[0] < noise < axes.y_range[1]:
-        parts.append(axes.level(noise, "#999999", "noise of reference"))
-    methods = list(dict.fromkeys(p.method for p in points))
-    for i, method in enumerate(methods):
-        color = COLORS[i % len(COLORS)]
+    if doubt and axes.y_range[0] < doubt < axes.y_range[1]:
+        parts.append(axes.level(doubt, "#999999", "what the reference can tell"))
+    looks = _looks(points)
+    for method, (color, dash) in looks.items():
         own = sorted((p for p in points if p.method == method), key=lambda p: p.spp)
         path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in own)
-        dashes = f' stroke-dasharray="{5 * (i // len(COLORS))} 3"' if i >= len(COLORS) else ""
+        dashes = f' stroke-dasharray="{dash}"' if dash else ""
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
         for p in own:
             shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
             name = escape(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
             look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
             parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")
-    parts += axes.legend([(m, COLORS[i % len(COLORS)]) for i, m in enumerate(methods)])
+    parts += axes.legend([(method, *look) for method, look in looks.items()])
     note = "rings: Pareto set"
     parts.append(f'<text x="{axes.right + 10}" y="{axes.bottom}" font-size="11" fill="#555555">{note}</text>')
     return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _looks(points: list[Point]) -> dict[str, tuple[str, str]]:
+    """(colour, dashes) of each method: colours by family, dashes by its members and by the rounds of the colours."""
+    families: dict[str, list[str]] = {}
+    for name, family in dict.fromkeys((p.method, p.family or p.method) for p in points):
+        families.setdefault(family, []).append(name)
+    looks = {}
+    for i, names in enumerate(families.values()):
+        for j, name in enumerate(names):
+            looks[name] = (COLORS[i % len(COLORS)], DASHES[(i // len(COLORS) + j) % len(DASHES)])
+    # In the order of the points.
+    return {name: looks[name] for name in dict.fromkeys(p.method for p in points)}

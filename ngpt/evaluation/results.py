@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ngpt.evaluation.averages import mean, median, summary
 from ngpt.evaluation.frontier import Point, draw, pareto
-from ngpt.evaluation.stacks import summary, write_json
 from ngpt.evaluation.tables import tables
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total")
 
@@ -24,21 +21,16 @@ def write_results(results: dict[str, Any], out: Path) -> None:
     results["plots"] = {"frontier": {}}
     (out / "plots").mkdir(exist_ok=True)
     for scene in [*results["scenes"], None]:
-        points = _points([row for row in results["summary"] if row["scene"] == scene and _is_drawn(row)])
+        points = _points(results, [row for row in results["summary"] if row["scene"] == scene and _is_drawn(row)])
         if points:
             name = scene or "mean"
             title = scene or f"geometric mean over {len(shared_scenes(results))} scenes"
-            noise = results["scenes"][scene]["reference"]["noise"] if scene else None
-            write_text(out / f"plots/frontier-{name}.svg", draw(points, title, results["primary"], noise))
+            doubt = results["scenes"][scene]["reference"]["doubt"] if scene else None
+            write_text(out / f"plots/frontier-{name}.svg", draw(points, title, results["primary"], doubt))
             results["plots"]["frontier"][name] = f"plots/frontier-{name}.svg"
     write_json(out / "results.json", results)
     write_text(out / "results.csv", as_csv(results))
     write_text(out / "results.md", tables(results))
-
-
-def write_text(path: Path, text: str) -> None:
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(text)
 
 
 def shared_scenes(results: dict[str, Any]) -> list[str]:
@@ -50,8 +42,9 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
     """A row for each scene, spp and method: median and quartiles over seeds; then geometric means over scenes.
 
     ``error`` is the primary metric's median. Means, with scene None, are of methods that are there on all scenes; a
-    metric that is not an error (PSNR, SSIM) has its arithmetic mean. ``pareto`` says that no cell of the scene is both
-    faster and better.
+    metric that is not an error (PSNR, SSIM) has its arithmetic mean. An error below 0, which is one that the halves
+    of a reference cannot tell from 0, has no geometric mean. ``pareto`` says that no cell of the
+    scene is both faster and better.
     """
     rows: list[dict[str, Any]] = []
     groups: dict[tuple, list[dict[str, Any]]] = {}
@@ -64,7 +57,7 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
             values = [cell["metrics"][name] for cell in cells if cell["metrics"].get(name) is not None]
             if values:
                 scores[name] = summary(values)
-        seconds = {key: _median(cell["seconds"][key] for cell in cells) for key in _SECONDS}
+        seconds = {key: median(cell["seconds"][key] for cell in cells) for key in _SECONDS}
         rows.append(_row(results, scene, spp, method, scores, seconds, len(cells)))
     scenes = shared_scenes(results)
     for spp in results["settings"]["spp"]:
@@ -73,31 +66,33 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
             if scenes and len(parts) == len(scenes):
                 scores = {}
                 for name in parts[0]["metrics"]:
-                    if all(name in row["metrics"] for row in parts):
-                        lower = results["metrics"][name]["better"] == "lower"
+                    found = [row["metrics"][name] for row in parts if name in row["metrics"]]
+                    lower = results["metrics"][name]["better"] == "lower"
+                    if len(found) == len(parts) and not (lower and min(value["median"] for value in found) < 0):
                         scores[name] = {
-                            key: _mean([row["metrics"][name][key] for row in parts], geometric=lower)
+                            key: mean([value[key] for value in found], geometric=lower)
                             for key in ("median", "low", "high")
                         }
                 times: dict[str, float | None] = {}
                 for key in _SECONDS:
                     known = [row["seconds"][key] for row in parts if row["seconds"][key] is not None]
-                    times[key] = _mean(known, geometric=True) if len(known) == len(parts) else None
+                    times[key] = mean(known, geometric=True) if len(known) == len(parts) else None
                 rows.append(_row(results, None, spp, method, scores, times, min(row["seeds"] for row in parts)))
     for scene in {row["scene"] for row in rows}:
         timed = [row for row in rows if row["scene"] == scene and _is_drawn(row)]
-        for row, is_best in zip(timed, pareto(_points(timed)), strict=True):
+        for row, is_best in zip(timed, pareto(_points(results, timed)), strict=True):
             row["pareto"] = is_best
     return rows
 
 
 def _is_drawn(row: dict[str, Any]) -> bool:
     """Whether there are a time and an error; logarithmic axes know no zero."""
-    return bool(row["error"]) and bool(row["seconds"]["total"])
+    return (row["error"] or 0) > 0 and bool(row["seconds"]["total"])
 
 
-def _points(rows: list[dict[str, Any]]) -> list[Point]:
-    return [Point(row["method"], row["spp"], row["seconds"]["total"], row["error"]) for row in rows]
+def _points(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[Point]:
+    families = {name: entry["family"] for name, entry in results["methods"].items()}
+    return [Point(r["method"], r["spp"], r["seconds"]["total"], r["error"], families[r["method"]]) for r in rows]
 
 
 def _row(
@@ -112,17 +107,6 @@ def _row(
     error = scores.get(results["primary"], {}).get("median")
     row: dict[str, Any] = {"scene": scene, "spp": spp, "method": method, "error": error, "metrics": scores}
     return row | {"seconds": seconds, "seeds": seeds, "pareto": False}
-
-
-def _median(values: Iterable[float | None]) -> float | None:
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
-
-
-def _mean(values: list[float], geometric: bool) -> float:
-    if not geometric:
-        return float(np.mean(values))
-    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))
 
 
 def as_csv(results: dict[str, Any]) -> str:

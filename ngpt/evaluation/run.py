@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import math
-import os
-import platform
-import subprocess
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.cells import Scorer, absence, versions
-from ngpt.evaluation.config import Column, Config
+from ngpt.evaluation.cells import PACKAGES, Scorer, absence
+from ngpt.evaluation.config import Column, Config, file_part
 from ngpt.evaluation.gradientmap import write_map
+from ngpt.evaluation.references import HALVES, Reference
+from ngpt.evaluation.renders import Render
 from ngpt.evaluation.results import write_results
-from ngpt.evaluation.stacks import SceneStacks, reference_noise
+from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
 from ngpt.io.exr import write
 from ngpt.measure.advice import describe
-from ngpt.measure.metrics import FORMULAS, check_size, exposure_mismatch
+from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.report.display import auto_exposure
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import exclusive
-
-# A reconstruction moves the brightness by less; noise of few samples, and fireflies, may reach it.
-MOST_STOPS = 1.0
+from ngpt.system.machine import metadata
 
 
 def evaluate(config: Config, out: Path, console: Console, command: str, cache: Path | None = None) -> dict[str, Any]:
@@ -47,10 +44,15 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
         "title": config.title,
         "command": command,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),
-        "metadata": metadata(),
+        "metadata": metadata(*PACKAGES),
         "settings": config.to_dict(),
         "metrics": {
-            name: {"formula": FORMULAS[name][0], "better": FORMULAS[name][1], "absent": scorer.absent_metrics.get(name)}
+            name: {
+                "formula": METRICS[name].formula,
+                "better": METRICS[name].better,
+                "squared": METRICS[name].squared,
+                "absent": scorer.absent_metrics.get(name),
+            }
             for name in config.metrics
         },
         "primary": config.primary,
@@ -58,7 +60,10 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
             column.name: {
                 "summary": METHODS[column.method].summary if column.method in METHODS else "",
                 "method": column.method,
-                "stack": column.stack,
+                "family": column.family,
+                "stack": column.render.kind,
+                "sampler": column.render.sampler,
+                "render": column.render.name,
                 "options": column.options,
                 "absent": lacks[column.name] or None,
             }
@@ -108,28 +113,19 @@ def _scene(
 ) -> None:
     """Adds a scene and its cells to ``results``; raises NgptError for what concerns all of them."""
     config, name = stacks.config, stacks.name
-    reference, file = stacks.reference()
-    costs = stacks.costs()
-    entry: dict[str, Any] = {"file": stacks.source, "size": [reference.width, reference.height], "cost": costs}
-    pixels = reference["primal"]
-    first = stacks.stack("gradients", stacks.samples("gradients", config.spp[0], costs), 0)
+    reference = stacks.reference()
+    costs = stacks.costs(column.render for column in columns if not lacks[column.name])
+    renders = {column.name: stacks.resolve(column.render) for column in columns}
+    lacks = {n: lacks[n] or stacks.lacks.get(render.name, "") for n, render in renders.items()}
+    pilot = _pilot([render for n, render in renders.items() if not lacks[n]])
+    first = stacks.stack(pilot, stacks.samples(pilot, config.spp[0], costs), 0)
     if stacks.given or name in config.references:
         # Not our own, where fireflies of few samples could pass for another exposure.
-        _check_reference(first, reference, file)
-    # Relative, so that the folder can be moved.
-    picture = out / "images" / name / "reference.exr"
-    if wanted(config.images, 0):
-        picture.parent.mkdir(parents=True, exist_ok=True)
-        write(picture, pixels, overwrite=True)
-    entry["exposure"] = auto_exposure(pixels)
+        reference.check(first)
+    entry: dict[str, Any] = {"file": stacks.source, "size": [first.width, first.height], "cost": costs}
+    entry["exposure"] = auto_exposure(reference.mean)
     entry["pilot"] = describe(first) if "primal_var" in first else None
-    attributes = reference.attributes
-    entry["reference"] = {
-        "image": f"images/{name}/reference.exr" if wanted(config.images, 0) else None,
-        "spp": _number(attributes.get("ngpt:spp")),
-        "seconds": _number(attributes.get("ngpt:seconds")),
-        "noise": _number(reference_noise(reference)) if "primal_var" in reference else None,
-    }
+    entry["reference"] = _reference_entry(reference, scorer, name, out)
     entry["absent"] = None
     cells: list[dict[str, Any]] = []
     for spp in config.spp:
@@ -140,16 +136,17 @@ def _scene(
                 if lacks[column.name]:
                     cells.append(_absent(name, spp, column.name, seed, lacks[column.name]))
                     continue
-                used = stacks.samples(column.stack, spp, costs)
+                render = renders[column.name]
+                used = stacks.samples(render, spp, costs)
 
-                def load(kind: str = column.stack, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
-                    if kind not in held:
-                        held[kind] = stacks.stack(kind, n, s)
-                    return held[kind]
+                def load(render: Render = render, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
+                    if render.name not in held:
+                        held[render.name] = stacks.stack(render, n, s)
+                    return held[render.name]
 
                 image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
-                key = [stacks.stack_key(column.stack, used, seed), _reference_key(file)]
-                cell = scorer.cell(column, load, pixels, key, out / image if image else None)
+                key = stacks.stack_key(render, used, seed)
+                cell = scorer.cell(column, load, reference, key, out / image if image else None)
                 if cell["absent"]:
                     cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
                     continue
@@ -170,7 +167,7 @@ def _scene(
                         "absent": None,
                     }
                 )
-    maps = gradient_map(stacks, costs, out)
+    maps = gradient_map(stacks, pilot, costs, out)
     if maps:
         entry["gradients"] = maps
     # All at once: a scene that fails half-way is absent as a whole.
@@ -178,10 +175,38 @@ def _scene(
     results["cells"] += cells
 
 
-def gradient_map(stacks: SceneStacks, costs: dict, out: Path) -> str | None:
+def _pilot(renders: list[Render]) -> Render:
+    """The gradient stacks that a scene is described by: the usual ones, unless all columns have others."""
+    gradients = [render for render in renders if render.kind == USUAL.kind]
+    return gradients[0] if gradients and USUAL not in gradients else USUAL
+
+
+def _reference_entry(reference: Reference, scorer: Scorer, name: str, out: Path) -> dict[str, Any]:
+    """What results.json says of a reference; writes its pictures."""
+    images = {"reference.exr": reference.mean}
+    if len(reference.images) > 1:
+        images |= {f"reference{half}.exr": image for half, image in zip(HALVES, reference.images, strict=True)}
+    # Relative, so that the folder can be moved.
+    paths = [f"images/{name}/{file}" for file in images]
+    if kept := wanted(scorer.config.images, 0):
+        (out / paths[0]).parent.mkdir(parents=True, exist_ok=True)
+        for path, image in zip(paths, images.values(), strict=True):
+            write(out / path, image, overwrite=True)
+    return {
+        "image": paths[0] if kept else None,
+        "halves": len(reference.images) == 2,
+        "images of halves": paths[1:] if kept else [],
+        "spp": reference.total("ngpt:spp"),
+        "seconds": reference.total("ngpt:seconds"),
+        "noise": reference.noise,
+        "doubt": reference.doubt,
+        "floors": scorer.floors(reference),
+    }
+
+
+def gradient_map(stacks: SceneStacks, render: Render, costs: Costs, out: Path) -> str | None:
     """Draws where gradients pay and where they hurt, from the stack of most samples; its path relative to ``out``."""
-    spp = max(stacks.config.spp)
-    stack = stacks.stack("gradients", stacks.samples("gradients", spp, costs), 0)
+    stack = stacks.stack(render, stacks.samples(render, max(stacks.config.spp), costs), 0)
     if not all(layer in stack for layer in ("direct", "primal_var", "dx_var", "dy_var")):
         return None
     path = f"plots/gradients-{stacks.name}.png"
@@ -195,27 +220,8 @@ def wanted(images: str, seed: int) -> bool:
 
 
 def picture_path(scene: str, spp: int, method: str, seed: int) -> str:
-    """A cell's picture, relative to the folder of results."""
-    return f"images/{scene}/{spp}-{method}{f'-seed{seed}' if seed else ''}.exr"
-
-
-def _check_reference(stack: GradientStack, reference: GradientStack, file: str) -> None:
-    """Raises NgptError for a reference that is of something else."""
-    try:
-        check_size(stack["primal"], reference["primal"])
-    except NgptError as error:
-        raise NgptError(f"reference {file}: {error}") from error
-    stops = exposure_mismatch(reference["primal"], stack["primal"])
-    if abs(stops) > MOST_STOPS:
-        raise NgptError(
-            f"reference {file}: {abs(stops):.1f} stops {'brighter' if stops > 0 else 'darker'} than the renders; "
-            "use one of the same scene and exposure"
-        )
-
-
-def _reference_key(file: str) -> list:
-    status = os.stat(file)
-    return [Path(file).name, status.st_size, status.st_mtime_ns]
+    """A cell's picture, relative to the folder of results; ``method`` is the name of its column."""
+    return f"images/{scene}/{spp}-{file_part(method)}{f'-seed{seed}' if seed else ''}.exr"
 
 
 def _absent(scene: str, spp: int, method: str, seed: int, why: str) -> dict[str, Any]:
@@ -230,26 +236,3 @@ def _number(value: Any) -> float | None:
     except (TypeError, ValueError):
         return None
     return number if math.isfinite(number) else None
-
-
-def metadata() -> dict[str, Any]:
-    """Where and with what the numbers were made."""
-    commit = subprocess.run(
-        ["git", "rev-parse", "--short", "HEAD"], capture_output=True, text=True, check=False, cwd=Path(__file__).parent
-    )
-    return {
-        "versions": versions(),
-        "python": platform.python_version(),
-        "machine": platform.machine(),
-        "cpu": _cpu(),
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
-        "commit": commit.stdout.strip() or None,
-    }
-
-
-def _cpu() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-        return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
-    except (OSError, StopIteration):
-        return platform.processor()

@@ -19,36 +19,40 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.evaluation.results import write_text
+from ngpt.evaluation.config import file_part
 from ngpt.evaluation.run import picture_path
-from ngpt.evaluation.stacks import write_json
 from ngpt.io.exr import read_image
-from ngpt.measure.metrics import EPSILON, check_size
+from ngpt.measure.images import check_size, middle
+from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_json, write_text
 
 
-def flicker_and_bias(images: np.ndarray, reference: np.ndarray, share: float = 0.001) -> dict[str, float]:
+def flicker_and_bias(images: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> dict[str, float]:
     """The two parts of relMSE over seeds, of images (N, H, W, 3), without the worst 0.1 % of the pixels of each.
 
     ``flicker``  mean of v / (r² + 1e-3), v the sample variance over the N images
-    ``bias``     mean of ((m - r)² - v / N) / (r² + 1e-3), m the mean image; what its own noise adds to the square is
+    ``bias``     mean of ((x - r)² - v / N) / (r² + 1e-3), x the mean image; what its own noise adds to the square is
                  taken off, so it is near 0 (of either sign) for an unbiased method
-    Their sum is the expected relMSE. Raises NgptError for fewer than two images, and for another size.
+    Their sum is the expected relMSE. With the two ``halves`` of a reference the square is (x - a)(x - b), and r their
+    mean. Raises NgptError for fewer than two images, and for another size.
     """
     if len(images) < 2:
         raise NgptError(f"{len(images)} image: stability needs those of at least 2 seeds")
-    check_size(images[0], reference)
-    scale = reference.astype(np.float64) ** 2 + EPSILON
+    for half in halves:
+        check_size(images[0], half)
+    reference = middle(tuple(half.astype(np.float64) for half in halves))
+    scale = reference**2 + EPSILON
     mean, variance = images.mean(axis=0, dtype=np.float64), images.var(axis=0, ddof=1, dtype=np.float64)
-    parts = {"flicker": variance / scale, "bias": ((mean - reference) ** 2 - variance / len(images)) / scale}
-    result = {}
-    for name, part in parts.items():
-        values = np.sort(part.mean(axis=-1), axis=None)
-        result[name] = float(values[: values.size - int(share * values.size)].mean())
-    return result
+    noise = variance / len(images)
+    flicker, bias, size = variance, squared_error(mean, *halves) - noise, squared_error(mean, reference) - noise
+    return {
+        "flicker": trimmed_mean(flicker / scale, flicker / scale, share),
+        "bias": trimmed_mean(bias / scale, size / scale, share),
+    }
 
 
 def rolling_shutter(images: np.ndarray) -> np.ndarray:
@@ -76,11 +80,13 @@ def study(out: Path) -> list[dict[str, Any]]:
         if missing:
             raise NgptError(f'{missing}: no such picture; set images = "all" in the configuration, and run it again')
         images = np.stack([read_image(path) for path in paths])
-        reference = read_image(out / results["scenes"][scene]["reference"]["image"])
-        path = out / "stability" / f"{scene}-{spp}-{method}.png"
+        entry = results["scenes"][scene]["reference"]
+        reference = read_image(out / entry["image"])
+        halves = [read_image(out / path) for path in entry["images of halves"]] or [reference]
+        path = out / "stability" / f"{scene}-{spp}-{file_part(method)}.png"
         with atomic_output(path, overwrite=True) as temporary:
             temporary.write_bytes(encode_png(to_srgb8(rolling_shutter(images), auto_exposure(reference))))
-        rows.append({"scene": scene, "spp": spp, "method": method, **flicker_and_bias(images, reference)})
+        rows.append({"scene": scene, "spp": spp, "method": method, **flicker_and_bias(images, *halves)})
     write_json(out / "stability.json", rows)
     write_text(out / "stability.md", table(rows, len(seeds)))
     return rows

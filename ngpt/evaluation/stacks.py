@@ -1,149 +1,154 @@
 """Stacks, references and costs of one scene: rendered once, then taken from the cache.
 
 The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
-files, the size, and the versions that render. In it are KIND-SPP-SEED.exr, where SPP is the number of samples that were
-rendered, reference-*.exr and cost-*.json. A folder of stacks of one's own looks the same, without the costs.
+files, the size, the code that renders, and Mitsuba's version. In it are RENDER-SPP-SEED.exr, where RENDER is a kind of
+stack ("gradients"), followed by the sampler where it is not the usual one ("gradients-gpt-basic"), and SPP the number
+of samples that were rendered; the two halves of references, reference-*-a.exr and -b.exr; and cost-*.json. A folder of
+stacks of one's own looks the same, without the costs; its reference may be one image.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import re
-import statistics
-from collections.abc import Callable
-from importlib.metadata import PackageNotFoundError, version
+import math
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from ngpt.errors import NgptError
+from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
+from ngpt.evaluation.keys import renderer_hash, scene_hash
+from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
+from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
-from ngpt.measure.metrics import EPSILON
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output
+from ngpt.system.machine import version
+from ngpt.system.writing import write_json
 from ngpt.version import __version__
 
-# Far from the seeds 0, 1 ... of what is judged.
+# Of the first half; far from the seeds 0, 1 ... of what is judged.
 REFERENCE_SEED = 1 << 20
 
-
-def reference_noise(reference: GradientStack) -> float:
-    """What the reference's own noise adds to every relMSE: the mean of its variance / (r² + epsilon)."""
-    return float(np.mean(reference["primal_var"] / (reference["primal"] ** 2 + EPSILON)))
-
-
-def content_hash(scene: str) -> str:
-    """SHA-256 over a scene's file and the files it names, those included in turn; over a built-in scene's name."""
-    digest = hashlib.sha256()
-    if not Path(scene).is_file():
-        digest.update(scene.encode())
-        return digest.hexdigest()
-    queue, seen = [Path(scene)], set()
-    while queue:
-        path = queue.pop()
-        if path.resolve() in seen:
-            continue
-        seen.add(path.resolve())
-        data = path.read_bytes()
-        digest.update(hashlib.sha256(data).digest())
-        if path.suffix == ".xml":
-            names = sorted(set(re.findall(r'(?:value|filename)="([^"$]+)"', data.decode(errors="replace"))))
-            queue += [file for name in names if (file := Path(scene).parent / name).is_file()]
-    return digest.hexdigest()
-
-
-def write_json(path: Path, value: object) -> None:
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(value, indent=1, allow_nan=False) + "\n")
+USUAL = DEFAULTS[0]
+Costs = dict[str, dict[str, Any]]
 
 
 class SceneStacks:
-    """What one scene's cells are made of."""
+    """What one scene's cells are made of.
+
+    ``lacks``  why a render's columns are absent on this scene, by the render's name; filled by ``costs``
+    """
 
     def __init__(self, name: str, source: str, config: Config, cache: Path, say: Callable[[str], None]):
         self.name, self.source, self.config, self.say = name, source, config, say
         self.given = Path(source).is_dir()
+        self.lacks: dict[str, str] = {}
+        self._auto = ""
         self._scene: Any = None
-        self._warm: set[str] = set()
+        self._warm: dict[str, GradientStack] = {}
         if self.given:
             self.folder = Path(source)
             return
-        parts = [content_hash(source), list(config.size), __version__, _version("mitsuba")]
+        parts = [scene_hash(source), list(config.size), renderer_hash(), __version__, version("mitsuba")]
         self.key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
         self.folder = cache / f"{name}-{self.key[:12]}"
         self.folder.mkdir(parents=True, exist_ok=True)
 
-    def reference(self) -> tuple[GradientStack, str]:
-        """The reference and its file name. Raises NgptError where there is none."""
-        config, file = self.config, self.config.references.get(self.name)
-        if file:
-            return read(file), file
+    def reference(self) -> Reference:
+        """The reference that the configuration names, or the folder holds; else two halves, of half the budget each.
+
+        Raises NgptError where there is none.
+        """
+        config = self.config
+        if self.name in config.references:
+            named = config.references[self.name]
+            return read_reference([named] if isinstance(named, str) else named)
         if self.given:
-            found = sorted(self.folder.glob("reference*.exr"))
-            if not found:
-                raise NgptError(f"{self.folder}: no reference: name one reference.exr, or set references.{self.name}")
-            return read(found[0]), str(found[0])
+            return find_reference(self.folder)
         limit = f"{config.reference_spp}spp" if config.reference_spp else f"{config.reference_seconds:g}s"
-        path = self.folder / f"reference-{limit}.exr"
-        if not path.exists():
-            seconds = None if config.reference_spp else config.reference_seconds
-            self.say(f"{self.name}: rendering the reference, {limit}")
-            scene = self.load()
-            from data_gen.render import render_stack
+        paths = [self.folder / f"reference-{limit}{half}.exr" for half in HALVES]
+        for i, path in enumerate(paths):
+            if not path.exists():
+                self.say(f"{self.name}: rendering the reference, half {i + 1} of {limit}")
+                scene = self.load()
+                from data_gen.render import render_stack
 
-            write(path, render_stack(scene, config.reference_spp or None, REFERENCE_SEED, "primal", seconds=seconds))
-        return read(path), str(path)
+                spp = math.ceil(config.reference_spp / 2) or None
+                seconds = None if spp else config.reference_seconds / 2
+                write(path, render_stack(scene, spp, REFERENCE_SEED + i, "primal", seconds=seconds))
+        return read_reference(paths)
 
-    def costs(self) -> dict[str, dict[str, float]]:
-        """Seconds per sample per pixel count, by kind: median and quartiles of alternating renders, kernels compiled.
+    def costs(self, renders: Iterable[Render] = ()) -> Costs:
+        """Seconds per sample of the whole image for the usual renders, the clock and ``renders``, by name.
 
-        Empty for a folder of stacks that were rendered elsewhere.
+        ``median`` and quartiles ``low`` and ``high`` of alternating renders, kernels compiled, and the ``sampler`` that
+        rendered. What is not in the cache is measured in turn with the clock, and put into the unit of the clock's time
+        there: more samplers do not move the others. Empty for a folder of stacks that were rendered elsewhere.
         """
         if self.given:
             return {}
         spp, repeats = self.config.timing_spp, self.config.timing_repeats
         path = self.folder / f"cost-{spp}-{repeats}.json"
-        if not path.exists():
+        known: Costs = json.loads(path.read_text()) if path.exists() else {}
+        self._auto = known[USUAL.name]["sampler"] if known else _sampler(self._warm_up(USUAL))
+        clock = self.clock
+        new = {r.name: r for r in map(self.resolve, (clock, *DEFAULTS, *renders)) if r.name not in known}
+        new = {name: render for name, render in new.items() if self._can(render)}
+        if clock.name in self.lacks:
+            raise NgptError(f"the clock, sampler '{clock.sampler}', cannot be measured: {self.lacks[clock.name]}")
+        if new:
             self.say(f"{self.name}: measuring what samples cost")
             scene = self.load()
             from data_gen.costs import measure
 
-            seconds, _ = measure(scene, spp, repeats)
-            write_json(path, {kind: summary(values) for kind, values in seconds.items()})
-        return json.loads(path.read_text())
+            timed = {clock.name: clock} | new
+            seconds, _ = measure(scene, {name: r.options for name, r in timed.items()}, spp, repeats)
+            found = {name: summary(values) for name, values in seconds.items()}
+            unit = known[clock.name]["median"] / found[clock.name]["median"] if clock.name in known else 1.0
+            for name in new:
+                known[name] = {key: value * unit for key, value in found[name].items()}
+                known[name]["sampler"] = _sampler(self._warm[name])
+            write_json(path, known)
+        return known
 
-    def samples(self, kind: str, spp: int, costs: dict[str, dict[str, float]]) -> int:
-        """How many samples the time of ``spp`` of the gradient sampler buys; two at least, for a variance."""
-        if kind == "gradients" or not costs:
+    @property
+    def clock(self) -> Render:
+        """The render whose samples the nominal numbers count."""
+        return self.resolve(Render(USUAL.kind, self.config.clock))
+
+    def resolve(self, render: Render) -> Render:
+        """``render``, or the usual one where "auto" stands for its sampler on this scene; after ``costs``."""
+        return USUAL if (render.kind, render.sampler) == (USUAL.kind, self._auto) else render
+
+    def samples(self, render: Render, spp: int, costs: Costs) -> int:
+        """How many samples the time of ``spp`` of the clock's buys; two at least, for a variance."""
+        if render == self.clock or not costs:
             return spp
-        return max(2, round(spp * costs["gradients"]["median"] / costs[kind]["median"]))
+        return max(2, round(spp * costs[self.clock.name]["median"] / costs[render.name]["median"]))
 
-    def stack(self, kind: str, spp: int, seed: int) -> GradientStack:
+    def stack(self, render: Render, spp: int, seed: int) -> GradientStack:
         """A stack with its time in the attribute ``ngpt:seconds``, without the compilation of kernels."""
-        path = self.folder / f"{kind}-{spp}-{seed}.exr"
+        path = self._path(render, spp, seed)
         if not path.exists():
             if self.given:
                 raise NgptError(f"{path}: no such stack")
             scene = self.load()
-            from data_gen.costs import timed, warm_up
+            from data_gen.costs import timed
 
-            if kind not in self._warm:
-                warm_up(scene, kind)
-                self._warm.add(kind)
-            stack, seconds = timed(scene, kind, spp, seed)
+            self._warm_up(render)
+            stack, seconds = timed(scene, render.options, spp, seed)
             stack.attributes["ngpt:seconds"] = seconds
             write(path, stack)
         # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
-        return read(path, {"direct": "direct"} if kind == "features" and not self.given else None)
+        return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)
 
-    def stack_key(self, kind: str, spp: int, seed: int) -> list:
+    def stack_key(self, render: Render, spp: int, seed: int) -> list:
         """What the stack depends on, without rendering it."""
         if not self.given:
-            return [self.key, kind, spp, seed]
-        path = self.folder / f"{kind}-{spp}-{seed}.exr"
+            return [self.key, render.name, spp, seed]
+        path = self._path(render, spp, seed)
         return [str(path), path.stat().st_mtime_ns if path.exists() else 0]
 
     def load(self) -> Any:
@@ -156,15 +161,31 @@ class SceneStacks:
             self._scene = load_scene(self.source, self.config.size)
         return self._scene
 
+    def _path(self, render: Render, spp: int, seed: int) -> Path:
+        return self.folder / f"{render.name.replace(' ', '-')}-{spp}-{seed}.exr"
 
-def summary(values: list[float]) -> dict[str, float]:
-    """Median and quartiles."""
-    low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
-    return {"median": median, "low": low, "high": high}
+    def _warm_up(self, render: Render) -> GradientStack:
+        """Has the kernels compiled, and returns the stack of one sample."""
+        scene = self.load()
+        from data_gen.costs import warm_up
+
+        if render.name not in self._warm:
+            self._warm[render.name] = warm_up(scene, render.options)
+        return self._warm[render.name]
+
+    def _can(self, render: Render) -> bool:
+        """Whether the sampler can render this scene, and renders that kind of stack; if not, ``lacks`` says why."""
+        try:
+            stack = self._warm_up(render)
+        except NgptError as error:
+            self.lacks[render.name] = str(error)
+            return False
+        if ("dx" in stack) != (render.kind == "gradients"):
+            what, entry = ("no gradients", "rivals") if render.kind == "gradients" else ("gradients", "samplers")
+            self.lacks[render.name] = f"sampler '{render.sampler}' renders {what}: list it under {entry}"
+            return False
+        return True
 
 
-def _version(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
+def _sampler(stack: GradientStack) -> str:
+    return str(stack.attributes["ngpt:sampler"])

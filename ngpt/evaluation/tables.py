@@ -6,6 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from ngpt.evaluation.averages import mean
+from ngpt.evaluation.renders import KINDS
+
 
 def tables(results: dict[str, Any]) -> str:
     """results.md: errors by scene, times, what is absent and why."""
@@ -18,8 +21,10 @@ def tables(results: dict[str, Any]) -> str:
         f"{width}x{height} pixels. Methods with a † see no gradients and are given path-traced samples in their place, "
         "as many as the gradient stack's rendering time buys (measured for each scene; with albedo, normal and depth "
         "where they want them). **Bold** is best in its row; *italic* is a method with gradients that loses to one "
-        "without; ~ is within three times of the reference's own noise, where an order means little.",
+        f"without; ~ is {_doubtful(results)}, where an order means little.",
         "",
+        *_samplers(results),
+        *_halves(results),
         *_errors(results),
         "",
         *_costs(results),
@@ -31,7 +36,7 @@ def tables(results: dict[str, Any]) -> str:
     ]
     others = [name for name in results["metrics"] if name != primary]
     if others and any(row["scene"] is None for row in results["summary"]):
-        lines += ["Means over scenes of the other metrics:", "", *_others(results, others), ""]
+        lines += [_title_of_others(results), "", *_others(results, others), ""]
     for name in dict.fromkeys((primary, "FLIP")):
         lines += _duels(results, name)
     lines += _absences(results)
@@ -42,6 +47,45 @@ def tables(results: dict[str, Any]) -> str:
         f"commit {facts['commit']}; {versions}."
     )
     return "\n".join(lines) + "\n"
+
+
+def _doubtful(results: dict[str, Any]) -> str:
+    """What ~ means: halves take a reference's noise off the errors, so that less of it is left to doubt."""
+    if _halved(results):
+        return "within three standard errors of what the reference's noise leaves in an error"
+    return "within three times of the reference's own noise"
+
+
+def _halved(results: dict[str, Any]) -> list[str]:
+    """The scenes whose references are two halves."""
+    references = {name: entry.get("reference") or {} for name, entry in results["scenes"].items()}
+    return [name for name, reference in references.items() if reference.get("halves")]
+
+
+def _halves(results: dict[str, Any]) -> list[str]:
+    if not _halved(results):
+        return []
+    return [
+        "The reference is rendered in two independent halves a, b. In metrics made of squares, (x - r)² stands for "
+        "(x - a)(x - b), to which the reference's noise adds nothing on average; it may be negative where an error is "
+        "too small to tell. Elsewhere r is the mean of the two.",
+        "",
+    ]
+
+
+def _several_samplers(results: dict[str, Any]) -> bool:
+    """Whether columns differ by their samplers alone."""
+    return any(name != entry.get("family", name) for name, entry in results["methods"].items())
+
+
+def _samplers(results: dict[str, Any]) -> list[str]:
+    if not _several_samplers(results):
+        return []
+    return [
+        "In brackets is the sampler. All of them are given the time that the samples of the row cost with sampler "
+        f"`{results['settings']['clock']}`, so each has as many samples as it buys, measured for each scene.",
+        "",
+    ]
 
 
 def _present(results: dict[str, Any]) -> list[str]:
@@ -68,23 +112,23 @@ def _errors(results: dict[str, Any]) -> list[str]:
             errors = {m: row["error"] for m, row in found.items() if row["error"] is not None}
             if not errors:
                 continue
-            noise = results["scenes"][scene]["reference"]["noise"] if scene else None
-            texts = [_error(results, m, found, errors, noise) for m in methods]
+            noise, doubt = (results["scenes"][scene]["reference"][k] if scene else None for k in ("noise", "doubt"))
+            texts = [_error(results, m, found, errors, doubt) for m in methods]
             label = scene or "*geometric mean*"
             rows.append([label, str(spp), *texts, f"{noise:.5f}" if noise is not None else ""])
     return _table(["scene", "spp", *_heads(results, methods), "reference noise"], rows, 1)
 
 
-def _error(results: dict[str, Any], method: str, found: dict, errors: dict[str, float], noise: float | None) -> str:
+def _error(results: dict[str, Any], method: str, found: dict, errors: dict[str, float], doubt: float | None) -> str:
     if method not in errors:
         return ""
     error, stacks = errors[method], results["methods"]
     text = f"{error:.4f}" if error >= 0.001 else f"{error:.2g}"
     spread = found[method]["metrics"][results["primary"]]
-    half = (spread["high"] - spread["low"]) / 2 / error if error else 0.0
+    half = (spread["high"] - spread["low"]) / 2 / error if error > 0 else 0.0
     if half > 0.05:
         text += f" ±{half:.0%}"
-    if noise is not None and error < 3 * noise:
+    if doubt is not None and error < doubt:
         text += " ~"
     if error == min(errors.values()):
         return f"**{text}**"
@@ -94,20 +138,28 @@ def _error(results: dict[str, Any], method: str, found: dict, errors: dict[str, 
 
 
 def _costs(results: dict[str, Any]) -> list[str]:
-    rows = []
-    for name, entry in results["scenes"].items():
-        cost = entry.get("cost") or {}
-        if cost:
-            gradients = cost["gradients"]["median"]
-            ratios = [f"{gradients / cost[kind]['median']:.2f}" for kind in ("path", "features")]
-            quartiles = f"{cost['gradients']['low'] * 1e3:.1f} .. {cost['gradients']['high'] * 1e3:.1f}"
-            reference = entry.get("reference") or {}
-            spp = reference.get("spp")
-            rows.append([name, f"{gradients * 1e3:.1f}", quartiles, *ratios, f"{spp:.0f}" if spp else ""])
-    if not rows:
+    costs = {name: entry["cost"] for name, entry in results["scenes"].items() if entry.get("cost")}
+    if not costs:
         return []
-    heads = ["scene", "ms / spp with gradients", "quartiles", "over path", "over path with features", "reference spp"]
+    # More than the three that every scene is measured with: one column each, and which sampler the usual one is.
+    others = list(dict.fromkeys(name for cost in costs.values() for name in cost if name not in KINDS))
+    rows = []
+    for scene, cost in costs.items():
+        gradients = cost["gradients"]["median"]
+        ratios = [gradients / cost[name]["median"] if name in cost else None for name in ("path", "features", *others)]
+        quartiles = f"{cost['gradients']['low'] * 1e3:.1f} .. {cost['gradients']['high'] * 1e3:.1f}"
+        spp = (results["scenes"][scene].get("reference") or {}).get("spp")
+        row = [scene, f"{gradients * 1e3:.1f}", quartiles, *("" if r is None else f"{r:.2f}" for r in ratios)]
+        rows.append([*row, f"{spp:.0f}" if spp else "", *([f"`{cost['gradients']['sampler']}`"] if others else [])])
+    heads = ["scene", "ms / spp with gradients", "quartiles", "over path", "over path with features"]
+    heads += [*(f"over {_over(name)}" for name in others), "reference spp", *(["by sampler"] if others else [])]
     return ["What a sample with gradients costs:", "", *_table(heads, rows, 1)]
+
+
+def _over(render: str) -> str:
+    """ "gradients gpt-basic" as a column's head: the sampler, and the kind where it is not the one with gradients."""
+    kind, _, sampler = render.partition(" ")
+    return f"`{sampler}`" + {"gradients": "", "features": " with features", "path": ""}[kind]
 
 
 def _seconds(results: dict[str, Any]) -> list[str]:
@@ -122,7 +174,7 @@ def _seconds(results: dict[str, Any]) -> list[str]:
 
 
 def _others(results: dict[str, Any], names: list[str]) -> list[str]:
-    methods, rows = _present(results), []
+    methods, rows, floors = _present(results), [], _floors(results)
     means = {(row["spp"], row["method"]): row["metrics"] for row in results["summary"] if row["scene"] is None}
     for name in names:
         for spp in results["settings"]["spp"]:
@@ -131,8 +183,31 @@ def _others(results: dict[str, Any], names: list[str]) -> list[str]:
                 continue
             best = np.nanmin(values) if results["metrics"][name]["better"] == "lower" else np.nanmax(values)
             texts = ["" if np.isnan(v) else f"**{v:.4g}**" if v == best else f"{v:.4g}" for v in values]
-            rows.append([name, str(spp), *texts])
-    return _table(["metric", "spp", *_heads(results, methods)], rows, 1)
+            rows.append([name, str(spp), *texts, *([floors.get(name, "")] if floors else [])])
+    heads = ["metric", "spp", *_heads(results, methods), *(["between halves"] if floors else [])]
+    return _table(heads, rows, 1)
+
+
+def _title_of_others(results: dict[str, Any]) -> str:
+    title = "Means over scenes of the other metrics"
+    if not _floors(results):
+        return f"{title}:"
+    return (
+        f"{title}. Those not made of squares are measured against the mean of the reference's halves. What they are "
+        "between the two halves, whose noise has four times the variance of the mean's, says how much of them may be "
+        "the reference's noise:"
+    )
+
+
+def _floors(results: dict[str, Any]) -> dict[str, str]:
+    """Metric -> its mean, over the scenes with two halves, between these: what no image can be judged better than."""
+    found: dict[str, list[float]] = {}
+    for scene in _halved(results):
+        for name, value in results["scenes"][scene]["reference"]["floors"].items():
+            if value is not None:
+                found.setdefault(name, []).append(value)
+    lower = {name: results["metrics"][name]["better"] == "lower" for name in found}
+    return {name: f"{mean(values, geometric=lower[name]):.4g}" for name, values in found.items()}
 
 
 def _duels(results: dict[str, Any], metric: str) -> list[str]:

@@ -76,29 +76,37 @@ def describe(stack: GradientStack) -> dict[str, float]:
 
 
 def make_table(results: dict[str, Any]) -> dict[str, Any]:
-    """The table of advice from what an evaluation wrote (results.json). Only methods that any user has are in it."""
+    """The table of advice from what an evaluation wrote (results.json).
+
+    In it are methods that are there on all scenes, with the usual sampler for their kind of stack, as the pilot is.
+    """
     primary, scenes = results["primary"], []
+    kinds = {name: entry["stack"] for name, entry in results["methods"].items() if entry["render"] == entry["stack"]}
     for name, entry in results["scenes"].items():
         if entry.get("absent") or not entry.get("pilot"):
             continue
         width, height = entry["size"]
         methods: dict[str, dict[str, list[float]]] = {}
         for row in results["summary"]:
-            if row["scene"] == name and row["error"]:
+            if row["scene"] == name and row["method"] in kinds and (row["error"] or 0) > 0:
                 law = methods.setdefault(row["method"], {"spp": [], "error": [], "reconstruct": []})
                 used = [c["spp used"] for c in results["cells"] if _same(c, row) and not c["absent"]]
                 law["spp"].append(float(np.median(used)))
                 law["error"].append(row["error"])
                 law["reconstruct"].append(row["seconds"]["reconstruct"] / (width * height))
-        cost = {kind: value["median"] / (width * height) for kind, value in entry["cost"].items()}
+        cost = {kind: entry["cost"][kind]["median"] / (width * height) for kind in sorted(set(kinds.values()))}
         scenes.append({"scene": name, **entry["pilot"], "cost": cost, "methods": methods})
-    shared = [m for m in results["methods"] if scenes and all(m in scene["methods"] for scene in scenes)]
+    shared = [m for m in kinds if scenes and all(m in scene["methods"] for scene in scenes)]
     for scene in scenes:
         scene["methods"] = {m: scene["methods"][m] for m in shared}
     if len(scenes) < 3 or not shared:
         raise NgptError(f"advice needs measurements of at least 3 scenes with a method in common; got {len(scenes)}")
-    stacks = {m: results["methods"][m]["stack"] for m in shared}
-    return {"metric": primary, "methods": stacks, "scenes": scenes, "made by": results["command"]}
+    return {
+        "metric": primary,
+        "methods": {m: kinds[m] for m in shared},
+        "scenes": scenes,
+        "made by": results["command"],
+    }
 
 
 def _same(cell: dict, row: dict) -> bool:
@@ -234,43 +242,3 @@ def residuals(table: dict[str, Any], left_out: str = "") -> dict[str, np.ndarray
             pairs = zip(law["spp"], law["error"], strict=True)
             result[method].append(float(np.mean([math.log(e) - laws.log_error(method, scene, n) for n, e in pairs])))
     return {method: np.array(values) for method, values in result.items()}
-
-
-def hindsight(table: dict[str, Any], pixels: int = 320 * 180, budgets: int = 5) -> list[dict[str, Any]]:
-    """What advice on each scene costs when the table does not have it.
-
-    For budgets from the cheapest measured cell's seconds to the dearest's, the error of the advised method, as measured
-    on the scene (between its sample counts by power laws), over that of the best method there.
-    """
-    rows = []
-    for scene in table["scenes"]:
-        laws = Laws(table)
-        times = [
-            (n * scene["cost"][stack] + laws.reconstruct(m)) * pixels
-            for m, stack in table["methods"].items()
-            for n in scene["methods"][m]["spp"]
-        ]
-        for seconds in np.geomspace(min(times) * 1.5, max(times), budgets):
-            actual = {}
-            for method, stack in table["methods"].items():
-                spp = (seconds / pixels - laws.reconstruct(method)) / scene["cost"][stack]
-                if spp >= 2:
-                    actual[method] = _measured(scene["methods"][method], spp)
-            try:
-                best = advise(table, scene, scene["cost"], pixels, seconds=float(seconds), left_out=scene["scene"])[0]
-            except NgptError:
-                continue
-            if best.method in actual:
-                ratio = actual[best.method] / min(actual.values())
-                rows.append({"scene": scene["scene"], "seconds": float(seconds), "method": best.method, "cost": ratio})
-    return rows
-
-
-def _measured(law: dict[str, list[float]], spp: float) -> float:
-    """A method's error at ``spp`` samples: straight lines of the logarithms between those measured, ends extended."""
-    x, y = np.log(law["spp"]), np.log(law["error"])
-    if len(x) == 1:
-        return float(np.exp(y[0]))
-    i = int(np.clip(np.searchsorted(x, math.log(spp)) - 1, 0, len(x) - 2))
-    slope = (y[i + 1] - y[i]) / max(x[i + 1] - x[i], 1e-9)
-    return float(np.exp(y[i] + slope * (math.log(spp) - x[i])))

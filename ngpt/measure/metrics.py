@@ -1,54 +1,84 @@
-"""Error of an image against a reference.
+"""Error of an image against a reference, and the registry of all metrics.
 
-x is the image and r the reference, scene-linear (H, W, 3); means run over pixels and channels. Pixels that are not
-finite in either are left out and counted, since one of them would hide all others.
+x is the image, scene-linear (H, W, 3). The reference is one image r, or two independent halves a and b: renders of the
+same scene with seeds of their own. Means run over pixels and channels. Pixels that are not finite in any of the images
+are left out and counted, since one of them would hide all others.
+
+A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is that of (x - t)² plus the mean of
+n². With two halves the square becomes the product (x - a)(x - b): their noises are independent and of mean zero, so the
+product's expectation is (x - t)², whatever the noise. The product of a pixel, and even a mean, may be negative where an
+image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2; what its noise does
+to them changes the error by a share of the order of the noise's relMSE.
 """
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.measure import perceptual
+from ngpt.measure.images import check_size, middle, reinhard
 
 # Published relMSE values differ in this constant; ours is that of gradient-domain VCM and photon mapping.
 EPSILON = 1e-3
 
-# What tables and reports print beside the numbers: name -> (formula, whether "lower" or "higher" is better).
-FORMULAS = {
-    "relMSE": ("mean of (x - r)² / (r² + 0.001) over pixels and channels", "lower"),
-    "relMSE trimmed": ("relMSE without the worst 0.1 % of the pixels", "lower"),
-    "relMSE NGPT": ("mean over pixels of mean_c (x - r)² / (mean_c(r)² + 0.001)", "lower"),
-    "SMAPE": ("mean of 2 |x - r| / (|x| + |r|)", "lower"),
-    "PSNR": ("-10 log10 mean (x' - r')² in dB, with x' = x / (1 + x)", "higher"),
-    "MSE": ("mean of (x - r)²", "lower"),
-    "max |x - r|": ("largest |x - r|", "lower"),
-    "SSIM": ("structural similarity of x / (1 + x), Gaussian window of sigma 1.5, mean over channels", "higher"),
-    "FLIP": ("mean HDR-FLIP, 67 pixels per degree, exposures computed from the reference", "lower"),
-    "E-LPIPS": ("E-LPIPS of SqueezeNet on sRGB(x / (1 + mean_c x)), mean of 16 random transforms", "lower"),
-}
+
+def squared_error(image: np.ndarray, *halves: np.ndarray) -> np.ndarray:
+    """(x - r)², or (x - a)(x - b) with two halves, per pixel and channel."""
+    return (image - halves[0]) * (image - halves[-1])
 
 
-def relative_squared_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """(x - r)² / (r² + 1e-3) per pixel and channel."""
-    return (image - reference) ** 2 / (reference**2 + EPSILON)
+def relative_squared_error(image: np.ndarray, *halves: np.ndarray) -> np.ndarray:
+    """(x - r)² / (r² + 1e-3), or (x - a)(x - b) / (m² + 1e-3) with two halves, per pixel and channel."""
+    return squared_error(image, *halves) / (middle(halves) ** 2 + EPSILON)
 
 
-def relmse(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean of (x - r)² / (r² + 1e-3)."""
-    return float(relative_squared_error(image, reference).mean())
+def relmse(image: np.ndarray, *halves: np.ndarray) -> float:
+    """Mean of (x - r)² / (r² + 1e-3), or of (x - a)(x - b) / (m² + 1e-3)."""
+    return float(relative_squared_error(image, *halves).mean())
 
 
-def relmse_trimmed(image: np.ndarray, reference: np.ndarray, share: float = 0.001) -> float:
-    """relMSE without the worst 0.1 % of the pixels (by channel mean), which fireflies would otherwise decide."""
-    error = np.sort(relative_squared_error(image, reference).mean(axis=-1), axis=None)
-    return float(error[: error.size - int(share * error.size)].mean())
+def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> float:
+    """relMSE without the worst 0.1 % of the pixels (by channel mean), which fireflies would otherwise decide.
+
+    With two halves the worst have the largest (x - m)² / (m² + 1e-3). To leave out the largest products would prefer
+    those in which noise made the product positive, and bias the mean of the others.
+    """
+    errors, sizes = (relative_squared_error(image, *r) for r in (halves, (middle(halves),)))
+    return trimmed_mean(errors, sizes, share)
 
 
-def relmse_channel_mean(image: np.ndarray, reference: np.ndarray) -> float:
+def trimmed_mean(values: np.ndarray, sizes: np.ndarray, share: float) -> float:
+    """The mean of (H, W, 3) without that share of the pixels whose ``sizes``, by channel mean, are largest."""
+    order = np.argsort(sizes.mean(axis=-1), axis=None)
+    return float(values.mean(axis=-1).ravel()[order[: order.size - int(share * order.size)]].mean())
+
+
+def relmse_channel_mean(image: np.ndarray, *halves: np.ndarray) -> float:
     """relMSE as the code of NGPT has it: mean over pixels of mean_c (x - r)² / (mean_c(r)² + 1e-3).
 
     The squared error's mean over the channels c, relative to the grey of the reference: saturated colours count less.
     """
-    error = ((image - reference) ** 2).mean(axis=-1)
-    return float((error / (reference.mean(axis=-1) ** 2 + EPSILON)).mean())
+    error = squared_error(image, *halves).mean(axis=-1)
+    return float((error / (middle(halves).mean(axis=-1) ** 2 + EPSILON)).mean())
+
+
+def mse(image: np.ndarray, *halves: np.ndarray) -> float:
+    """Mean of (x - r)², or of (x - a)(x - b)."""
+    return float(squared_error(image, *halves).mean())
+
+
+def psnr_reinhard(image: np.ndarray, *halves: np.ndarray) -> float:
+    """Peak signal-to-noise ratio in dB of x / (1 + x): -10 log10 of the MSE of x'; infinite where that is not positive.
+
+    Noise moves the mean of a tone-mapped half by its variance times the curve's second derivative: a small bias that
+    halves cannot take off.
+    """
+    error = mse(reinhard(image), *map(reinhard, halves))
+    return float("inf") if error <= 0 else float(-10 * np.log10(error))
 
 
 def smape(image: np.ndarray, reference: np.ndarray) -> float:
@@ -57,25 +87,105 @@ def smape(image: np.ndarray, reference: np.ndarray) -> float:
     return float(np.divide(2 * np.abs(image - reference), size, out=np.zeros_like(size), where=size > 0).mean())
 
 
-def reinhard(image: np.ndarray) -> np.ndarray:
-    """The tone map of PSNR and SSIM: x / (1 + x) for each channel, in [0, 1), values below 0 taken as 0."""
-    positive = np.maximum(image, 0)
-    return positive / (1 + positive)
+def largest(image: np.ndarray, reference: np.ndarray) -> float:
+    """The largest |x - r|."""
+    return float(np.abs(image - reference).max())
 
 
-def psnr_reinhard(image: np.ndarray, reference: np.ndarray) -> float:
-    """Peak signal-to-noise ratio in dB of x / (1 + x): -10 log10 mean (x' - r')²; infinite for equal images."""
-    error = float(np.mean((reinhard(image) - reinhard(reference)) ** 2))
-    return float("inf") if error == 0 else -10 * np.log10(error)
+@dataclass(frozen=True)
+class Metric:
+    """One way to judge an image, as tables, reports and ``ngpt diff`` have it.
+
+    ``formula``   what is printed beside the numbers
+    ``better``    "lower" or "higher"
+    ``function``  (x, r, **options) -> float; of a ``squared`` metric (x, a, b) as well
+    ``squared``   made of squares (x - r)², so that two halves of a reference take its noise off
+    ``whole``     looks at neighbourhoods: is given whole images with 0 for what is not finite, not the finite pixels
+    ``missing``   (**options) -> why it cannot be computed here, "" if it can; None: nothing but NumPy is needed
+    """
+
+    formula: str
+    better: str
+    function: Callable[..., float]
+    squared: bool = False
+    whole: bool = False
+    missing: Callable[..., str] | None = None
 
 
-def check_size(image: np.ndarray, reference: np.ndarray) -> None:
-    """Raises NgptError if the images cannot be compared."""
-    if image.shape != reference.shape:
-        raise NgptError(
-            f"images of different size cannot be compared: {image.shape[1]}x{image.shape[0]} and "
-            f"{reference.shape[1]}x{reference.shape[0]}; render or crop them alike"
-        )
+METRICS = {
+    "relMSE": Metric("mean of (x - r)² / (r² + 0.001) over pixels and channels", "lower", relmse, squared=True),
+    "relMSE trimmed": Metric("relMSE without the worst 0.1 % of the pixels", "lower", relmse_trimmed, squared=True),
+    "relMSE NGPT": Metric(
+        "mean over pixels of mean_c (x - r)² / (mean_c(r)² + 0.001)", "lower", relmse_channel_mean, squared=True
+    ),
+    "SMAPE": Metric("mean of 2 |x - r| / (|x| + |r|)", "lower", smape),
+    "PSNR": Metric("-10 log10 mean (x' - r')² in dB, with x' = x / (1 + x)", "higher", psnr_reinhard, squared=True),
+    "MSE": Metric("mean of (x - r)²", "lower", mse, squared=True),
+    "max |x - r|": Metric("largest |x - r|", "lower", largest),
+    "SSIM": Metric(
+        "structural similarity of x / (1 + x), Gaussian window of sigma 1.5, mean over channels",
+        "higher",
+        perceptual.ssim,
+        whole=True,
+        missing=partial(perceptual.lack, "SSIM", "skimage", "scikit-image"),
+    ),
+    "FLIP": Metric(
+        "mean HDR-FLIP, 67 pixels per degree, exposures computed from the reference",
+        "lower",
+        lambda image, reference: perceptual.flip(image, reference)[0],
+        whole=True,
+        missing=partial(perceptual.lack, "FLIP", "flip_evaluator", "flip-evaluator"),
+    ),
+    "E-LPIPS": Metric(
+        "E-LPIPS of SqueezeNet on sRGB(x / (1 + mean_c x)), mean of 16 random transforms",
+        "lower",
+        perceptual.elpips,
+        whole=True,
+        missing=perceptual.elpips_lack,
+    ),
+}
+
+
+def scores(
+    names: Iterable[str], image: np.ndarray, *halves: np.ndarray, options: dict[str, dict[str, Any]] | None = None
+) -> dict[str, float]:
+    """Metrics of ``METRICS`` by name, in double precision; ``options`` are those of each metric's function.
+
+    Squared metrics are given all ``halves`` (one image or two), the others their mean. Raises NgptError if the images
+    differ in size or have no pixel that is finite in all of them.
+    """
+    for half in halves:
+        check_size(image, half)
+    finite = _finite(image, *halves)
+    if not finite.any():
+        raise NgptError(f"none of {finite.size} pixels is finite in {'both' if len(halves) == 1 else 'all'} images")
+    # Double precision: squares of 1e12 are fine there, and means of millions of pixels exact enough.
+    x, *parts = (i[finite][None].astype(np.float64) for i in (image, *halves))
+    values = {}
+    for name in names:
+        metric, more = METRICS[name], (options or {}).get(name, {})
+        if metric.squared:
+            values[name] = metric.function(x, *parts, **more)
+        elif metric.whole:
+            filled = (np.nan_to_num(i, nan=0.0, posinf=0.0, neginf=0.0) for i in (image, middle(halves)))
+            values[name] = metric.function(*filled, **more)
+        else:
+            values[name] = metric.function(x, middle(tuple(parts)), **more)
+    return values
+
+
+def compare(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
+    """The metrics that need no package, and ``nonfinite``: how many pixels had to be left out.
+
+    Raises NgptError if the images differ in size or have no pixel that is finite in both.
+    """
+    values = scores((name for name, metric in METRICS.items() if metric.missing is None), image, reference)
+    return {**values, "nonfinite": int(np.sum(~_finite(image, reference)))}
+
+
+def _finite(*images: np.ndarray) -> np.ndarray:
+    """(H, W): pixels that are finite in all of them."""
+    return np.logical_and.reduce([np.isfinite(image).all(axis=-1) for image in images])
 
 
 def exposure_mismatch(image: np.ndarray, reference: np.ndarray) -> float:
@@ -89,27 +199,3 @@ def exposure_mismatch(image: np.ndarray, reference: np.ndarray) -> float:
         limit = np.quantile(values, 0.999) if values.size else 0.0
         sums.append(float(np.minimum(values, limit).mean(dtype=np.float64)) if values.size else 0.0)
     return float(np.log2(sums[0] / sums[1])) if min(sums) > 0 else 0.0
-
-
-def compare(image: np.ndarray, reference: np.ndarray) -> dict[str, float]:
-    """The metrics of ``FORMULAS`` that need no package, and ``nonfinite``: how many pixels had to be left out.
-
-    ``ngpt.measure.perceptual`` has the others. Raises NgptError if the images differ in size or have no pixel that is
-    finite in both.
-    """
-    check_size(image, reference)
-    finite = (np.isfinite(image) & np.isfinite(reference)).all(axis=-1)
-    if not finite.any():
-        raise NgptError(f"none of {finite.size} pixels is finite in both images")
-    # Double precision: squares of 1e12 are fine there, and means of millions of pixels exact enough.
-    x, r = (i[finite][None].astype(np.float64) for i in (image, reference))
-    return {
-        "relMSE": relmse(x, r),
-        "relMSE trimmed": relmse_trimmed(x, r),
-        "relMSE NGPT": relmse_channel_mean(x, r),
-        "SMAPE": smape(x, r),
-        "PSNR": psnr_reinhard(x, r),
-        "MSE": float(np.mean((x - r) ** 2)),
-        "max |x - r|": float(np.abs(x - r).max()),
-        "nonfinite": int(np.sum(~finite)),
-    }

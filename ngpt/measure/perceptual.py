@@ -1,31 +1,25 @@
-"""Metrics of what the eye sees. Each needs an optional package or weights; ``missing`` says which.
+"""Metrics of what the eye sees. Each needs an optional package or weights; ``lack`` and ``elpips_lack`` say which.
 
 x is the image and r the reference, scene-linear (H, W, 3), finite; values below 0 count as 0.
 """
 
 import math
+from collections.abc import Callable
+from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.measure.metrics import check_size, reinhard
-
-_PACKAGES = {
-    "SSIM": ("skimage", "scikit-image"),
-    "FLIP": ("flip_evaluator", "flip-evaluator"),
-    "E-LPIPS": ("torch",) * 2,
-}
+from ngpt.measure.images import check_size, reinhard
 
 # Of the random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
 _DRAWS = 16
 
 
-def missing(name: str) -> str:
-    """Why metric ``name`` cannot be computed here, "" if it can; E-LPIPS also needs its weights."""
-    module, package = _PACKAGES[name]
-    return "" if find_spec(module) else f"{name} needs {package}: pip install 'ngpt-recon[peers]'"
+def lack(name: str, module: str, package: str, extra: str = "peers") -> str:
+    """Why metric ``name``, which imports ``module`` of ``package``, cannot be computed here; "" if it can."""
+    return "" if find_spec(module) else f"{name} needs {package}: pip install 'ngpt-recon[{extra}]'"
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> float:
@@ -78,14 +72,28 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
     return start, stop, max(2, math.ceil(stop - start))
 
 
-def make_elpips(backbone: str, weights: str) -> Any:
-    """E-LPIPS by SqueezeNet as a function (image, reference) -> float, of files that docs/losses.md explains.
+def elpips(image: np.ndarray, reference: np.ndarray, backbone: str = "", weights: str = "") -> float:
+    """E-LPIPS by SqueezeNet, 0 for equal images; ``backbone`` and ``weights`` are files that docs/losses.md explains.
 
     d(x, r) averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"], of sRGB(x / (1 + mean_c x)); the draws
     are the same for all images. Raises NgptError for files that are missing or not what they should be.
     """
-    if missing("E-LPIPS"):
-        raise NgptError(missing("E-LPIPS"))
+    return _elpips(backbone, weights)(image, reference)
+
+
+def elpips_lack(backbone: str = "", weights: str = "") -> str:
+    """Why E-LPIPS cannot be computed here, "" if it can."""
+    if without := lack("E-LPIPS", "torch", "torch", "train"):
+        return without
+    try:
+        _elpips(backbone, weights)
+    except NgptError as error:
+        return str(error)
+    return ""
+
+
+@lru_cache(maxsize=1)
+def _elpips(backbone: str, weights: str) -> Callable[[np.ndarray, np.ndarray], float]:
     # torch takes seconds to come in.
     import torch
 

@@ -53,33 +53,6 @@ def auto_exposure(reference: np.ndarray) -> float:
     return float(np.log2(MIDDLE_GREY / key))
 
 
-def relative_squared_error(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """(H, W): the mean over RGB of (image - reference)^2 / (reference^2 + epsilon), no unit, 0 is equal.
-
-    Both are brought to the automatic exposure of the reference first, so that ERROR_EPSILON means as much in a dim
-    scene as in a bright one: relMSE, which takes them as they are, calls every image of a dim scene good.
-    """
-    image, reference = _rgb(image), _rgb(reference)
-    if image.shape != reference.shape:
-        raise NgptError(f"error map: the image is {image.shape} but the reference is {reference.shape}")
-    epsilon = ERROR_EPSILON * 4.0 ** -auto_exposure(reference)
-    with np.errstate(invalid="ignore", over="ignore"):
-        return np.mean((image - reference) ** 2 / (reference**2 + epsilon), axis=2)
-
-
-def error_map(image: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The relative squared error of each pixel in the colours of :func:`heat_table`.
-
-    The scale is logarithmic over ERROR_RANGE: black is an error of at most 1 %, the middle 10 %, pale yellow 100 % or
-    more (an error here is the root of the relative squared error).
-    """
-    error = relative_squared_error(image, reference)
-    low, high = np.log10(ERROR_RANGE)
-    with np.errstate(divide="ignore"):
-        place = (np.log10(error) - low) / (high - low)
-    return coloured(place, heat_table())
-
-
 def signed_map(gradient: np.ndarray) -> np.ndarray:
     """A gradient layer, (H, W, 3) of either sign: zero is grey, negative is blue, positive is orange.
 

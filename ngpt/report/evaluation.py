@@ -93,12 +93,13 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
         entry.metrics = dict(sorted(entry.metrics.items(), key=lambda item: item[0] != results["primary"]))
     reference = scene["reference"] or {"image": None}
     image = read_image(folder / reference["image"]) if reference["image"] else None
-    facts = [
-        f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of gradients; times are render and method"
-    ]
+    clock = f"sampler {results['settings']['clock']}" if _several_samplers(results) else "gradients"
+    facts = [f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of {clock}; times are render and method"]
     # Of references from elsewhere the number of samples may not be known.
     samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
     facts += [samples] if image is not None else ["no reference"]
+    floors = [f"{metric} {value:.3g}" for metric, value in reference.get("floors", {}).items() if value is not None]
+    facts += [f"between the reference's halves {', '.join(floors)}"] if floors else []
     facts += ["without " + ", ".join(absent)] if absent else []
     return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries)
 
@@ -131,9 +132,27 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
     absent = {(cell["scene"], cell["method"], cell["absent"]) for cell in results["cells"] if cell["absent"]} | {
         (name, "all", scene["absent"]) for name, scene in results["scenes"].items() if scene["absent"]
     }
+    if _several_samplers(results):
+        tables |= _costs(results)
     if absent:
         tables["Absent"] = [["scene", "method", "why"], *map(list, sorted(absent))]
     return tables
+
+
+def _several_samplers(results: dict) -> bool:
+    """Whether columns differ by their samplers alone."""
+    return any(name != entry["family"] for name, entry in results["methods"].items())
+
+
+def _costs(results: dict) -> dict[str, list[list[str]]]:
+    """What a sample costs by scene and sampler: milliseconds for the whole image."""
+    costs = {name: entry["cost"] for name, entry in results["scenes"].items() if entry.get("cost")}
+    renders = list(dict.fromkeys(name for cost in costs.values() for name in cost))
+    rows = [["scene", *renders, "auto"]]
+    for scene, cost in costs.items():
+        times = [f"{cost[name]['median'] * 1e3:.3g}" if name in cost else "-" for name in renders]
+        rows.append([scene, *times, cost["gradients"]["sampler"]])
+    return {"Milliseconds a sample, by kind of stack and sampler": rows} if costs else {}
 
 
 def _cell(row: dict, metric: str) -> str:
@@ -160,4 +179,10 @@ def _plots(folder: Path, results: dict) -> dict[str, str]:
 
 
 def _formulas(results: dict) -> dict[str, str]:
-    return {name: f"{metric['formula']} ({metric['better']} is better)" for name, metric in results["metrics"].items()}
+    texts = {name: f"{metric['formula']} ({metric['better']} is better)" for name, metric in results["metrics"].items()}
+    if any((scene.get("reference") or {}).get("halves") for scene in results["scenes"].values()):
+        texts["r"] = (
+            "mean of a reference's two independent halves a, b; (x - r)² is (x - a)(x - b), "
+            "which has no bias by the reference's noise"
+        )
+    return texts

@@ -14,7 +14,6 @@ from ngpt.classical.variances import auto_alpha, smooth_variances
 from ngpt.classical.weighted import wl2
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import relmse
-from ngpt.tiles import apron, l2_tiled
 
 SIZES = [(1, 1), (1, 9), (9, 1), (2, 2), (2, 3), (7, 11), (13, 8), (31, 37)]
 every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
@@ -224,7 +223,7 @@ def test_l2_without_some_differences_is_the_solution_of_the_remaining_system():
     assert close(l2(primal, dx, dy, 0.2, tuple(trusted)), solve_sparse(primal, dx, dy, 0.2, weights), 1e-5)
 
 
-# Energy, alpha, tiles, memory
+# Energy, alpha, memory
 
 
 @pytest.mark.parametrize("name", ["l2", "cv"])
@@ -274,29 +273,6 @@ def test_auto_alpha_lowers_the_error_where_gradients_are_noisy():
     assert relmse(l2(primal, dx, dy, alpha), truth) < 0.7 * relmse(l2(primal, dx, dy), truth)
 
 
-def test_the_apron_at_the_usual_alpha():
-    assert apron(0.2) == 72 and apron(1e6) <= 3 and apron(0.02) > 600
-
-
-@pytest.mark.parametrize("alpha", [0.2, 0.7])
-def test_tiles_equal_the_whole(alpha):
-    _, *data, _ = noisy_stack(331, 280)
-    trusted = tuple(np.random.default_rng(0).random((2, 331, 280)) > 0.001)
-    for more in ((), (trusted,)):
-        whole, out = l2(*data, alpha, *more), np.full_like(data[0], np.nan)
-
-        def read(rows, columns, more=more):
-            flags = [(more[0][0][rows, columns], more[0][1][rows, columns])] if more else []
-            return (*(a[rows, columns] for a in data), *flags)
-
-        def write(rows, columns, image, out=out):
-            assert np.isnan(out[rows, columns]).all()
-            out[rows, columns] = image
-
-        l2_tiled(read, write, 331, 280, alpha, tile=100)
-        assert close(out, whole, 1e-5)
-
-
 def peak_bytes(function):
     tracemalloc.start()
     try:
@@ -311,18 +287,6 @@ def test_memory_per_pixel_is_as_stated(name, bound):
     height, width = 1000, 1100
     _, *data, variances = noisy_stack(height, width)
     assert peak_bytes(lambda: METHODS[name](*data, variances)) < bound * height * width
-
-
-def test_tiles_bound_the_memory():
-    used = []
-    for rows in (1500, 4500):
-
-        def read(r, c):
-            shape = (r.stop - r.start, c.stop - c.start, 3)
-            return tuple(np.ones(shape, np.float32) for _ in range(3))
-
-        used.append(peak_bytes(lambda rows=rows: l2_tiled(read, lambda r, c, i: None, rows, 500, tile=300)))
-    assert used[1] < 1.2 * used[0]
 
 
 # Refusals

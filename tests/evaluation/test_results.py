@@ -6,8 +6,8 @@ import pytest
 
 from ngpt.evaluation.axes import Axes, ticks
 from ngpt.evaluation.frontier import Point, draw, pareto
+from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.results import as_csv, summarised
-from ngpt.evaluation.stacks import content_hash
 from ngpt.evaluation.tables import tables
 
 
@@ -22,8 +22,10 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
         "primary": "relMSE",
         "metrics": {"relMSE": {"formula": "f", "better": "lower"}, "PSNR": {"formula": "p", "better": "higher"}},
         "settings": {"spp": [16], "seeds": 3, "size": [8, 8]},
-        "methods": {m: {"stack": stacks.get(m, "gradients"), "absent": None} for m in errors},
-        "scenes": {s: {"reference": {"noise": noise}, "cost": {}, "absent": None} for s in ("a", "b")},
+        "methods": {m: {"stack": stacks.get(m, "gradients"), "family": m, "absent": None} for m in errors},
+        "scenes": {
+            s: {"reference": {"noise": noise, "doubt": 3 * noise}, "cost": {}, "absent": None} for s in ("a", "b")
+        },
         "cells": [],
     }
     for scene, factor in (("a", 1), ("b", 100)):
@@ -99,9 +101,9 @@ def test_the_pareto_set():
 
 def test_the_plot_is_legal_and_names_everything():
     points = [Point("l1 <&>", 4, 0.5, 0.1), Point("l1 <&>", 16, 2.0, 0.02), Point("oidn", 4, 1.0, 0.01)]
-    root = ElementTree.fromstring(draw(points, "a & b", "relMSE", noise=0.015))
+    root = ElementTree.fromstring(draw(points, "a & b", "relMSE", doubt=0.015))
     texts = [element.text for element in root.iter("{http://www.w3.org/2000/svg}text")]
-    assert {"a & b", "relMSE", "l1 <&>", "oidn", "noise of reference"} <= set(texts)
+    assert {"a & b", "relMSE", "l1 <&>", "oidn", "what the reference can tell"} <= set(texts)
     circles = list(root.iter("{http://www.w3.org/2000/svg}circle"))
     assert [circle.get("stroke") for circle in circles] == ["black", None, "black"]
     assert float(circles[0].get("cx")) < float(circles[1].get("cx"))
@@ -118,10 +120,10 @@ def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
     (tmp_path / "part.xml").write_text('<string name="filename" value="meshes/m.ply"/><float value="0.5"/>')
     (tmp_path / "meshes").mkdir()
     (tmp_path / "meshes/m.ply").write_text("one")
-    hashes = [content_hash(str(tmp_path / "scene.xml"))]
-    assert hashes[0] == content_hash(str(tmp_path / "scene.xml"))
+    hashes = [scene_hash(str(tmp_path / "scene.xml"))]
+    assert hashes[0] == scene_hash(str(tmp_path / "scene.xml"))
     (tmp_path / "meshes/m.ply").write_text("two")
-    hashes.append(content_hash(str(tmp_path / "scene.xml")))
+    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
     (tmp_path / "scene.xml").write_text("<scene/>")
-    hashes.append(content_hash(str(tmp_path / "scene.xml")))
-    assert len({*hashes, content_hash("diffuse"), content_hash("glossy")}) == 5
+    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
+    assert len({*hashes, scene_hash("diffuse"), scene_hash("glossy")}) == 5

@@ -10,7 +10,7 @@ import pytest
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.measure import advice
-from ngpt.measure.advice import advise, describe, hindsight, make_table, read_table
+from ngpt.measure.advice import Laws, advise, describe, make_table, read_table
 from ngpt.stack import GradientStack
 
 COST = {"gradients": 3e-6, "features": 1.5e-6, "path": 1e-6}
@@ -29,6 +29,46 @@ def make_scene(name: str, noise: float, gain: float, wobble: float = 0.0, rng=No
         errors = [law(method, noise, gain, n) * factor for n in counts]
         methods[method] = {"spp": counts, "error": errors, "reconstruct": [1e-6 if method == "l1" else 0.0] * 4}
     return {"scene": name, "noise": noise, "gain": gain, "cost": COST, "methods": methods}
+
+
+def hindsight(table: dict, pixels: int = 320 * 180, budgets: int = 5) -> list[dict]:
+    """What advice on each scene costs when the table does not have it.
+
+    For budgets from the cheapest measured cell's seconds to the dearest's, the error of the advised method, as measured
+    on the scene (between its sample counts by power laws), over that of the best method there.
+    """
+    rows = []
+    for scene in table["scenes"]:
+        laws = Laws(table)
+        times = [
+            (n * scene["cost"][stack] + laws.reconstruct(m)) * pixels
+            for m, stack in table["methods"].items()
+            for n in scene["methods"][m]["spp"]
+        ]
+        for seconds in np.geomspace(min(times) * 1.5, max(times), budgets):
+            actual = {}
+            for method, stack in table["methods"].items():
+                spp = (seconds / pixels - laws.reconstruct(method)) / scene["cost"][stack]
+                if spp >= 2:
+                    actual[method] = _measured(scene["methods"][method], spp)
+            try:
+                best = advise(table, scene, scene["cost"], pixels, seconds=float(seconds), left_out=scene["scene"])[0]
+            except NgptError:
+                continue
+            if best.method in actual:
+                ratio = actual[best.method] / min(actual.values())
+                rows.append({"scene": scene["scene"], "seconds": float(seconds), "method": best.method, "cost": ratio})
+    return rows
+
+
+def _measured(law: dict[str, list[float]], spp: float) -> float:
+    """A method's error at ``spp`` samples: straight lines of the logarithms between those measured, ends extended."""
+    x, y = np.log(law["spp"]), np.log(law["error"])
+    if len(x) == 1:
+        return float(np.exp(y[0]))
+    i = int(np.clip(np.searchsorted(x, math.log(spp)) - 1, 0, len(x) - 2))
+    slope = (y[i + 1] - y[i]) / max(x[i + 1] - x[i], 1e-9)
+    return float(np.exp(y[i] + slope * (math.log(spp) - x[i])))
 
 
 @pytest.fixture
@@ -108,19 +148,25 @@ def test_the_pilot_knows_the_variance_whatever_the_samples(rng):
 
 
 def test_the_table_of_an_evaluation(tmp_path):
-    methods = {"primal": {"stack": "path"}, "l1": {"stack": "gradients"}, "rare": {"stack": "gradients"}}
+    kinds = {"primal": "path", "l1": "gradients", "rare": "gradients", "l1 (gpt-basic)": "gradients"}
+    methods = {name: {"stack": kind, "render": kind} for name, kind in kinds.items()}
+    methods["l1 (gpt-basic)"]["render"] = "gradients gpt-basic"
     results = {"primary": "relMSE", "methods": methods, "scenes": {}, "cells": [], "summary": [], "command": "c"}
     for i, name in enumerate("abc"):
         cost = {kind: {"median": value * 200} for kind, value in COST.items()}
         results["scenes"][name] = {"size": [20, 10], "pilot": {"noise": 1.0, "gain": 2.0 + i}, "cost": cost}
-        for method in ("primal", "l1") if i else methods:
+        for method in ("primal", "l1", "l1 (gpt-basic)") if i else methods:
             cell = {"scene": name, "spp": 4, "method": method}
             results["cells"].append({**cell, "spp used": 9 if method == "primal" else 4, "absent": None})
             results["summary"].append({**cell, "error": 0.1, "seconds": {"reconstruct": 2.0}})
     table = make_table(results)
-    assert table["methods"] == {"primal": "path", "l1": "gradients"}  # "rare" is not there on all scenes
+    # "rare" is not there on all scenes, and gpt-basic is not what a pilot is rendered by.
+    assert table["methods"] == {
+        "primal": "path",
+        "l1": "gradients",
+    }
     assert table["scenes"][0]["methods"]["primal"] == {"spp": [9.0], "error": [0.1], "reconstruct": [0.01]}
-    assert table["scenes"][0]["cost"] == pytest.approx(COST)
+    assert table["scenes"][0]["cost"] == pytest.approx({kind: COST[kind] for kind in ("gradients", "path")})
     path = tmp_path / "table.json"
     path.write_text(json.dumps(table))
     assert read_table(path) == table

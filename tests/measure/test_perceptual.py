@@ -5,6 +5,7 @@ import pytest
 
 from ngpt.errors import NgptError
 from ngpt.measure import perceptual
+from ngpt.measure.metrics import METRICS
 
 
 @pytest.fixture
@@ -49,12 +50,14 @@ def test_black_reference_and_sizes(reference):
         perceptual.flip(reference, reference[:-1])
 
 
-def test_elpips_without_weights_says_what_is_missing():
+def test_elpips_without_weights_says_what_is_missing(reference):
     pytest.importorskip("torch")
+    assert "E-LPIPS needs its fitted weights" in METRICS["E-LPIPS"].missing()
     with pytest.raises(NgptError, match="E-LPIPS needs its fitted weights"):
-        perceptual.make_elpips("", "")
+        perceptual.elpips(reference, reference)
 
 
 def test_what_is_missing_is_named(monkeypatch):
     monkeypatch.setattr(perceptual, "find_spec", lambda name: None)
-    assert "flip-evaluator" in perceptual.missing("FLIP") and "scikit-image" in perceptual.missing("SSIM")
+    assert "flip-evaluator" in METRICS["FLIP"].missing() and "scikit-image" in METRICS["SSIM"].missing()
+    assert "torch" in METRICS["E-LPIPS"].missing(backbone="", weights="w")

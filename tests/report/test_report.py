@@ -11,6 +11,7 @@ from urllib.parse import quote, urlencode
 import numpy as np
 import pytest
 from browser import Session, browser_command
+from errormap import error_map
 
 from ngpt.errors import NgptError
 from ngpt.report import display, pixelcodec
@@ -262,7 +263,7 @@ def test_a_screenshot_shows_the_error_map_of_python(tmp_path):
     path = written(tmp_path, flat_scene())
     browse(path, tmp_path, picture=tmp_path / "shot.png", a="primal", b="reference", error=1, split=50)
     shot = imageio.imread(tmp_path / "shot.png")[:, :, :3].astype(int)
-    expected = display.error_map(constant(COLOURS["primal"]), constant(COLOURS["reference"]))[0, 0]
+    expected = error_map(constant(COLOURS["primal"]), constant(COLOURS["reference"]))[0, 0]
     assert where(shot, expected).sum() > 100_000
     assert where(shot, display.heat_table()[0]).sum() > 100_000  # the reference has no error
 

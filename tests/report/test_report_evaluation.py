@@ -39,7 +39,10 @@ def results_folder(folder):
     reference = {"image": "images/reference.exr", "spp": 99}
     results = {"format": 1, "title": "Evaluation", "command": "eval.py", "date": "today", "primary": "relMSE"}
     results |= {"metadata": {"versions": {"ngpt": "0.1"}, "cpu": "a cpu"}, "metrics": metrics, "cells": cells}
-    results |= {"methods": {name: {"absent": None} for name in ("primal", "l1", "oidn")}, "summary": summary}
+    results |= {
+        "methods": {name: {"absent": None, "family": name} for name in ("primal", "l1", "oidn")},
+        "summary": summary,
+    }
     results |= {"scenes": {"room": {"size": [8, 6], "reference": reference, "absent": None}}}
     results |= {"plots": {"frontier": {"room": "plots/frontier-room.svg"}}}
     (folder / "results.json").write_text(json.dumps(results))

@@ -1,0 +1,25 @@
+"""How repeated measurements become one number."""
+
+import statistics
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+
+def summary(values: list[float]) -> dict[str, float]:
+    """Median and quartiles."""
+    low, median, high = statistics.quantiles(values, n=4, method="inclusive") if len(values) > 1 else values * 3
+    return {"median": median, "low": low, "high": high}
+
+
+def median(values: Iterable[float | None]) -> float | None:
+    """Of those that are known."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
+
+
+def mean(values: Sequence[float], geometric: bool) -> float:
+    """Arithmetic, or geometric with 0 taken for 1e-30."""
+    if not geometric:
+        return float(np.mean(values))
+    return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))

@@ -1,0 +1,132 @@
+"""What a scene's images are judged by: two independent halves of a reference, or one image from elsewhere.
+
+Two halves take the reference's noise off every squared metric (``ngpt.measure.metrics``); one image cannot.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.io.exr import read
+from ngpt.measure.images import check_size, middle
+from ngpt.measure.metrics import EPSILON, exposure_mismatch
+from ngpt.stack import GradientStack
+
+# What the names of two halves end with, before ".exr".
+HALVES = ("-a", "-b")
+# A reconstruction moves the brightness by less; noise of few samples, and fireflies, may reach it.
+MOST_STOPS = 1.0
+
+
+@dataclass(frozen=True)
+class Reference:
+    """One stack or two, and their files."""
+
+    stacks: tuple[GradientStack, ...]
+    files: tuple[str, ...]
+
+    @cached_property
+    def images(self) -> tuple[np.ndarray, ...]:
+        """One image or two halves, (H, W, 3) each."""
+        return tuple(stack["primal"] for stack in self.stacks)
+
+    @cached_property
+    def mean(self) -> np.ndarray:
+        """The best image there is, (H, W, 3): r, or m = (a + b) / 2."""
+        return middle(self.images)
+
+    @property
+    def key(self) -> list:
+        """What a cached cell depends on."""
+        status = [os.stat(file) for file in self.files]
+        return [[Path(f).name, s.st_size, s.st_mtime_ns] for f, s in zip(self.files, status, strict=True)]
+
+    def total(self, attribute: str) -> float | None:
+        """The sum of a number in the files' headers, such as the samples; None where it is not in all."""
+        try:
+            value = sum(float(stack.attributes[attribute]) for stack in self.stacks)
+        except (KeyError, TypeError, ValueError):
+            return None
+        return value if np.isfinite(value) else None
+
+    @property
+    def noise(self) -> float | None:
+        """The relMSE that the mean image has by its own noise; None where the files hold no variances."""
+        if not all("primal_var" in stack for stack in self.stacks):
+            return None
+        if len(self.stacks) == 1:
+            return reference_noise(self.stacks[0])
+        a, b = (stack["primal_var"] for stack in self.stacks)
+        return _number(np.mean((a + b) / 4 / (self.mean**2 + EPSILON)))
+
+    @property
+    def doubt(self) -> float | None:
+        """The relMSE below which an order of methods means little; None where the files hold no variances.
+
+        With one image three times its noise, which is part of every error. With two halves three standard errors of
+        what is left of their noise: the mean of (a - t)(b - t) / (m² + 1e-3), t the truth, has expectation 0 and the
+        variance of a times that of b in each pixel. Channels count as one, as if their noise were the same.
+        """
+        noise = self.noise
+        if noise is None or len(self.stacks) == 1:
+            return None if noise is None else 3 * noise
+        a, b = (stack["primal_var"].astype(np.float64) for stack in self.stacks)
+        deviation = (np.sqrt(a * b) / (self.mean.astype(np.float64) ** 2 + EPSILON)).mean(axis=-1)
+        return _number(3 * np.sqrt(np.sum(deviation**2)) / deviation.size)
+
+    def check(self, stack: GradientStack) -> None:
+        """Raises NgptError if the reference is of something else than ``stack``."""
+        names = " and ".join(self.files)
+        try:
+            check_size(stack["primal"], self.mean)
+        except NgptError as error:
+            raise NgptError(f"reference {names}: {error}") from error
+        stops = exposure_mismatch(self.mean, stack["primal"])
+        if abs(stops) > MOST_STOPS:
+            raise NgptError(
+                f"reference {names}: {abs(stops):.1f} stops {'brighter' if stops > 0 else 'darker'} than the renders; "
+                "use one of the same scene and exposure"
+            )
+
+
+def reference_noise(reference: GradientStack) -> float:
+    """What one reference's own noise adds to every relMSE: the mean of its variance / (r² + epsilon)."""
+    return float(np.mean(reference["primal_var"] / (reference["primal"] ** 2 + EPSILON)))
+
+
+def read_reference(files: Sequence[str | Path]) -> Reference:
+    """Raises NgptError for files that cannot be read, and for halves that differ in size or are the same render."""
+    stacks = tuple(read(file) for file in files)
+    names = tuple(map(str, files))
+    if len(stacks) == 2:
+        check_size(stacks[0]["primal"], stacks[1]["primal"])
+        if np.array_equal(stacks[0]["primal"], stacks[1]["primal"]):
+            raise NgptError(f"{names[0]} and {names[1]}: the same image twice; halves need seeds of their own")
+    return Reference(stacks, names)
+
+
+def find_reference(folder: Path) -> Reference:
+    """The reference of a folder of stacks: two halves, reference*-a.exr and -b.exr, else reference*.exr.
+
+    Raises NgptError where there is none.
+    """
+    found = sorted(folder.glob("reference*.exr"))
+    for path in found:
+        other = path.with_name(f"{path.stem.removesuffix(HALVES[0])}{HALVES[1]}.exr")
+        if path.stem.endswith(HALVES[0]) and other in found:
+            return read_reference((path, other))
+    if not found:
+        raise NgptError(f"{folder}: no reference: name one reference.exr, or set references.{folder.name}")
+    return read_reference(found[:1])
+
+
+def _number(value: np.floating | float) -> float | None:
+    """None for what JSON does not know."""
+    return float(value) if np.isfinite(value) else None
