@@ -7,8 +7,8 @@ are left out and counted, since one of them would hide all others.
 A reference has noise. With one image r = t + n, t the truth, the mean of (x - r)² is that of (x - t)² plus the mean of
 n². With two halves the square becomes the product (x - a)(x - b): their noises are independent and of mean zero, so the
 product's expectation is (x - t)², whatever the noise. The product of a pixel, and even a mean, may be negative where an
-image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2; what its noise does
-to them changes the error by a share of the order of the noise's relMSE.
+image is nearer to the truth than the reference can tell. Denominators use the mean m = (a + b) / 2, whose noise is not
+taken off: for a relative variance v of m it adds about 6 v² to relMSE, and 4 v times a relative bias of the image.
 """
 
 from collections.abc import Callable, Iterable
@@ -44,8 +44,8 @@ def relmse(image: np.ndarray, *halves: np.ndarray) -> float:
 def relmse_trimmed(image: np.ndarray, *halves: np.ndarray, share: float = 0.001) -> float:
     """relMSE without the worst 0.1 % of the pixels (by channel mean), which fireflies would otherwise decide.
 
-    With two halves the worst have the largest (x - m)² / (m² + 1e-3). To leave out the largest products would prefer
-    those in which noise made the product positive, and bias the mean of the others.
+    With two halves the worst have the largest (x - m)² / (m² + 1e-3), whatever the sign of their product. That choice
+    sees the reference's noise, which lowers the mean by about 1 % of that noise's own relMSE where it is Gaussian.
     """
     errors, sizes = (relative_squared_error(image, *r) for r in (halves, (middle(halves),)))
     return trimmed_mean(errors, sizes, share)

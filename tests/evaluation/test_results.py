@@ -6,7 +6,6 @@ import pytest
 
 from ngpt.evaluation.axes import Axes, ticks
 from ngpt.evaluation.frontier import Point, draw, pareto
-from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
 
@@ -113,17 +112,3 @@ def test_the_plot_is_legal_and_names_everything():
 def test_axes_of_a_single_point_and_ticks():
     assert ticks(0.9, 21) == [1, 2, 5, 10, 20] and ticks(1e-6, 1.5) == pytest.approx([10.0**p for p in range(-6, 1)])
     assert Axes((1, 1), (1, 1)).x(1) == pytest.approx(Axes((0.1, 10), (1, 1)).x(1))
-
-
-def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
-    (tmp_path / "scene.xml").write_text('<scene><include filename="part.xml"/></scene>')
-    (tmp_path / "part.xml").write_text('<string name="filename" value="meshes/m.ply"/><float value="0.5"/>')
-    (tmp_path / "meshes").mkdir()
-    (tmp_path / "meshes/m.ply").write_text("one")
-    hashes = [scene_hash(str(tmp_path / "scene.xml"))]
-    assert hashes[0] == scene_hash(str(tmp_path / "scene.xml"))
-    (tmp_path / "meshes/m.ply").write_text("two")
-    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
-    (tmp_path / "scene.xml").write_text("<scene/>")
-    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
-    assert len({*hashes, scene_hash("diffuse"), scene_hash("glossy")}) == 5

@@ -7,17 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from folders import read, write_scene
 
 import ngpt
 from eval import main as command
-from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
 from ngpt.evaluation.config import read_config
 from ngpt.evaluation.run import evaluate, picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
 from ngpt.io.exr import read_image
-from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
 QUIET = Console(quiet=True)
@@ -31,32 +30,11 @@ images = "all"
 """
 
 
-def write_scene(folder: Path, rng: np.random.Generator, spp=(4, 16), seeds=2) -> np.ndarray:
-    """A folder of stacks of a smooth image, 24x17, whose noise falls with the samples; returns the image."""
-    folder.mkdir()
-    y, x = np.mgrid[0:17, 0:24] / 10
-    clean = np.stack([1 + np.sin(x + c) * np.cos(y) / 2 for c in range(3)], axis=-1)
-    features = {"albedo": clean / 2, "normal": np.zeros_like(clean), "depth": np.ones((17, 24, 1))}
-    for n in spp:
-        for seed in range(seeds):
-            noisy = {"primal": clean + rng.normal(0, 0.5 / n**0.5, clean.shape)}
-            noisy["primal_var"] = np.full_like(clean, 0.25 / n)
-            for name, difference in zip(("dx", "dy"), forward_differences(clean), strict=True):
-                noisy[name] = difference + rng.normal(0, 0.1 / n**0.5, clean.shape)
-                noisy[f"{name}_var"] = np.full_like(clean, 0.01 / n)
-            primal = {name: noisy[name] for name in ("primal", "primal_var")}
-            attributes = {"ngpt:seconds": 0.1 * n, "ngpt:spp": n}
-            for kind, layers in (("gradients", noisy | features), ("features", primal | features), ("path", primal)):
-                stack = GradientStack.from_arrays(attributes=attributes, **layers)
-                ngpt.write(folder / f"{kind}-{n}-{seed}.exr", stack)
-    ngpt.write(folder / "reference.exr", clean.astype(np.float32))
-    return clean
-
-
-def read(text: str, folder: Path):
-    path = folder / "config.toml"
-    path.write_text(text)
-    return read_config(path)
+TWIN = """
+[variants.l1-gpt]
+method = "l1"
+sampler = "primal"
+"""
 
 
 @pytest.fixture
@@ -183,6 +161,11 @@ def test_a_stack_without_features_is_an_absent_cell(room):
         ('images = "some"', "images = 'some'"),
         ('[variants.x]\nstack = "left"\nmethod = "l1"', "stack must be one of"),
         ("[variants.x]\nalpha = 1", "variants.x: method is missing"),
+        ("samplers = []", "samplers and rivals must not be empty"),
+        ('samplers = ["gpt", "gpt"]', "a sampler is listed twice"),
+        ("rivals = [1]", "must be a list of str"),
+        (f'methods = ["l1", "l1-gpt"]\nsamplers = ["gpt", "toy"]\n{TWIN}', "two columns would be called 'l1-gpt'"),
+        ('[references]\nroom = ["a.exr"]', "references.room = ['a.exr']: must be a file, or a list of two halves"),
     ],
 )
 def test_errors_of_the_configuration(tmp_path, entry, message):

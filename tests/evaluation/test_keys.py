@@ -1,0 +1,113 @@
+"""What a cached picture depends on: the code that renders it and the scene, not what is written about either."""
+
+import ast
+import re
+import shutil
+from pathlib import Path
+
+import pytest
+
+from ngpt.evaluation import keys, stacks
+from ngpt.evaluation.config import Config
+from ngpt.evaluation.keys import library_hash, renderer_hash, scene_hash, source_hash
+from ngpt.evaluation.stacks import SceneStacks
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def tree(tmp_path, monkeypatch):
+    """A copy of data_gen that the keys are made of."""
+    shutil.copytree(ROOT / "data_gen", tmp_path / "data_gen", ignore=shutil.ignore_patterns("__pycache__"))
+    monkeypatch.setattr(keys, "_data_gen", lambda: tmp_path / "data_gen")
+    return tmp_path / "data_gen"
+
+
+def replace(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new, 1))
+
+
+def key_of(scene: str, folder: Path) -> str:
+    return SceneStacks("s", scene, Config(scenes=(scene,)), folder, lambda text: None).key
+
+
+def test_a_changed_weight_in_the_film_is_another_key(tree, tmp_path):
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    scenes = ("diffuse", str(tmp_path / "scene.xml"))
+    before = [key_of(scene, tmp_path) for scene in scenes]
+    assert before == [key_of(scene, tmp_path) for scene in scenes]
+    replace(tree / "film" / "gradient_film.py", "gradient[behind] = 0.5 *", "gradient[behind] = 0.25 *")
+    assert not set(before) & {key_of(scene, tmp_path) for scene in scenes}
+
+
+def test_a_new_file_that_renders_is_another_key(tree):
+    before = renderer_hash()
+    (tree / "samplers" / "toy.py").write_text("x = 1\n")
+    assert renderer_hash() != before
+
+
+def test_a_changed_colour_of_a_built_in_scene_is_another_key_of_built_in_scenes(tree, tmp_path):
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    scenes = ("diffuse", str(tmp_path / "scene.xml"))
+    before = [key_of(scene, tmp_path) for scene in scenes]
+    replace(tree / "scenes" / "builtin.py", "_diffuse(0.3, 0.42, 0.6)", "_diffuse(0.3, 0.42, 0.7)")
+    after = [key_of(scene, tmp_path) for scene in scenes]
+    assert after[0] != before[0] and after[1] == before[1]
+
+
+def test_another_version_of_mitsuba_is_another_key(tree, tmp_path, monkeypatch):
+    before = key_of("diffuse", tmp_path)
+    monkeypatch.setattr(stacks, "version", lambda package: "0.0")
+    assert key_of("diffuse", tmp_path) != before
+
+
+def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):
+    before = key_of("diffuse", tmp_path)
+    film = tree / "film" / "gradient_film.py"
+    film.write_text("# A remark.\n" + re.sub(r'"""(?=[A-Z])', '"""More words. ', film.read_text()))
+    for name in ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "costs.py", "__main__.py"):
+        (tree / name).write_text((tree / name).read_text() + "\nsomething = 1\n")
+    assert key_of("diffuse", tmp_path) == before
+
+
+def test_a_docstring_of_a_report_changes_nothing(tree, tmp_path):
+    """Nor does its code: it decides no number; a metric's code does."""
+    shutil.copytree(ROOT / "ngpt", tmp_path / "ngpt", ignore=shutil.ignore_patterns("__pycache__", "weights"))
+    before = key_of("diffuse", tmp_path), source_hash(tmp_path / "ngpt", keys._PRESENTATION)
+    page = tmp_path / "ngpt" / "report" / "page.py"
+    page.write_text(page.read_text().replace('"""', '"""More words. ', 1) + "\nsomething = 1\n")
+    assert (key_of("diffuse", tmp_path), source_hash(tmp_path / "ngpt", keys._PRESENTATION)) == before
+    metrics = tmp_path / "ngpt" / "measure" / "metrics.py"
+    replace(metrics, "EPSILON = 1e-3", "EPSILON = 1e-2")
+    assert source_hash(tmp_path / "ngpt", keys._PRESENTATION) != before[1]
+    assert len(library_hash()) == 64
+
+
+def test_what_renders_imports_nothing_that_is_left_out():
+    """But the built-in scenes, which have a key of their own."""
+    left_out = {f"data_gen.{name.removesuffix('.py').replace('/', '.')}" for name in keys._NOT_RENDERING}
+    seen = set()
+    for path in (ROOT / "data_gen").rglob("*.py"):
+        name = path.relative_to(ROOT / "data_gen").as_posix()
+        if any(name == part or name.startswith(f"{part}/") for part in keys._NOT_RENDERING):
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("data_gen"):
+                seen |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    assert {name for name in seen if name in left_out} == {"data_gen.scenes.builtin"}
+
+
+def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
+    (tmp_path / "scene.xml").write_text('<scene><include filename="part.xml"/></scene>')
+    (tmp_path / "part.xml").write_text('<string name="filename" value="meshes/m.ply"/><float value="0.5"/>')
+    (tmp_path / "meshes").mkdir()
+    (tmp_path / "meshes/m.ply").write_text("one")
+    hashes = [scene_hash(str(tmp_path / "scene.xml"))]
+    assert hashes[0] == scene_hash(str(tmp_path / "scene.xml"))
+    (tmp_path / "meshes/m.ply").write_text("two")
+    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
+    (tmp_path / "scene.xml").write_text("<scene/>")
+    hashes.append(scene_hash(str(tmp_path / "scene.xml")))
+    assert len({*hashes, scene_hash("diffuse"), scene_hash("glossy")}) == 5

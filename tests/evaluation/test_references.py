@@ -1,0 +1,128 @@
+"""References: two halves whose noise is taken off, or one image whose noise is not."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from folders import read, smooth_image, write_halves, write_scene
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.evaluation.references import find_reference, read_reference, reference_noise
+from ngpt.evaluation.run import evaluate
+from ngpt.evaluation.stability import flicker_and_bias, study
+from ngpt.io.exr import read_image
+from ngpt.system.console import Console
+
+QUIET = Console(quiet=True)
+CONFIG = """
+scenes = ["{folder}"]
+spp = [16]
+seeds = 2
+methods = ["primal", "l2"]
+metrics = ["relMSE", "relMSE trimmed", "SMAPE", "PSNR"]
+images = "all"
+"""
+
+
+def test_halves_are_found_before_single_images(tmp_path, rng):
+    with pytest.raises(NgptError, match="no reference"):
+        find_reference(tmp_path)
+    # What older versions kept in their caches is one image.
+    ngpt.write(tmp_path / "reference-512spp.exr", smooth_image().astype(np.float32))
+    assert len(find_reference(tmp_path).images) == 1
+    write_halves(tmp_path, rng, 0.1, "reference-512spp")
+    found = find_reference(tmp_path)
+    assert [Path(file).name for file in found.files] == ["reference-512spp-a.exr", "reference-512spp-b.exr"]
+    (tmp_path / "reference-512spp-b.exr").unlink()
+    (tmp_path / "reference-512spp.exr").unlink()
+    assert len(find_reference(tmp_path).images) == 1
+
+
+def test_the_same_image_twice_is_refused(tmp_path, rng):
+    write_halves(tmp_path, rng, 0.1)
+    file = tmp_path / "reference-a.exr"
+    with pytest.raises(NgptError, match="the same image twice"):
+        read_reference([file, file])
+
+
+def test_noise_and_doubt(tmp_path, rng):
+    """The mean of the halves has half their variance; what is left of it in an error is far less than the noise."""
+    write_halves(tmp_path, rng, 0.2)
+    found = find_reference(tmp_path)
+    mean = found.mean
+    assert found.noise == pytest.approx(np.mean(0.04 / 2 / (mean**2 + 1e-3)), rel=1e-3)
+    assert found.total("ngpt:spp") == 200 and found.total("ngpt:seconds") == 3 and found.total("other") is None
+    truth = smooth_image()
+    left = [
+        np.mean((truth - a) * (truth - b) / (mean**2 + 1e-3))
+        for a, b in truth + 0.2 * rng.standard_normal((300, 2, *truth.shape))
+    ]
+    # Three standard errors, on the safe side: channels are taken to be noisy together.
+    assert np.std(left) < found.doubt / 3 < 2 * np.std(left)
+    one = read_reference(found.files[:1])
+    assert one.noise == reference_noise(one.stacks[0]) and one.doubt == pytest.approx(3 * one.noise)
+
+
+def test_the_noise_of_the_reference_is_not_in_the_errors(tmp_path):
+    """Of many references: with halves the errors are those of the clean one, with one image its noise is added."""
+    rng = np.random.default_rng(3)
+    clean = tmp_path / "room"
+    write_scene(clean, rng, spp=(16,))
+    config = read(CONFIG.format(folder=clean).replace('"primal", ', ""), tmp_path)
+    true = error_of(evaluate(config, tmp_path / "clean", QUIET, ""))
+    (clean / "reference.exr").unlink()
+    halves, one = [], []
+    for i in range(12):
+        write_halves(clean, rng, 0.03)
+        halves.append(error_of(evaluate(config, tmp_path / f"halves{i}", QUIET, "")))
+        (clean / "reference-b.exr").unlink()
+        one.append(error_of(evaluate(config, tmp_path / f"one{i}", QUIET, "")))
+        (clean / "reference-a.exr").unlink()
+    assert np.mean(halves) == pytest.approx(true, rel=0.08)
+    assert np.mean(one) > 2 * true
+
+
+def error_of(results: dict) -> float:
+    return next(r["error"] for r in results["summary"] if r["method"] == "l2" and r["scene"])
+
+
+def test_tables_say_what_halves_do(tmp_path, rng):
+    write_scene(tmp_path / "room", rng)
+    write_halves(tmp_path / "room", rng, 0.1)
+    out = tmp_path / "out"
+    results = evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), out, QUIET, "")
+    entry = results["scenes"]["room"]["reference"]
+    assert entry["halves"] and entry["spp"] == 200
+    a, b = (read_image(tmp_path / "room" / f"reference-{half}.exr").astype(np.float64) for half in "ab")
+    # The floor of a metric that is not made of squares is that between the halves.
+    assert entry["floors"] == {"SMAPE": pytest.approx(np.mean(2 * np.abs(a - b) / (np.abs(a) + np.abs(b))))}
+    assert np.allclose(read_image(out / entry["image"]), (a + b) / 2, rtol=2e-3)
+    text = (out / "results.md").read_text()
+    assert "two independent halves" in text and "three standard errors" in text
+    line = next(line for line in text.splitlines() if line.startswith("| SMAPE | 16 "))
+    assert line.endswith(f"| {entry['floors']['SMAPE']:.4g} |")
+    assert next(line for line in text.splitlines() if line.startswith("| PSNR | 16 ")).endswith("|  |")
+
+
+def test_two_files_named_in_the_configuration_are_halves(tmp_path, rng):
+    write_scene(tmp_path / "room", rng)
+    write_halves(tmp_path, rng, 0.1, "mine")
+    files = [str(tmp_path / f"mine-{half}.exr") for half in "ab"]
+    text = CONFIG.format(folder=tmp_path / "room") + f"[references]\nroom = {files}\n"
+    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "")
+    assert results["scenes"]["room"]["reference"]["halves"]
+
+
+def test_stability_takes_the_noise_off_the_bias(tmp_path, rng):
+    """An unbiased method has no bias, even by references with more noise than its mean image."""
+    truth = np.ones((40, 50, 3))
+    images = truth + rng.normal(0, 0.2, (16, *truth.shape))
+    a, b = truth + rng.normal(0, 0.1, (2, *truth.shape))
+    assert abs(flicker_and_bias(images, a, b, share=0)["bias"]) < 0.001
+    assert flicker_and_bias(images, (a + b) / 2, share=0)["bias"] > 0.004
+    write_scene(tmp_path / "room", rng)
+    write_halves(tmp_path / "room", rng, 0.3)
+    evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out", QUIET, "")
+    rows = {row["method"]: row for row in study(tmp_path / "out")}
+    assert abs(rows["primal"]["bias"]) < 0.02 and rows["primal"]["flicker"] > 0.01

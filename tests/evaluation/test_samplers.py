@@ -1,0 +1,157 @@
+"""The sampler as an axis: columns, equal time, tables; of folders of stacks, and of a scene that is rendered."""
+
+import json
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from folders import read, write_scene
+
+import ngpt
+from ngpt.evaluation.config import Config
+from ngpt.evaluation.renders import Render
+from ngpt.evaluation.run import evaluate
+from ngpt.evaluation.stacks import SceneStacks
+from ngpt.report.evaluation import write_evaluation_report
+from ngpt.system.console import Console
+
+QUIET = Console(quiet=True)
+
+
+def columns(**entries):
+    config = Config(scenes=("diffuse",), **entries)
+    return {column.name: (column.method, column.render.name) for column in config.columns()}
+
+
+def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack():
+    methods = ("primal", "wcv", "oidn")
+    # One sampler: names and stacks are those of old.
+    assert columns(methods=methods) == {
+        "primal": ("primal", "path"),
+        "wcv": ("wcv", "gradients"),
+        "oidn": ("oidn", "features"),
+    }
+    assert columns(methods=methods, samplers=("gpt-basic",))["wcv"] == ("wcv", "gradients gpt-basic")
+    assert columns(methods=methods, samplers=("auto", "gpt-basic"), rivals=("primal", "ppm")) == {
+        "primal (primal)": ("primal", "path"),
+        "primal (ppm)": ("primal", "path ppm"),
+        "wcv (auto)": ("wcv", "gradients"),
+        "wcv (gpt-basic)": ("wcv", "gradients gpt-basic"),
+        "oidn (primal)": ("oidn", "features"),
+        "oidn (ppm)": ("oidn", "features ppm"),
+    }
+
+
+def test_a_variant_names_its_own_sampler():
+    variants = {
+        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
+        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
+        "photons": {"method": "primal", "sampler": "ppm"},
+    }
+    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
+        "wcv (gpt)": ("wcv", "gradients gpt"),
+        "wcv (toy)": ("wcv", "gradients toy"),
+        "wcv-replayed": ("wcv", "gradients gpt-basic"),
+        "raw": ("primal", "gradients gpt"),
+        "photons": ("primal", "path ppm"),
+    }
+
+
+def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monkeypatch):
+    """Any names: nobody asks the registry."""
+    monkeypatch.setattr(SceneStacks, "load", lambda self: pytest.fail("asked for the renderer"))
+    room = tmp_path / "room"
+    for name in ("gradients-ours", "gradients-theirs"):
+        write_scene(room, rng, gradients=name)
+    text = f'scenes = ["{room}"]\nspp = [4, 16]\nseeds = 2\nmethods = ["primal", "l2"]\nimages = "all"\n'
+    text += 'samplers = ["ours", "theirs"]\nmetrics = ["relMSE", "relMSE trimmed"]\n'
+    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "")
+    names = ["primal", "l2 (ours)", "l2 (theirs)"]
+    assert list(results["methods"]) == names and not any(cell["absent"] for cell in results["cells"])
+    entry = results["methods"]["l2 (theirs)"]
+    assert (entry["family"], entry["method"], entry["stack"], entry["sampler"]) == ("l2", "l2", "gradients", "theirs")
+    assert (tmp_path / "out" / "images" / "room" / "16-l2-theirs-seed1.exr").is_file()
+    table = (tmp_path / "out" / "results.md").read_text()
+    assert "| `primal`† | `l2 (ours)` | `l2 (theirs)` |" in table and "In brackets is the sampler" in table
+    plot = ElementTree.parse(tmp_path / "out" / results["plots"]["frontier"]["room"])
+    texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
+    assert set(names) <= set(texts)
+    lines = [e for e in plot.iter("{http://www.w3.org/2000/svg}path") if e.get("stroke-width") == "1.6"]
+    (_, ours, theirs) = [(e.get("stroke"), e.get("stroke-dasharray")) for e in lines]
+    assert ours[0] == theirs[0] and ours[1] != theirs[1]  # one colour for l2, dashes by sampler
+    page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
+    assert "l2 (theirs)" in page and "equal time to 4 spp of sampler auto" in page
+    # A single sampler that is not the usual one: names are those of the methods.
+    results = evaluate(read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path, QUIET, "")
+    assert list(results["methods"]) == ["primal", "l2"]
+
+
+SETTINGS = """
+scenes = ["diffuse"]
+size = [32, 24]
+spp = [8]
+seeds = 2
+methods = ["primal", "wcv"]
+metrics = ["relMSE", "relMSE trimmed"]
+reference_spp = 128
+timing_spp = 8
+timing_repeats = 3
+"""
+
+
+def test_two_samplers_at_equal_time(renderer, tmp_path):
+    out = tmp_path / "out"
+    before = evaluate(read(SETTINGS, tmp_path), out, QUIET, "")
+    text = SETTINGS + 'samplers = ["gpt", "gpt-basic"]\nrivals = ["primal", "ppn"]\n'
+    results = evaluate(read(text, tmp_path), out, QUIET, "")
+    names = ["primal (primal)", "primal (ppn)", "wcv (gpt)", "wcv (gpt-basic)"]
+    assert list(results["methods"]) == names
+    cells = {(cell["method"], cell["seed"]): cell for cell in results["cells"]}
+    # What cannot be compared is a row that says why.
+    assert "unknown sampler 'ppn'; choose one of: auto, gpt" in cells["primal (ppn)", 0]["absent"]
+    # Equal time: a sample of gpt-basic costs more, so there are fewer of them; those of gpt, which "auto" is, count.
+    costs = results["scenes"]["diffuse"]["cost"]
+    assert costs["gradients"]["sampler"] == "gpt" and costs["gradients gpt-basic"]["sampler"] == "gpt-basic"
+    ratio = costs["gradients"]["median"] / costs["gradients gpt-basic"]["median"]
+    used = {method: cells[method, 0]["spp used"] for method in names}
+    assert used["wcv (gpt)"] == 8 and used["wcv (gpt-basic)"] == max(2, round(8 * ratio))
+    # What was measured and rendered before stays: the clock is the same, and so are the cells.
+    assert {name: costs[name] for name in before["scenes"]["diffuse"]["cost"]} == before["scenes"]["diffuse"]["cost"]
+    for old, new in (("primal", "primal (primal)"), ("wcv", "wcv (gpt)")):
+        mine = [cell["metrics"] for cell in before["cells"] if cell["method"] == old]
+        assert mine == [cells[new, seed]["metrics"] for seed in range(2)]
+    # The table is right: rows are medians of the cells, heads name the samplers, and the costs are those of the cells.
+    lines = (out / "results.md").read_text().splitlines()
+    heads = next(line for line in lines if line.startswith("| scene | spp |"))
+    assert heads == "| scene | spp | `primal (primal)`† | `wcv (gpt)` | `wcv (gpt-basic)` | reference noise |"
+    row = next(line for line in lines if line.startswith("| diffuse | 8 |"))
+    for text, method in zip(row.split("|")[3:6], ("primal (primal)", "wcv (gpt)", "wcv (gpt-basic)"), strict=True):
+        errors = [cells[method, seed]["metrics"]["relMSE trimmed"] for seed in range(2)]
+        assert float(text.strip(" *").split(" ")[0]) == pytest.approx(np.median(errors), abs=6e-5)
+    cost = next(line for line in lines if line.startswith("| scene | ms / spp with gradients |"))
+    assert cost.endswith("| over path | over path with features | over `gpt-basic` | reference spp | by sampler |")
+    row = next(line for line in lines if line.startswith(f"| diffuse | {costs['gradients']['median'] * 1e3:.1f} |"))
+    assert row.endswith(f"| {ratio:.2f} | 128 | `gpt` |")
+    # Stacks of their own, under names of their own; gpt's are the usual ones.
+    folder = next((out / "cache").glob("diffuse-*"))
+    stack = ngpt.read(next(folder.glob("gradients-gpt-basic-*-1.exr")))
+    assert stack.attributes["ngpt:sampler"] == "gpt-basic"
+    assert not list(folder.glob("gradients-gpt-[0-9]*")) and (folder / "gradients-8-1.exr").is_file()
+    assert sorted(p.name for p in folder.glob("reference*")) == ["reference-128spp-a.exr", "reference-128spp-b.exr"]
+    seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in folder.glob("reference*")}
+    assert len(seeds) == 2 and results["scenes"]["diffuse"]["reference"]["spp"] == 128
+    page = write_evaluation_report(out, tmp_path / "report.html").read_text()
+    assert "Milliseconds a sample" in page and "gradients gpt-basic" in page
+    assert json.loads((out / "results.json").read_text())["methods"]["wcv (gpt)"]["sampler"] == "gpt"
+    # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
+    slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "")
+    assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
+
+
+def test_a_sampler_of_the_other_kind_is_refused_with_the_entry_it_belongs_to(renderer, tmp_path):
+    config = read(SETTINGS, tmp_path)
+    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, lambda text: None)
+    with_gradients, without = Render("features", "gpt"), Render("gradients", "primal")
+    assert not stacks._can(with_gradients) and not stacks._can(without)
+    assert stacks.lacks[with_gradients.name] == "sampler 'gpt' renders gradients: list it under samplers"
+    assert stacks.lacks[without.name] == "sampler 'primal' renders no gradients: list it under rivals"
