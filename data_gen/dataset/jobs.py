@@ -14,8 +14,9 @@ from pathlib import Path
 from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.errors import NgptError
-from ngpt.system.files import atomic_output, exclusive
+from ngpt.system.files import exclusive
 from ngpt.system.workers import end_with_parent
+from ngpt.system.writing import write_json
 from ngpt.training.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
 from ngpt.training.shards import Shard
 
@@ -151,8 +152,3 @@ def update_manifest(folder: Path) -> None:
             entries.append(known[name])
         if entries != manifest["shards"]:
             write_json(folder / MANIFEST, manifest | {"shards": entries})
-
-
-def write_json(path: Path, value: dict) -> None:
-    with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text(json.dumps(value, indent=1) + "\n")

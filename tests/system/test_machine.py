@@ -1,0 +1,32 @@
+"""What results record of where they were made, and the files they are written to."""
+
+import json
+
+import pytest
+
+from ngpt.system.machine import metadata
+from ngpt.system.writing import write_json, write_text
+from ngpt.version import __version__
+
+
+def test_metadata_names_versions_and_machine():
+    facts = metadata("numpy", "a-package-that-is-not-there")
+    assert facts["versions"]["ngpt-recon"] == __version__ and facts["versions"]["numpy"]
+    assert facts["versions"]["a-package-that-is-not-there"] is None and facts["threads"] >= 1
+    json.dumps(facts)
+
+
+def test_without_git_there_is_no_commit(monkeypatch, tmp_path):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert metadata()["commit"] is None
+
+
+def test_files_are_replaced_whole_or_not_at_all(tmp_path):
+    path = tmp_path / "a.json"
+    write_json(path, {"σ": 1})
+    assert json.loads(path.read_text()) == {"σ": 1}
+    with pytest.raises(ValueError, match="JSON"):
+        write_json(path, {"x": float("nan")})
+    write_text(tmp_path / "a.md", "σ²\n")
+    assert json.loads(path.read_text()) == {"σ": 1} and (tmp_path / "a.md").read_text(encoding="utf-8") == "σ²\n"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.md"]
