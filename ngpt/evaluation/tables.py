@@ -51,9 +51,12 @@ def tables(results: dict[str, Any]) -> str:
 
 def _doubtful(results: dict[str, Any]) -> str:
     """What ~ means: halves take a reference's noise off the errors, so that less of it is left to doubt."""
-    if _halved(results):
-        return "within three standard errors of what the reference's noise leaves in an error"
-    return "within three times of the reference's own noise"
+    one, two = "three times of the reference's own noise", "three standard errors of what the reference's noise leaves"
+    halved = _halved(results)
+    if not halved:
+        return f"within {one}"
+    alike = all(name in halved for name, entry in results["scenes"].items() if entry.get("reference"))
+    return f"within {two}" if alike else f"within {two}, or where the reference is one image within {one}"
 
 
 def _halved(results: dict[str, Any]) -> list[str]:
@@ -74,18 +77,23 @@ def _halves(results: dict[str, Any]) -> list[str]:
 
 
 def _several_samplers(results: dict[str, Any]) -> bool:
-    """Whether columns differ by their samplers alone."""
-    return any(name != entry.get("family", name) for name, entry in results["methods"].items())
+    """Whether any stacks are not by the usual sampler for their kind."""
+    return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 
 
 def _samplers(results: dict[str, Any]) -> list[str]:
+    """Which methods have the stacks of which sampler, where it is not always the usual one."""
     if not _several_samplers(results):
         return []
-    return [
-        "In brackets is the sampler. All of them are given the time that the samples of the row cost with sampler "
-        f"`{results['settings']['clock']}`, so each has as many samples as it buys, measured for each scene.",
-        "",
-    ]
+    found: dict[str, list[str]] = {}
+    for method in _present(results):
+        found.setdefault(results["methods"][method]["sampler"], []).append(f"`{method}`")
+    lines = [f"- by `{sampler}`: {', '.join(methods)}" for sampler, methods in found.items()]
+    clock = results["settings"]["clock"]
+    text = (
+        f"All samplers have the time that the samples of the row cost with `{clock}`, measured for each scene. Stacks"
+    )
+    return [text, "", *lines, ""]
 
 
 def _present(results: dict[str, Any]) -> list[str]:

@@ -140,8 +140,8 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
 
 
 def _several_samplers(results: dict) -> bool:
-    """Whether columns differ by their samplers alone."""
-    return any(name != entry["family"] for name, entry in results["methods"].items())
+    """Whether any stacks are not by the usual sampler for their kind."""
+    return any(entry["render"] != entry["stack"] for entry in results["methods"].values())
 
 
 def _costs(results: dict) -> dict[str, list[list[str]]]:

@@ -10,9 +10,13 @@ from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
 
 
+def method_entry(name: str) -> dict:
+    kind = {"primal": "path", "oidn": "features"}.get(name, "gradients")
+    return {"stack": kind, "render": kind, "family": name, "absent": None}
+
+
 def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
     """Two scenes, one spp, with these errors by method, one for each seed; the second scene's are a hundred times."""
-    stacks = {"primal": "path", "oidn": "features"}
     results = {
         "title": "Title",
         "command": "command",
@@ -21,7 +25,7 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
         "primary": "relMSE",
         "metrics": {"relMSE": {"formula": "f", "better": "lower"}, "PSNR": {"formula": "p", "better": "higher"}},
         "settings": {"spp": [16], "seeds": 3, "size": [8, 8]},
-        "methods": {m: {"stack": stacks.get(m, "gradients"), "family": m, "absent": None} for m in errors},
+        "methods": {m: method_entry(m) for m in errors},
         "scenes": {
             s: {"reference": {"noise": noise, "doubt": 3 * noise}, "cost": {}, "absent": None} for s in ("a", "b")
         },

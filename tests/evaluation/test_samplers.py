@@ -72,7 +72,7 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     assert (entry["family"], entry["method"], entry["stack"], entry["sampler"]) == ("l2", "l2", "gradients", "theirs")
     assert (tmp_path / "out" / "images" / "room" / "16-l2-theirs-seed1.exr").is_file()
     table = (tmp_path / "out" / "results.md").read_text()
-    assert "| `primal`† | `l2 (ours)` | `l2 (theirs)` |" in table and "In brackets is the sampler" in table
+    assert "| `primal`† | `l2 (ours)` | `l2 (theirs)` |" in table and "- by `theirs`: `l2 (theirs)`\n" in table
     plot = ElementTree.parse(tmp_path / "out" / results["plots"]["frontier"]["room"])
     texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
     assert set(names) <= set(texts)

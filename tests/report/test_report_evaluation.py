@@ -40,7 +40,7 @@ def results_folder(folder):
     results = {"format": 1, "title": "Evaluation", "command": "eval.py", "date": "today", "primary": "relMSE"}
     results |= {"metadata": {"versions": {"ngpt": "0.1"}, "cpu": "a cpu"}, "metrics": metrics, "cells": cells}
     results |= {
-        "methods": {name: {"absent": None, "family": name} for name in ("primal", "l1", "oidn")},
+        "methods": {name: {"absent": None, "render": "path", "stack": "path"} for name in ("primal", "l1", "oidn")},
         "summary": summary,
     }
     results |= {"scenes": {"room": {"size": [8, 6], "reference": reference, "absent": None}}}

@@ -23,10 +23,10 @@ def test_without_git_there_is_no_commit(monkeypatch, tmp_path):
 
 def test_files_are_replaced_whole_or_not_at_all(tmp_path):
     path = tmp_path / "a.json"
-    write_json(path, {"σ": 1})
-    assert json.loads(path.read_text()) == {"σ": 1}
+    write_json(path, {"x²": 1})
+    assert json.loads(path.read_text()) == {"x²": 1}
     with pytest.raises(ValueError, match="JSON"):
         write_json(path, {"x": float("nan")})
     write_text(tmp_path / "a.md", "σ²\n")
-    assert json.loads(path.read_text()) == {"σ": 1} and (tmp_path / "a.md").read_text(encoding="utf-8") == "σ²\n"
+    assert json.loads(path.read_text()) == {"x²": 1} and (tmp_path / "a.md").read_text(encoding="utf-8") == "σ²\n"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.md"]
