@@ -89,11 +89,8 @@ def _samplers(results: dict[str, Any]) -> list[str]:
     for method in _present(results):
         found.setdefault(results["methods"][method]["sampler"], []).append(f"`{method}`")
     lines = [f"- by `{sampler}`: {', '.join(methods)}" for sampler, methods in found.items()]
-    clock = results["settings"]["clock"]
-    text = (
-        f"All samplers have the time that the samples of the row cost with `{clock}`, measured for each scene. Stacks"
-    )
-    return [text, "", *lines, ""]
+    clock = f"All samplers have the time that a row's samples cost with `{results['settings']['clock']}`"
+    return [f"{clock}, measured for each scene. The stacks are rendered", "", *lines, ""]
 
 
 def _present(results: dict[str, Any]) -> list[str]:
