@@ -11,7 +11,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force, positive, size
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
-from ngpt.measure.metrics import compare
+from ngpt.measure.metrics import METRICS, compare
 from ngpt.methods import METHODS, reconstruct
 from ngpt.report.page import Entry, Scene, median, write_report
 from ngpt.stack import GradientStack
@@ -99,7 +99,9 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
         f"{stack.width}x{stack.height}, {args.spp} spp, rendered in {stack.attributes['ngpt:seconds']:.1f} s; "
         f"reference {args.reference_spp} spp of Mitsuba's own integrator"
     )
-    return Scene(name, caption, reference, entries, {layer: stack[layer] for layer in LAYER_VIEWS if layer in stack})
+    layers = {layer: stack[layer] for layer in LAYER_VIEWS if layer in stack}
+    rising = [metric for metric in TABLE_METRICS if METRICS[metric].better == "higher"]
+    return Scene(name, caption, reference, entries, layers, rising)
 
 
 def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> Entry:

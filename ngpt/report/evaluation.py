@@ -101,7 +101,8 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     floors = [f"{metric} {value:.3g}" for metric, value in reference.get("floors", {}).items() if value is not None]
     facts += [f"between the reference's halves {', '.join(floors)}"] if floors else []
     facts += ["without " + ", ".join(absent)] if absent else []
-    return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries)
+    rising = [metric for metric, entry in results["metrics"].items() if entry["better"] == "higher"]
+    return Scene(f"{name}, {spp} spp", "; ".join(facts), image, entries, rising=rising)
 
 
 def _value(value: float | None) -> float:

@@ -13,7 +13,7 @@ import math
 import os
 import re
 import statistics
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 from html import escape
 from importlib.resources import files as package_files
@@ -28,7 +28,6 @@ from ngpt.system.files import atomic_output
 
 REFERENCE = "reference"  # the name of Scene.reference among the pictures
 BASELINE = "primal"  # the method the table compares the others to
-HIGHER_IS_BETTER = {"psnr", "ssim", "ms-ssim"}  # compared in lower case; every other metric is an error
 THUMBNAIL_WIDTH = 240
 NOTHING = "&ndash;"
 PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
@@ -56,6 +55,7 @@ class Scene:
     # Extra views, (H, W), (H, W, 1) or (H, W, 3): 'dx', 'dy', 'normal' and 'depth' get a map of their own, the others
     # show as colour.
     layers: dict[str, np.ndarray] = field(default_factory=dict)
+    rising: Collection[str] = ()  # the metrics of which more is better; every other is an error
 
 
 @dataclass
@@ -268,7 +268,7 @@ def _table(scene: Scene) -> str:
     best = {metric: _best(scene, metric) for metric in metrics}
     baseline = next((entry.metrics for entry in scene.entries if entry.name == BASELINE), {})
     heads = [
-        f'<th scope="col">{escape(metric)} <i>{"↑" if _rising(metric) else "↓"}</i><small></small></th>'
+        f'<th scope="col">{escape(metric)} <i>{"↑" if metric in scene.rising else "↓"}</i><small></small></th>'
         for metric in metrics
     ]
     rows = []
@@ -277,7 +277,7 @@ def _table(scene: Scene) -> str:
         for metric in metrics:
             values = entry.metrics.get(metric, math.nan)
             value, primal = median(values), median(baseline.get(metric, math.nan))
-            compared = "" if entry.name == BASELINE else _compared(metric, value, primal)
+            compared = "" if entry.name == BASELINE else _compared(value, primal, metric in scene.rising)
             mark = ' class="best"' if best[metric] == row else ""
             cells.append(f"<td{mark}><span>{_number(value)}</span>{_spread(values)}<small>{compared}</small></td>")
         seconds = NOTHING if entry.seconds is None else f"{entry.seconds:.3g} s"
@@ -327,21 +327,17 @@ def _plain_table(rows: list[list[str]]) -> str:
     return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
 
 
-def _rising(metric: str) -> bool:
-    return metric.lower() in HIGHER_IS_BETTER
-
-
 def _best(scene: Scene, metric: str) -> int | None:
     """The index of the entry with the best finite value, or None."""
     values = [(median(entry.metrics.get(metric, math.nan)), row) for row, entry in enumerate(scene.entries)]
-    values = [(-value if _rising(metric) else value, row) for value, row in values if math.isfinite(value)]
+    values = [(-value if metric in scene.rising else value, row) for value, row in values if math.isfinite(value)]
     return min(values)[1] if values else None
 
 
-def _compared(metric: str, value: float, baseline: float) -> str:
+def _compared(value: float, baseline: float, rising: bool) -> str:
     if not (math.isfinite(value) and math.isfinite(baseline)):
         return ""
-    if _rising(metric):  # decibels and similarities have no meaningful ratio
+    if rising:  # decibels and similarities have no meaningful ratio
         return f"{value - baseline:+.2f}"
     return f"&times;{value / baseline:.2g}" if baseline > 0.0 else ""
 

@@ -35,7 +35,7 @@ def flat_scene(name="flat") -> Scene:
         Entry("primal", constant(COLOURS["primal"]), None, {"relMSE": 0.5, "PSNR": 10.0}),
         Entry("l1", constant(COLOURS["l1"]), 0.25, {"relMSE": 0.05, "PSNR": 14.0}),
     ]
-    return Scene(name, "two colours", constant(COLOURS["reference"]), entries, {"dx": constant(-1.0)})
+    return Scene(name, "two colours", constant(COLOURS["reference"]), entries, {"dx": constant(-1.0)}, rising=("PSNR",))
 
 
 def noise_scene(name="noise") -> Scene:
