@@ -21,6 +21,7 @@ from ngpt.measure.advice import describe
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.report.display import auto_exposure
+from ngpt.report.evaluation import FORMAT
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import exclusive
@@ -40,7 +41,7 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
     lacks = {column.name: absence(column) for column in columns}
     scorer = Scorer(config, cache / "cells")
     results: dict[str, Any] = {
-        "format": 1,
+        "format": FORMAT,
         "title": config.title,
         "command": command,
         "date": datetime.now(UTC).strftime("%Y-%m-%d"),

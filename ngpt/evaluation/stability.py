@@ -25,6 +25,7 @@ from ngpt.io.exr import read_image
 from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
 from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.report.evaluation import FORMAT
 from ngpt.report.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
@@ -68,6 +69,8 @@ def study(out: Path) -> list[dict[str, Any]]:
         results = json.loads((out / "results.json").read_text())
     except (OSError, ValueError) as error:
         raise NgptError(f"{out / 'results.json'}: cannot be read: {error}; run eval.py first") from error
+    if results.get("format") != FORMAT:
+        raise NgptError(f"{out / 'results.json'}: is not of format {FORMAT}; run eval.py of this version again")
     seeds = range(results["settings"]["seeds"])
     rows = []
     (out / "stability").mkdir(exist_ok=True)

@@ -10,7 +10,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import read_image
 from ngpt.report.page import Entry, Overview, Scene, write_report
 
-FORMAT = 1
+FORMAT = 2
 ROOM = (
     54 * 1280 * 720
 )  # pixels of all pictures that a page takes in acceptable quality: 8 methods and reference, 6 scenes

@@ -37,7 +37,7 @@ def results_folder(folder):
         summary += [row | {"scene": "room"}, row | {"scene": None, "pareto": False}]
     metrics = {"PSNR": {"formula": "of what", "better": "higher"}, "relMSE": {"formula": "mean", "better": "lower"}}
     reference = {"image": "images/reference.exr", "spp": 99}
-    results = {"format": 1, "title": "Evaluation", "command": "eval.py", "date": "today", "primary": "relMSE"}
+    results = {"format": 2, "title": "Evaluation", "command": "eval.py", "date": "today", "primary": "relMSE"}
     results |= {"metadata": {"versions": {"ngpt": "0.1"}, "cpu": "a cpu"}, "metrics": metrics, "cells": cells}
     results |= {
         "methods": {name: {"absent": None, "render": "path", "stack": "path"} for name in ("primal", "l1", "oidn")},
@@ -70,8 +70,8 @@ def test_what_is_not_a_result_is_refused(tmp_path):
     with pytest.raises(NgptError, match=r"results.json: cannot be read"):
         write_evaluation_report(tmp_path, tmp_path / "report.html")
     results = results_folder(tmp_path)
-    (tmp_path / "results.json").write_text(json.dumps(results | {"format": 2}))
-    with pytest.raises(NgptError, match="format 1"):
+    (tmp_path / "results.json").write_text(json.dumps(results | {"format": 1}))
+    with pytest.raises(NgptError, match="format 2"):
         write_evaluation_report(tmp_path, tmp_path / "report.html")
     (tmp_path / "results.json").write_text(json.dumps(results | {"cells": []}))
     with pytest.raises(NgptError, match="no cell has a picture"):
