@@ -46,15 +46,13 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
 from data_gen.samplers.common import GradientIntegrator
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
-
-# α of Beckmann and GGX above which a material is connectable.
-ROUGHNESS_THRESHOLD = 0.05
 
 
 class GPT(GradientIntegrator):
