@@ -33,13 +33,14 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
-from data_gen.paths.camera import CameraSamples, render_passes
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from
-from data_gen.samplers.common import GradientIntegrator
+from data_gen.samplers.common import GradientIntegrator, like_path
 from ngpt.errors import NgptError
 
 
@@ -64,17 +65,9 @@ class GPTSimple(GradientIntegrator):
         L, Le, _ = self.trace(scene, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
-    def render_film(self, scene, sensor, seed: int, spp: int, **progress) -> GradientFilm:
-        """Renders pass by pass: see ``data_gen.paths.camera.render_passes()``."""
-        obstacle = "variant '{mi.variant()}' is polarised" if mi.is_polarized else ""
-        obstacle = "its integrator hides emitters" if self.hide_emitters else obstacle
-        materials = Materials(scene, ROUGHNESS_THRESHOLD).unconnectable
-        if materials:
-            more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
-            obstacle = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}"
-        if obstacle:
-            raise NgptError(f"sampler 'gpt-simple' cannot render this scene: {obstacle}; use sampler 'gpt'")
-        return render_passes(lambda camera, film: self.sample_pass(scene, camera, film), sensor, seed, spp, **progress)
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene, self.hide_emitters)
+        return lambda camera, film: self.sample_pass(scene, camera, film)
 
     def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
@@ -230,6 +223,25 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
     Δ += w2 * (β * step.Le * mis_weight(p, step.p_light) - step.β1 * step.L_bsdf)
     # All densities from here on are the same for both paths: r and w stay, and of C(y) - C(x) all but β is common.
     return Δ, w2 * (β - step.β1)
+
+
+def refuse(scene, hide_emitters: bool) -> None:
+    """Raises NgptError for a scene that reconnection alone cannot render."""
+    if mi.is_polarized:
+        reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
+    elif hide_emitters:
+        reason, other = "its integrator hides emitters", "gpt"
+    elif materials := Materials(scene, ROUGHNESS_THRESHOLD).unconnectable:
+        more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
+        reason, other = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}", "gpt"
+    else:
+        return
+    raise NgptError(f"sampler 'gpt-simple' cannot render this scene: {reason}; use --sampler {other}")
+
+
+def make(scene: mi.Scene) -> SamplePass:
+    """The sampler ``gpt-simple``, with the parameters of the scene's own ``path``."""
+    return like_path(scene, "gpt_simple").prepare(scene)
 
 
 mi.register_integrator("gpt_simple", lambda props: GPTSimple(props))

@@ -1,10 +1,10 @@
-"""The teaching twin of ``gpt`` is right for what it renders, refuses the rest, and is noisy no more than its model.
+"""The teaching twin of ``gpt`` is right for what it renders, and refuses the rest.
 
-The budget is fixed: 16 stacks of 64 spp against 24 references of 128 spp at 32x32 pixels, a level of 1 % for a scene as
-a whole.
+The laws that all samplers share are in ``test_samplers``. The budget of z-tests is fixed: 16 stacks of 64 spp against
+24 references of 128 spp at 32x32 pixels, a level of 1 % for a scene as a whole.
 """
 
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 import pytest
@@ -43,33 +43,25 @@ def courtyard():
     }
 
 
-SCENES = ["diffuse", "lens", courtyard]
-
-
 @pytest.fixture(scope="module")
 def stacks(renderer):
-    """Stacks of a scene, (name or function) -> layers of each, rendered once."""
-    return cache(lambda scene: render_ours(load(renderer, scene, (32, 32)), "gpt-simple"))
+    """Layers of 16 stacks of the courtyard."""
+    return render_ours(load(renderer, courtyard, (32, 32)), "gpt-simple")
 
 
 @pytest.fixture(scope="module")
 def references(renderer):
-    return cache(lambda scene: render_references(renderer, load(renderer, scene, (32, 32)), spp=128))
+    return render_references(renderer, load(renderer, courtyard, (32, 32)), spp=128)
 
 
-def verdicts(stacks, references):
-    return {name: result.passed for name, result in gradient_tests(stacks, references)}
-
-
-@pytest.mark.parametrize("scene", SCENES)
-def test_unbiased(stacks, references, scene):
-    assert references(scene).mean() > 0.01  # black images agree all too well
-    for name, result in gradient_tests(stacks(scene), references(scene)):
+def test_unbiased(stacks, references):
+    assert references.mean() > 0.01  # black images agree all too well
+    for name, result in gradient_tests(stacks, references):
         assert result.passed, f"{name}: {result}"
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("scene", SCENES)
+@pytest.mark.parametrize("scene", ["diffuse", "lens", courtyard])
 def test_unbiased_with_a_large_budget(renderer, scene):
     scene = load(renderer, scene, (64, 64))
     references = render_references(renderer, scene, batches=32, spp=1024)
@@ -77,18 +69,30 @@ def test_unbiased_with_a_large_budget(renderer, scene):
         assert result.passed, f"{name}: {result}"
 
 
-@pytest.mark.parametrize("max_depth", [0, 1, 2, 3, 4])
-def test_unbiased_at_each_of_the_steps_that_are_written_out(renderer, max_depth):
+def limited(max_depth):
     def scene():
         description = courtyard()
         description["integrator"]["max_depth"] = max_depth
         return description
 
-    scene = load(renderer, scene, (16, 16))
-    ours = render_ours(scene, "gpt-simple", spp=32)
-    assert np.any(ours[0]["dx"]) == (max_depth > 1) and np.any(ours[0]["primal"]) == (max_depth > 0)
-    for name, result in gradient_tests(ours, render_references(renderer, scene, batches=16, spp=128)):
+    return scene
+
+
+@pytest.mark.parametrize("max_depth", [2, 3])
+def test_unbiased_where_paths_end_at_a_step_that_is_written_out(renderer, max_depth):
+    scene = load(renderer, limited(max_depth), (16, 16))
+    references = render_references(renderer, scene, batches=12, spp=256)
+    for name, result in gradient_tests(render_ours(scene, "gpt-simple", batches=12), references):
         assert result.passed, f"{name}: {result}"
+
+
+def test_depth_limits(renderer):
+    from data_gen.render import render_stack
+
+    for max_depth in (0, 1):
+        stack = render_stack(load(renderer, limited(max_depth), (16, 16)), 16, sampler="gpt-simple")
+        assert stack["primal"].any() == stack["direct"].any() == (max_depth == 1)
+        assert not stack["dx"].any() and not stack["dy"].any()
 
 
 def test_furnace(renderer):
@@ -104,14 +108,10 @@ def test_agrees_with_the_full_integrator(renderer, stacks):
     from data_gen.render import render_stack
 
     scene = load(renderer, courtyard, (32, 32))
-    ours, theirs = stacks(courtyard), [render_stack(scene, 64, 100 + seed, "gpt").layers for seed in range(16)]
+    full = [render_stack(scene, 64, 100 + seed, "gpt").layers for seed in range(16)]
     for name in ("primal", "direct", "dx", "dy", "albedo", "normal"):
-        result = z_test(*(np.stack([stack[name] for stack in both]) for both in (ours, theirs)))
+        result = z_test(*(np.stack([stack[name] for stack in both]) for both in (stacks, full)))
         assert result.passed, f"{name}: {result}"
-    # The same shift with the same weights: no noisier, and no less noisy.
-    for name in ("primal_var", "dx_var", "dy_var"):
-        one, other = (np.mean([stack[name] for stack in both]) for both in (ours, theirs))
-        assert one == pytest.approx(other, rel=0.1), name
 
 
 @pytest.mark.parametrize(
@@ -119,9 +119,9 @@ def test_agrees_with_the_full_integrator(renderer, stacks):
     [
         ("reconnection_jacobian", lambda mi, dr, *geometry: mi.Float(1)),
         ("gradient_weight", lambda mi, dr, r, good: mi.Float(1)),
-        ("seen_from", lambda mi, dr, si, direction: si),
+        ("gradient_weight", lambda mi, dr, r, good: dr.select(r > 0, 2 / (1 + r), 1)),
     ],
-    ids=["no Jacobian", "w is 1/2", "the joined vertex is seen from the base path's"],
+    ids=["no Jacobian", "w is 1/2", "failed shifts count half"],
 )
 def test_mutants_fail_the_z_test(renderer, references, function, mutant, monkeypatch):
     import drjit as dr
@@ -129,10 +129,19 @@ def test_mutants_fail_the_z_test(renderer, references, function, mutant, monkeyp
     from data_gen.samplers import gpt_simple
 
     monkeypatch.setattr(gpt_simple, function, partial(mutant, renderer, dr))
-    scene = "diffuse" if function != "seen_from" else courtyard
-    passed = verdicts(render_ours(load(renderer, scene, (32, 32)), "gpt-simple"), references(scene))
-    print(passed)
-    assert passed["primal"] and not (passed["dx"] and passed["dy"])
+    stacks = render_ours(load(renderer, courtyard, (32, 32)), "gpt-simple")
+    passed = {name: result.passed for name, result in gradient_tests(stacks, references)}
+    assert passed["primal"] and not (passed["dx"] or passed["dy"])
+
+
+def test_random_replay_of_it_is_random_replay(renderer):
+    """As a plugin that samples radiance, in place of Mitsuba's ``path``."""
+    scene = load(renderer, courtyard, (12, 12))
+    nested = {"type": "gpt_simple", "max_depth": 7, "rr_depth": 3}
+    replay = renderer.load_dict({"type": "gpt_basic", "nested": nested})
+    ours = np.array(renderer.render(scene, integrator=replay, spp=256))
+    assert ours[..., replay.aov_names().index("dx.R")].any()
+    assert ours[..., :3].mean() == pytest.approx(np.array(renderer.render(scene, spp=1024)).mean(), rel=0.05)
 
 
 class Pairs:
@@ -159,7 +168,7 @@ class Pairs:
         back = self.step(apart.y, one, first, apart.y.to_local(to), joined.y)
         joined_back = step_apart(scene, back, start(scene, apart.r > 0, ray, one))
         again = self.step(joined.y, back.β1, second, second.wo, second.x1)
-        self.back, self.again = step_joined(again, joined_back), again.goes_on
+        self.back, self.both = step_joined(again, joined_back), again.goes_on
         self.tried, self.r, self.r_back = first.goes_on & (apart.r > 0), joined.r, joined_back.r
         dr.eval(self.there, self.back, self.tried, self.r, self.r_back)
 
@@ -175,48 +184,64 @@ class Pairs:
         light = sample_light(self.scene, x, other.u_light, x.is_valid())
         f, p = evaluate(x.bsdf(), x, wo)
         goes_on = other.goes_on & (p > 0)
+        β1 = dr.select(goes_on, β * f / p, 0)
         Le, p_light = emission(self.scene, x1, x, goes_on, goes_on)
-        return Step(
-            x, β, other.u_light, light, reflected(light, x), wo, p, goes_on, dr.select(goes_on, β * f / p, 0), x1, Le, p_light,
-            Le * mis_weight(p, p_light),
-        )  # fmt: skip
+        L_light, L_bsdf = reflected(light, x), Le * mis_weight(p, p_light)
+        return Step(x, β, other.u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf)
 
 
-def test_a_pair_says_the_same_from_either_side(renderer):
-    """Sampled from the other side, the same two paths have 1 / r, weights that add up to 1, and -Δ and -a."""
-    import drjit as dr
-
-    pairs = Pairs(renderer, load(renderer, courtyard, (32, 32)))
-    good = np.array(pairs.tried & (pairs.r > 0))
-    print(good.mean(), np.array(pairs.tried).mean())
-    r, r_back = np.array(pairs.r)[good], np.array(pairs.r_back)[good]
-    print("r", np.quantile(np.abs(r*r_back-1), [.5,.99,.999,.9999,1]))
-    for one, other in zip(pairs.there, pairs.back):
-        one, other = np.array(one)[:, good], np.array(other)[:, good]
-        print(np.quantile(np.abs(one + other)/(1e-3+np.abs(one)), [.5,.9,.99,.999,.9999,1]))
+@pytest.fixture(scope="module")
+def pairs(renderer):
+    return Pairs(renderer, load(renderer, courtyard, (32, 32)))
 
 
-def test_most_shifts_succeed(renderer):
-    for scene in SCENES:
-        pairs = Pairs(renderer, load(renderer, scene, (32, 32)))
-        print(scene, (np.array(pairs.r)>0).sum() / np.array(pairs.tried).sum())
+def test_a_pair_says_the_same_from_either_side(pairs):
+    """Sampled from the other side the same two paths have 1 / r, so that w and w' add up to 1, and -Δ and -a."""
+    shifted = np.array(pairs.tried & (pairs.r > 0))
+    r, r_back = np.array(pairs.r)[shifted], np.array(pairs.r_back)[shifted]
+    assert (r_back > 0).mean() > 0.999
+    # Mitsuba's rays start a little off the surface, which shows where angles are flat or vertices close.
+    assert (np.abs(r * r_back - 1) < 0.05).mean() > 0.98
+    both = shifted & np.array(pairs.both)
+    for there, back in zip(pairs.there, pairs.back, strict=True):
+        there, back = np.array(there)[:, both], np.array(back)[:, both]
+        off = np.abs(there + back) > 0.05 * np.abs(there) + 1e-3 * np.abs(there).mean()
+        assert off.mean() < 0.02
 
 
-def test_gradients_have_less_variance_than_differences_of_pixels(stacks):
-    for scene in SCENES:
-        direct = np.mean([s["direct"] for s in stacks(scene)], axis=0).sum(axis=-1)
-        dark = direct == 0
-        primal, dx, dy = (np.mean([s[f"{n}_var"] for s in stacks(scene)], axis=0) for n in ("primal","dx","dy"))
-        pair = dark[:, 1:] & dark[:, :-1]
-        print(scene, ((primal[:, 1:] + primal[:, :-1])[pair]).mean() / dx[:, :-1][pair].mean())
-        pair = dark[1:] & dark[:-1]
-        print(scene, ((primal[1:] + primal[:-1])[pair]).mean() / dy[:-1][pair].mean())
+def test_most_shifts_succeed(pairs):
+    assert (np.array(pairs.r) > 0).sum() > 0.8 * np.array(pairs.tried).sum()  # measured: 0.88
 
 
-@pytest.mark.parametrize("scene", ["glossy", "environment", fog, hidden_lamp, lambda: polished(0.01), lambda: polished(0.3)])
-def test_refuses(renderer, scene):
+def test_gradients_have_less_variance_than_differences_of_pixels(renderer):
     from data_gen.render import render_stack
-    try:
+
+    stack = render_stack(load(renderer, "diffuse", (48, 48)), 64, sampler="gpt-simple")
+    # Pixels at lamps have the variance of the lamp's edge in the primal, but not in the gradients.
+    unlit = stack["direct"].sum(axis=-1) == 0
+    here = unlit[:, 1:] & unlit[:, :-1]
+    independent = (stack["primal_var"][:, 1:] + stack["primal_var"][:, :-1])[here].mean()
+    assert independent > 5 * stack["dx_var"][:, :-1][here].mean()  # measured: 11
+
+
+@pytest.mark.parametrize(
+    ("scene", "reason"),
+    [
+        (lambda: polished(0.01), r"floor.bsdf \(RoughConductor\).*use --sampler gpt"),
+        ("environment", r"ball.bsdf \(SmoothPlastic\); use --sampler gpt"),
+        ("glossy", r"glass.bsdf \(SmoothDielectric\), lacquer.bsdf .*, mirror.bsdf .*; use --sampler gpt"),
+        (fog, "'gpt-simple' knows only 'path'; use --sampler gpt-basic"),
+        (hidden_lamp, "hides emitters; use --sampler gpt"),
+    ],
+)
+def test_refuses_what_it_cannot_render(renderer, scene, reason):
+    from data_gen.render import render_stack
+
+    with pytest.raises(NgptError, match=f"sampler 'gpt-simple' cannot render this scene: .*{reason}"):
         render_stack(load(renderer, scene, (8, 8)), 1, sampler="gpt-simple")
-    except NgptError as e:
-        print(e)
+
+
+def test_takes_what_is_rough_enough(renderer):
+    from data_gen.samplers.gpt_simple import make
+
+    assert callable(make(load(renderer, lambda: polished(0.06), (8, 8))))

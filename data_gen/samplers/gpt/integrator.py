@@ -36,8 +36,6 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 
@@ -47,11 +45,10 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
-from data_gen.samplers.common import GradientIntegrator
+from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
-from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
 
 
@@ -202,18 +199,8 @@ def make(scene: mi.Scene, **options) -> SamplePass:
 
 
 def stand_in(scene: mi.Scene, **options) -> GPT:
-    """The plugin with the parameters of the scene's own ``path``; raises NgptError where they cannot be read."""
-    path = reference_integrator(scene)
-    # Mitsuba exposes neither depth as a parameter, only in print.
-    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
-    if depths.keys() != {"max_depth", "rr_depth"}:
-        raise NgptError(
-            f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
-            "use --sampler gpt-basic"
-        )
-    unlimited = depths["max_depth"] >= 0x7FFFFFFF
-    depths["max_depth"] = -1 if unlimited else depths["max_depth"]
-    return mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths, **options})
+    """The plugin with the parameters of the scene's own ``path``: see ``like_path()``."""
+    return like_path(scene, "gpt", **options)
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))
