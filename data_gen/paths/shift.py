@@ -27,6 +27,7 @@ def reconnects(kind: mi.UInt32, base: mi.Bool, base_next: mi.Bool, offset: mi.Bo
     ``kind`` is the kind of event by which the base path left its vertex; the others say which vertices are connectable,
     an escape to the environment being so (Kettunen et al. 2015, section 5.2).
     """
+    # All three vertices, so that the rule is its own mirror image: base and offset may change places.
     return (kind == SMOOTH) & base & base_next & offset
 
 
@@ -36,6 +37,7 @@ def replay_inverts(offset_kind: mi.UInt32, offset: mi.Bool, offset_next: mi.Bool
     It would not if that reconnects the path found, whose event is of ``offset_kind``, to the base path's vertex. Else
     it replays, whatever the kinds of the two events: the same random numbers have the same density (survey, eq. 6).
     """
+    # The rule above with the two paths changed, as the reverse shift would ask it
     return ~reconnects(offset_kind, offset, offset_next, base)
 
 
@@ -73,6 +75,8 @@ def copy_half_vector(
     refracts = wi.z * wo.z < 0
     thin = refracts & (η == 1)
     bends = refracts & ~thin
+
+    # The base path's half-vector h = (wi + η wo) / |wi + η wo| (survey, eq. 15; Walter et al., eq. 13 and 16)
     above = mi.Vector3f(wo.x, wo.y, dr.select(thin, -wo.z, wo.z))
     scale = dr.select(bends, η, 1)
     h = wi + scale * above
@@ -82,11 +86,12 @@ def copy_half_vector(
     # Reflection about h, of which either sign will do
     c = dr.dot(wi_offset, h)
     mirrored = 2 * c * h - wi_offset
-    # Refraction: wi' + η wo' is to be parallel to h.
+    # Refraction: wi' + η wo' is to be parallel to h (Walter et al., eq. 40).
     cos2 = 1 - (1 - dr.square(c)) / dr.square(scale)
     bent = (c * h - wi_offset) / scale - dr.mulsign(dr.safe_sqrt(cos2), c) * h
     wo_offset = dr.select(bends, bent, mirrored)
 
+    # dω'/dω = (dh/dω) / (dh'/dω'), since h' = h (Walter et al., eq. 14 for reflections, eq. 17 for refractions)
     length2_offset = dr.squared_norm(wi_offset + scale * wo_offset)
     cosines = dr.abs(dr.dot(wo_offset, h) / dr.dot(above, h))
     J = dr.select(bends, length2_offset / length2 / cosines, cosines)

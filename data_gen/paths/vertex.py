@@ -12,6 +12,9 @@ import numpy as np
 # direction at all counts as DELTA.
 SMOOTH, DELTA, NULL = 0, 1, 2
 
+# α of Beckmann and GGX above which a material is connectable, unless an integrator is given another.
+ROUGHNESS_THRESHOLD = 0.05
+
 # Parameters that hold a microfacet roughness, as mi.traverse() spells them: constants and textures, at any nesting.
 _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.data)?$")
 
@@ -27,22 +30,28 @@ class Materials:
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
 
-    ``all_connectable`` is True where every vertex is connectable and no event is other than smooth.
+    ``unconnectable`` lists the materials, as "shape.material (class)", at which a vertex is not connectable or an event
+    may be other than smooth; ``all_connectable`` is True where there are none.
     """
 
     def __init__(self, scene: mi.Scene, threshold: float):
         shapes = scene.shapes()
-        # By Dr.Jit's number of each material
-        bsdfs = {dr_number(shape.bsdf()): shape.bsdf() for shape in shapes if shape.bsdf() is not None}
-        table = np.ones(max(bsdfs, default=0) + 1, bool)
-        smooth = True
-        for number, bsdf in bsdfs.items():
+        # By Dr.Jit's number of each material, one of the shapes that are made of it
+        users = {dr_number(shape.bsdf()): shape for shape in shapes if shape.bsdf() is not None}
+        table = np.ones(max(users, default=0) + 1, bool)
+        self.unconnectable: list[str] = []
+        for number, shape in users.items():
+            bsdf = shape.bsdf()
             table[number] = smallest_roughness(bsdf) > threshold
             sharp = any(mi.has_flag(bsdf.flags(), flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
-            smooth &= mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) and not sharp
+            if sharp or not (table[number] and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)):
+                name = ".".join(filter(None, (shape.id(), bsdf.id())))
+                self.unconnectable.append(f"{name} ({bsdf.class_name()})".strip())
         # Materials inside shape groups are not listed: they count as rough, but what else they do is unknown.
-        hidden = any(shape.class_name() == "Instance" for shape in shapes)
-        self.all_connectable = bool(table.all()) and smooth and not hidden
+        if any(shape.class_name() == "Instance" for shape in shapes):
+            self.unconnectable.append("those inside shape groups")
+        self.unconnectable.sort()
+        self.all_connectable = not self.unconnectable
         self.size = len(table)
         self.rough = mi.Bool(table)
         dr.eval(self.rough)

@@ -100,14 +100,19 @@ def _from_module(module: str) -> Callable[..., SamplePass]:
     return lambda scene, **options: import_module(module).make(scene, **options)
 
 
-def _refused_by_gpt(facts: Facts) -> str:
+def _refused_by_gpt(facts: Facts, name: str = "gpt") -> str:
     if facts.polarised:
-        return f"variant '{facts.polarised}' is polarised, which 'gpt' does not follow"
+        return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow"
     if facts.integrator != "path":
-        return f"the integrator is '{facts.integrator}', and 'gpt' knows only 'path'"
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
     if facts.media:
-        return f"there are media ({', '.join(facts.media)}), which 'gpt' does not see"
+        return f"there are media ({', '.join(facts.media)}), which '{name}' does not see"
     return ""
+
+
+def _refused_by_gpt_simple(facts: Facts) -> str:
+    mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
+    return _refused_by_gpt(facts, "gpt-simple") or mirrors
 
 
 def _notes_on_replay(facts: Facts) -> list[str]:
@@ -124,7 +129,9 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _PRIMAL = (f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "primal"))
+_GPT, _BASIC, _SIMPLE, _PRIMAL = (
+    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "primal")
+)
 
 for _sampler in (
     Sampler(
@@ -149,6 +156,14 @@ for _sampler in (
         notes=_notes_on_replay,
         rank=9,
         module=_BASIC,
+    ),
+    Sampler(
+        "gpt-simple",
+        "gradients by reconnection alone (surfaces that scatter widely; the code to read before that of gpt)",
+        _from_module(_SIMPLE),
+        _refused_by_gpt_simple,
+        lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
+        module=_SIMPLE,
     ),
     Sampler(
         "primal",

@@ -51,26 +51,40 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, offsets) -> tup
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
     """
+    # ---------------------- Random numbers -----------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
+
+    # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     light, light_weight = scene.sample_emitter_direction(x, u_light, not plan.lights.shared, lit)
     lit &= light.pdf != 0
+    # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
     if plan.lights.shared:
         lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit)
+    # Toward the emitter and along a new direction at once: materials are virtual functions, and calls to them dear.
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
 
+    # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
+    # At its end a base path reconnects to nothing: with DELTA its offset paths are sent to replay, beside a ghost.
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
+    # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
     seen = seen | (kind != NULL)
     η = dr.select(found, η * sample.eta, η)
+
+    # ---------------------- Russian roulette ---------------------
     survival, walks = roulette(plan, depth, β * f_p, f_p, η, u_survival, offsets)
     goes_on = walks & found
+    # All five paths survive together: 1 / q is a factor of each throughput, and cancels in r (survey, eq. 17).
     f_p = dr.select(goes_on, f_p * survival, 0)
 
+    # ------------------- Next vertex, and Le there ---------------
     x1 = scene.ray_intersect(x.spawn_ray(x.to_world(sample.wo)), goes_on)
+    # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
     step = Step(
         x=x,
@@ -109,8 +123,11 @@ def roulette(plan: Plan, depth, β1, f_p, η, u, offsets) -> tuple[mi.Float, mi.
     """
     largest = dr.max(β1)
     for y in offsets:
+        # What an offset path may yet bring to Δ / 2: w β' until it is settled, with its β' of before this step, since
+        # its f is not known yet; then w |β' - β|, which is |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
+    # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever, were it a perfect mirror.
     q = dr.fmin(largest * dr.square(η), 0.95)
     plays = depth >= plan.rr_depth
     return dr.select(plays, dr.rcp(q), 1), (largest > 0) & (~plays | (u < q))
@@ -118,4 +135,5 @@ def roulette(plan: Plan, depth, β1, f_p, η, u, offsets) -> tuple[mi.Float, mi.
 
 def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:
     """MIS weight of a sampled emitter whose direction BSDF sampling finds with density ``p``."""
+    # No direction that is sampled ever meets a point or a single direction.
     return dr.select(delta, 1, mis_weight(p_light, p))

@@ -36,8 +36,6 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
-import re
-
 import drjit as dr
 import mitsuba as mi
 
@@ -46,15 +44,12 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import GradientIntegrator
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
+from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
-from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
-
-# α of Beckmann and GGX above which a material is connectable.
-ROUGHNESS_THRESHOLD = 0.05
 
 
 class GPT(GradientIntegrator):
@@ -112,11 +107,15 @@ class GPT(GradientIntegrator):
 
     def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
+        # ------------------------- Paths -----------------------------
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
+        # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
         L, Le, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
         L, Le = to_rgb(L, ray.wavelengths), to_rgb(Le, ray.wavelengths)
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
+
+        # ------------------------ Samples ----------------------------
         inside = [inside for _, _, inside in shifted]
         if self.reuse:
             L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in offsets], Δ, inside)
@@ -124,6 +123,7 @@ class GPT(GradientIntegrator):
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         if self.diagnostics:
             values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
+        # One kernel for all of it: each value read on its own would trace the paths again.
         dr.eval(values, Δ, inside)
         for name, value in values.items():
             film.put(name, value)
@@ -135,8 +135,10 @@ class GPT(GradientIntegrator):
 
         At the first vertex all offset paths are apart, and few later on: that step stands before the loop.
         """
+        # --------------------- First vertices ------------------------
         x = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray))
         seen = mi.Bool(not plan.hides)
+        # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
         Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
         offsets = []
         for offset_ray, offset_importance, inside in shifted:
@@ -144,8 +146,12 @@ class GPT(GradientIntegrator):
             offsets.append(start(plan, x, importance, offset_ray, hit, offset_importance, inside))
         if plan.max_depth < 2:
             return dr.zeros(mi.Spectrum, dr.width(hit.t)), Le, offsets
+
+        # --------------------- The first step ------------------------
+        # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
         β = dr.select(x.is_valid(), importance, 0)
         step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, offsets)
+        # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
         L = β * step.L_light + step.β1 * step.L_bsdf
         offsets = first_steps(scene, plan, step, offsets)
         L, offsets = self.walk(scene, plan, random, step, η, L, offsets)
@@ -154,10 +160,13 @@ class GPT(GradientIntegrator):
     @dr.syntax
     def walk(self, scene, plan, random, step, η, L, offsets):
         """The rest of all paths past their first ``step``."""
+        # ---------------------- Loop state ---------------------------
         x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
         depth = mi.UInt32(2)
+        # As long as the base path lives, or a ghost has company
         active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         while dr.hint(active, label="gpt"):
+            # The base path first: an offset path can only join a vertex that is known.
             step, η = base_step(scene, plan, random, x, β, η, depth, seen, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
             offsets = later_steps(scene, plan, step, offsets)
@@ -204,18 +213,8 @@ def make(scene: mi.Scene, **options) -> SamplePass:
 
 
 def stand_in(scene: mi.Scene, **options) -> GPT:
-    """The plugin with the parameters of the scene's own ``path``; raises NgptError where they cannot be read."""
-    path = reference_integrator(scene)
-    # Mitsuba exposes neither depth as a parameter, only in print.
-    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
-    if depths.keys() != {"max_depth", "rr_depth"}:
-        raise NgptError(
-            f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
-            "use --sampler gpt-basic"
-        )
-    unlimited = depths["max_depth"] >= 0x7FFFFFFF
-    depths["max_depth"] = -1 if unlimited else depths["max_depth"]
-    return mi.load_dict({"type": "gpt", "hide_emitters": path.hide_emitters, **depths, **options})
+    """The plugin with the parameters of the scene's own ``path``: see ``like_path()``."""
+    return like_path(scene, "gpt", **options)
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))

@@ -54,6 +54,9 @@ def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Off
     """
     lives = inside & hit.is_valid()
     ended = inside & ~hit.is_valid() & x.is_valid()
+    # Seen from the neighbour, a base path that has ended there would walk on as a ghost with this one replayed beside
+    # it: both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts back, and w = 1
+    # (survey, section 3.5).
     return Offset(
         ray=mi.Ray3f(ray),
         hit=hit,
@@ -113,6 +116,8 @@ def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Of
 
 def settle(step: Step, offsets: list[Offset]) -> None:
     """Adds to settled paths what the base path finds in this step."""
+    # Both paths are one by now. With all that came before in a = 2 w (β' - β), the sample 2 w (C(y) |J| - C(x)) / p(x)
+    # of either technique is a times what the base path finds (survey, eq. 4 and 16).
     C = step.L_light + step.f_p * step.L_bsdf
     for y in offsets:
         y.Δ = y.Δ + y.a * C
@@ -122,30 +127,45 @@ def settle(step: Step, offsets: list[Offset]) -> None:
 
 def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     """A step from the offset path's own vertex y."""
+    # ----------------------- The vertex --------------------------
+    # The state carries the preliminary hit alone: whole interactions of four paths would swell every loop.
     y = path.hit.compute_surface_interaction(path.ray)
     bsdf = y.bsdf()
     connectable = plan.materials.connectable(bsdf)
-    # Emitter sampling is replayed: densities cancel in r, and the same numbers lead to, or near, the same point.
+
+    # ----------------- Emitter sampling: replay ------------------
+    # Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
+    # near, the same point of an emitter.
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
     light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
     f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
+    # Each path has its own m: from y, the emitter is found with other densities than from x.
     L_light = f * light.weight * light_mis(light.delta, light.p, p)
+    # Never rejected: an emitter that y does not see is a sample of value 0, and the reverse shift knows it as such.
     w2_light = shift.gradient_weight(path.r, True)
+    # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
+    # ------------- BSDF sampling: reconnect, or part -------------
     joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
+    # Beside a ghost as well, which walks but does not go on
     parts = step.walks & ~joins
     none = mi.Bool(False)
+    # What neither does is rejected: β' = 0, r = 0.
     move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none)
     move = dr.if_stmt((move,), joins, lambda move: reconnect(scene, plan, step, y, bsdf, move), lambda move: move)
     if plan.replays:
         move = dr.if_stmt(
             (move,), parts, lambda move: part(scene, plan, step, y, bsdf, connectable, move), lambda move: move
         )
+
+    # --------------------- Weight and gradient -------------------
+    # One ratio p' |J| / p for each step: products of densities along a path would leave float32 (survey, eq. 17).
     β1, r1 = path.β * move.f_p, path.r * move.r
     good = move.good & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1, r1 = dr.select(good, β1, 0), dr.select(good, r1, 0)
     apart, joined = good & parts & move.reaches, good & joins & move.reaches
+    # This step has changed r, and with it the weight: emission found at its end is weighted by that of the new pair.
     w2 = shift.gradient_weight(r1, good)
     return Offset(
         ray=move.ray,
@@ -166,18 +186,28 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
 
 def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
     """Straight to the base path's next vertex, or, where it escapes, along with it."""
+    # ------------------------ The segment ------------------------
+    # An escape is a vertex at infinity: all directions to it are the same one.
     x1 = step.x1
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
+    # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
     occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)))
+
+    # ---------------------- Its throughput -----------------------
+    # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
     J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
     f, p = evaluate(bsdf, y, y.to_local(direction))
+
+    # ---------------------- Emission at x1 -----------------------
+    # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
     y1 = seen_from(x1, direction)
     ratio = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
     Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, y, y1, ratio)
     return Move(
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
+        # f |J| over the density of the *base* path (survey, eq. 4): p' enters by the weight alone.
         f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0),
         r=J * p / step.p,
         seen=mi.Bool(True),
@@ -189,29 +219,38 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
 
 def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Move:
     """In a direction of its own, with the half-vector of the base path or along its random numbers."""
+    # -------------------- Random sequence replay -----------------
+    # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
     sample, f_p = bsdf.sample(mi.BSDFContext(), y, step.u_lobe, step.u_direction)
     found = sample.pdf > 0
     wo, p, r = sample.wo, sample.pdf, mi.Float(1)
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
     allowed = mi.Bool(True)
+
+    # ---------------------- Half-vector copy ---------------------
     if plan.half_vectors:
+        # A Dirac event has no density to be divided by: it is replayed, as its own half-vector would have it.
         copies = step.goes_on & (step.kind == SMOOTH)
         same = y.bsdf() == step.x.bsdf()
         copied, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
         f1, p1 = evaluate(bsdf, y, copied, copies)
         found = dr.select(copies, exists & (p1 > 0), found)
         wo, p = dr.select(copies, copied, wo), dr.select(copies, p1, p)
+        # The same half-vector does not take the same numbers (survey, eq. 15): |J| stays, in f |J| / p and in r.
         f_p = dr.select(copies, f1 * (J / step.p), f_p)
         r = dr.select(copies, p1 * J / step.p, r)
         # Past the end of its base path an offset path has no half-vectors to copy, nor would the reverse shift.
         allowed = dr.select(copies, found, (kind != SMOOTH) | ~step.x.is_valid())
         kind = dr.select(copies, SMOOTH, kind)
+
+    # --------------- Next vertex, and Le there -------------------
     seen = move.seen if not plan.hides else move.seen | (kind != NULL)
     ray = y.spawn_ray(y.to_world(wo))
     hit = scene.ray_intersect_preliminary(ray, active=found)
     y1 = hit.compute_surface_interaction(ray)
     reaches = found & y1.is_valid()
     Le, p_light = emission(scene, y1, y, reaches | (found & seen), found & (kind == SMOOTH))
+    # Reject what would not be shifted back, or the weights of the pair would not sum to 1 (survey, section 3.5).
     inverts = shift.replay_inverts(
         kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
     )
@@ -231,18 +270,25 @@ def step_joined(step: Step, path: Offset) -> Offset:
     """A step from the shared vertex x, to which a joined offset path has come from elsewhere; settles it."""
     y = seen_from(step.x, path.ray.d)
     bsdf = y.bsdf()
+
+    # --------------- Emitter sampling: the same sample -----------
+    # One vertex, one emitter, one shadow ray: only f and m know from where the path has come.
     f, p = evaluate(bsdf, y, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
     w2_light = shift.gradient_weight(path.r, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
+    # -------------- BSDF sampling: the same direction ------------
+    # J = 1 (same vertex, same direction), but sampled with another p' after another arrival: the last factor of r.
     f, p = evaluate(bsdf, y, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
     r1 = path.r * p / step.p
+    # Where the base path has ended r1 is not finite, and both halves of what follows are 0, whatever w.
     good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
     β1 = dr.select(good, β1, 0)
     L_bsdf = step.Le * mis_weight(p, step.p_light)
     w2 = shift.gradient_weight(r1, good)
+    # All later factors of both paths are the same: r and w stay, and a is all that is left to know of y.
     a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
     A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf
     return Offset(
