@@ -27,7 +27,7 @@ def courtyard():
     black = {"type": "diffuse", "reflectance": tiles | {"color0": _rgb(0, 0, 0), "color1": _rgb(0, 0, 0.8)}}
     return {
         "type": "scene",
-        "integrator": {"type": "path", "max_depth": 7, "rr_depth": 3},
+        "integrator": {"type": "path", "max_depth": 7, "rr_depth": 5},
         "sensor": _camera([0, 1.25, 3.9], [0, 1.0, 0], 50)
         | {"type": "thinlens", "aperture_radius": 0.04, "focus_distance": 4.0},
         **{name: wall for name, wall in _room(1.5, satin).items() if name != "ceiling"},
@@ -81,8 +81,8 @@ def limited(max_depth):
 @pytest.mark.parametrize("max_depth", [2, 3])
 def test_unbiased_where_paths_end_at_a_step_that_is_written_out(renderer, max_depth):
     scene = load(renderer, limited(max_depth), (16, 16))
-    references = render_references(renderer, scene, batches=12, spp=256)
-    for name, result in gradient_tests(render_ours(scene, "gpt-simple", batches=12), references):
+    references = render_references(renderer, scene, batches=16, spp=256)
+    for name, result in gradient_tests(render_ours(scene, "gpt-simple", batches=10), references):
         assert result.passed, f"{name}: {result}"
 
 
@@ -112,23 +112,24 @@ def test_agrees_with_the_full_integrator(renderer, stacks):
     for name in ("primal", "direct", "dx", "dy", "albedo", "normal"):
         result = z_test(*(np.stack([stack[name] for stack in both]) for both in (stacks, full)))
         assert result.passed, f"{name}: {result}"
+    # The same shift with the same weights is as noisy, but for roulette and the outliers of so few samples.
+    for name in ("dx_var", "dy_var"):
+        ours, theirs = (np.mean([stack[name] for stack in both]) for both in (stacks, full))
+        assert ours == pytest.approx(theirs, rel=0.25), name
 
 
 @pytest.mark.parametrize(
     ("function", "mutant"),
     [
-        ("reconnection_jacobian", lambda mi, dr, *geometry: mi.Float(1)),
-        ("gradient_weight", lambda mi, dr, r, good: mi.Float(1)),
-        ("gradient_weight", lambda mi, dr, r, good: dr.select(r > 0, 2 / (1 + r), 1)),
+        ("reconnection_jacobian", lambda mi, *geometry: mi.Float(1)),
+        ("gradient_weight", lambda mi, r, good: mi.Float(1)),
     ],
-    ids=["no Jacobian", "w is 1/2", "failed shifts count half"],
+    ids=["no Jacobian", "w is 1/2"],
 )
 def test_mutants_fail_the_z_test(renderer, references, function, mutant, monkeypatch):
-    import drjit as dr
-
     from data_gen.samplers import gpt_simple
 
-    monkeypatch.setattr(gpt_simple, function, partial(mutant, renderer, dr))
+    monkeypatch.setattr(gpt_simple, function, partial(mutant, renderer))
     stacks = render_ours(load(renderer, courtyard, (32, 32)), "gpt-simple")
     passed = {name: result.passed for name, result in gradient_tests(stacks, references)}
     assert passed["primal"] and not (passed["dx"] or passed["dy"])
@@ -137,7 +138,7 @@ def test_mutants_fail_the_z_test(renderer, references, function, mutant, monkeyp
 def test_random_replay_of_it_is_random_replay(renderer):
     """As a plugin that samples radiance, in place of Mitsuba's ``path``."""
     scene = load(renderer, courtyard, (12, 12))
-    nested = {"type": "gpt_simple", "max_depth": 7, "rr_depth": 3}
+    nested = {"type": "gpt_simple", "max_depth": 7, "rr_depth": 5}
     replay = renderer.load_dict({"type": "gpt_basic", "nested": nested})
     ours = np.array(renderer.render(scene, integrator=replay, spp=256))
     assert ours[..., replay.aov_names().index("dx.R")].any()
