@@ -19,6 +19,7 @@ GROUPS = {
     "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
 }
 METHODS = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn")
+PAIRS = (("ngpt-combine", "oidn"), ("ngpt-primal", "oidn"), ("ngpt-fast", "oidn"), ("ngpt-combine", "ngpt-primal"))
 CELLS = Path(__file__).parents[1] / "ngpt" / "measure" / "advice.json"
 
 
@@ -38,22 +39,36 @@ def cells(path: Path) -> dict[tuple[str, int, str], float]:
 
 
 def tables(errors: dict[tuple[str, int, str], float]) -> str:
-    """Both tables as Markdown."""
+    """Three tables as Markdown: mean errors, their ratios, and counts of cells."""
     counts = sorted({spp for _, spp, _ in errors})
-    known = {scene for scenes in GROUPS.values() for scene in scenes}
-    lines = [f"| scenes | spp | {' | '.join(f'`{m}`' for m in METHODS)} |", "|---|--:|" + "--:|" * len(METHODS)]
-    for name, scenes in {**GROUPS, "all": sorted(known)}.items():
+    groups = {**GROUPS, "all": tuple(scene for scenes in GROUPS.values() for scene in scenes)}
+
+    def mean(scenes: tuple[str, ...], spp: int, method: str) -> float:
+        return float(np.exp(np.mean([np.log(errors[scene, spp, method]) for scene in scenes])))
+
+    def below(scenes: tuple[str, ...], method: str, rival: str) -> int:
+        return sum(errors[s, n, method] < errors[s, n, rival] for s in scenes for n in counts)
+
+    lines = heading("scenes", "spp", *(f"`{method}`" for method in METHODS))
+    for name, scenes in groups.items():
         for spp in counts:
-            means = [np.exp(np.mean([np.log(errors[scene, spp, m]) for scene in scenes])) for m in METHODS]
-            texts = [f"**{mean:.4f}**" if mean == min(means) else f"{mean:.4f}" for mean in means]
+            means = [mean(scenes, spp, method) for method in METHODS]
+            texts = [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
             lines.append(f"| {f'{name} ({len(scenes)})' if spp == counts[0] else ''} | {spp} | {' | '.join(texts)} |")
-    rivals = ("ngpt-combine", "ngpt-primal", "ngpt-fast")
-    lines += ["", f"| scenes | {' | '.join(f'`{m}` below `oidn`' for m in rivals)} |", "|---|" + "--:|" * len(rivals)]
-    for name, scenes in {**GROUPS, "all": sorted(known)}.items():
-        pairs = [(scene, spp) for scene in scenes for spp in counts]
-        won = [sum(errors[s, n, m] < errors[s, n, "oidn"] for s, n in pairs) for m in rivals]
-        lines.append(f"| {name} ({len(scenes)}) | {' | '.join(f'{w} of {len(pairs)}' for w in won)} |")
+    lines += ["", *heading("mean error over another's", *(f"{spp} spp" for spp in counts))]
+    for method, rival in PAIRS:
+        for name, scenes in groups.items():
+            ratios = [f"{mean(scenes, spp, method) / mean(scenes, spp, rival):.2f}" for spp in counts]
+            lines.append(f"| `{method}` over `{rival}`, {name} | {' | '.join(ratios)} |")
+    lines += ["", *heading("cells with less error", *(f"{name} ({len(scenes)})" for name, scenes in groups.items()))]
+    for method, rival in PAIRS:
+        won = [f"{below(scenes, method, rival)} of {len(scenes) * len(counts)}" for scenes in groups.values()]
+        lines.append(f"| `{method}` than `{rival}` | {' | '.join(won)} |")
     return "\n".join(lines)
+
+
+def heading(first: str, *others: str) -> list[str]:
+    return [f"| {first} | {' | '.join(others)} |", "|---" + "|--:" * len(others) + "|"]
 
 
 if __name__ == "__main__":
