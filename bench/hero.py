@@ -106,7 +106,8 @@ def main() -> None:
 
 def costs(args: argparse.Namespace) -> dict[str, dict[str, float]]:
     """CPU seconds per sample of each pixel, kernels compiled, by sampler: medians and quartiles of renders in turn."""
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     file = args.cache / f"{scene_name(args.scene)}-cost-{args.size[0]}x{args.size[1]}.json"
     if not file.exists():
@@ -128,7 +129,8 @@ def rendered(args: argparse.Namespace, sampler: str, spp: int, seed: int) -> Gra
     width, height = args.size
     file = args.cache / f"{scene_name(args.scene)}-{sampler}-{spp}-{seed}-{width}x{height}.exr"
     if not file.exists():
-        from data_gen.render import load_scene, render_stack
+        from data_gen.render import render_stack
+        from data_gen.scenes.load import load_scene
 
         print(f"rendering {file.name}", flush=True)
         ngpt.write(file, render_stack(load_scene(args.scene, (width, height)), spp, seed, sampler))
@@ -143,7 +145,8 @@ def reference_crop(args: argparse.Namespace, box: tuple[int, int, int, int]) -> 
     if not file.exists():
         import mitsuba as mi
 
-        from data_gen.render import load_scene, render_stack
+        from data_gen.render import render_stack
+        from data_gen.scenes.load import load_scene
 
         print(f"rendering {file.name}", flush=True)
         scene = load_scene(args.scene, tuple(args.size))

@@ -29,7 +29,8 @@ def main() -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    from data_gen.render import load_scene, render_stack
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
     stack = render_stack(load_scene(args.scene, TILE), args.spp)
     result = reconstruct(stack, args.method)
