@@ -11,9 +11,12 @@ the place where it loses most (or gains least).
 The reference is path traced in --references parts of --reference-spp samples, each with its own seed. Even and odd
 parts make two independent halves A and B. relMSE is the mean of (x - A)(x - B) / (m² + 0.001) with m = (A + B) / 2, so
 that the noise of the reference drops out in expectation; the 0.1 % of the pixels that are farthest from m are left out,
-as in the tables. FLIP is computed against m and recorded beside its floor, the FLIP of A and B. The two crops of the
-reference are rendered again with --crop-spp samples, for the eye alone. All renders are kept in the cache, so a run
-that was broken off goes on. Written are the picture and bench/results/hero.json.
+as in the tables. Pixels within SPREAD of a light that the camera sees are left out too, in numbers and crops: ngpt
+keeps such light apart, OIDN is given it, and the comparison is of what is left. The numbers of the whole image are
+recorded beside them, and those of OIDN with such light kept apart and of ngpt without gradients. FLIP is computed against m and recorded beside its
+floor, the FLIP of A and B. The two crops of the reference are rendered again with --crop-spp samples, for the eye
+alone. All renders are kept in the cache, so a run that was broken off goes on. Written are the picture and
+bench/results/hero.json.
 """
 
 import argparse
@@ -22,6 +25,7 @@ import time
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import binary_dilation
 
 import ngpt
 from bench import panels
@@ -36,9 +40,11 @@ from ngpt.system.files import atomic_output
 
 REFERENCE_SEED = 1 << 20  # far from the seed 0 of what is judged
 TIMING_SPP, REPEATS = 16, 3
+SPREAD = 3  # pixels
 TRIMMED = 0.001  # share of the pixels that relMSE leaves out
 ZOOM = 3
 COLUMN, ROW = 130 * ZOOM, 66 * ZOOM  # size of a crop in the picture
+TITLES = {"path tracing": "Path tracing", "OIDN": "Open Image Denoise", "ngpt": "ngpt ({method})"}
 COLOURS = ("#ff5500", "#00a2ff")
 
 
@@ -65,43 +71,42 @@ def main() -> None:
     gradients, path = rendered(args, "auto", args.spp, 0), rendered(args, "primal", equal, 0)
     parts = [rendered(args, "primal", args.reference_spp, REFERENCE_SEED + i) for i in range(args.references)]
     halves = [np.mean([part["primal"] for part in parts[i::2]], axis=0) for i in (0, 1)]
+    apart = path.replace(primal=path["primal"] - path["direct"], direct=np.zeros_like(path["direct"]))
     inputs = {"path tracing": (path, "primal"), "OIDN": (path, "oidn"), "ngpt": (gradients, args.method)}
-    seconds, results = {}, {}
+    inputs |= {"OIDN, lights apart": (apart, "oidn"), "without gradients": (path, "ngpt-primal")}
+    seconds, images, methods = {}, {}, {}
     for name, (stack, method) in inputs.items():
         reconstruct(stack, method)  # loads what the method needs
         start = time.process_time()
-        results[name] = reconstruct(stack, method)
+        result = reconstruct(stack, method)
         seconds[name] = time.process_time() - start
+        images[name], methods[name] = result.image + (path["direct"] if stack is apart else 0), result.method
     reference = np.mean(halves, axis=0)
-    errors = {name: squared_error(result.image, halves) for name, result in results.items()}
+    judged = ~binary_dilation((path["direct"] > 0).any(axis=-1), iterations=SPREAD)
+    errors = {name: squared_error(image, halves) for name, image in images.items()}
     numbers = {
         name: {
-            "method": result.method,
+            "method": methods[name],
             "spp": args.spp if name == "ngpt" else equal,
             "render CPU seconds": args.spp * cost["auto"]["median"],
             "reconstruction CPU seconds": seconds[name],
-            "relMSE trimmed": trimmed_mean(errors[name], result.image, reference),
-            "FLIP": flip(result.image, reference)[0],
+            "relMSE trimmed": trimmed_mean(errors[name], image, reference, judged),
+            "relMSE trimmed, whole image": trimmed_mean(errors[name], image, reference, np.ones_like(judged)),
+            "FLIP": flip(image, reference)[0],
         }
-        for name, result in results.items()
+        for name, image in images.items()
     }
     floor = flip(*halves)[0]
     noise = float(np.mean((halves[0] - halves[1]) ** 2 / (reference**2 + EPSILON))) / 4
     spp = args.references * args.reference_spp
-    boxes = extremes(errors["OIDN"] - errors["ngpt"], COLUMN // ZOOM, ROW // ZOOM)
-    save(
-        args.output,
-        {"benchmark": "hero", "scene": scene_name(args.scene), "size": list(args.size), "cost": cost}
-        | {
-            "results": numbers,
-            "reference": {"spp": spp, "relMSE of its noise": noise, "FLIP of its halves": floor},
-            "crops": boxes,
-        }
-        | {"metadata": metadata("mitsuba", "mitsuba-oidn", "flip-evaluator")},
-    )
-    images = {name: result.image for name, result in results.items()} | {"reference": reference}
+    boxes = extremes(errors["OIDN"] - errors["ngpt"], judged, COLUMN // ZOOM, ROW // ZOOM)
+    setup = {"benchmark": "hero", "scene": scene_name(args.scene), "size": args.size, "CPU seconds per spp": cost}
+    quality = {"spp": spp, "crop spp": args.crop_spp, "relMSE of its noise": noise, "FLIP of its halves": floor}
+    where = metadata("mitsuba", "mitsuba-oidn", "flip-evaluator")
+    save(args.output, setup | {"results": numbers, "reference": quality, "crops": boxes, "metadata": where})
+    shown = {name: images[name] for name in TITLES} | {"reference": reference}
     clean = [reference_crop(args, box) for box in boxes]
-    panels.save(args.picture, picture(images, headings(numbers, spp, args.crop_spp), boxes, clean))
+    panels.save(args.picture, picture(shown, headings(numbers, spp, args.crop_spp), boxes, clean))
 
 
 def costs(args: argparse.Namespace) -> dict[str, dict[str, float]]:
@@ -163,33 +168,41 @@ def squared_error(image: np.ndarray, halves: list[np.ndarray]) -> np.ndarray:
     return np.mean((image - a) * (image - b) / (((a + b) / 2) ** 2 + EPSILON), axis=-1)
 
 
-def trimmed_mean(error: np.ndarray, image: np.ndarray, reference: np.ndarray) -> float:
-    """The mean of ``error`` without the TRIMMED share of the pixels that differ most from the reference."""
-    distance = np.mean((image - reference) ** 2 / (reference**2 + EPSILON), axis=-1).ravel()
+def trimmed_mean(error: np.ndarray, image: np.ndarray, reference: np.ndarray, judged: np.ndarray) -> float:
+    """The mean of ``error`` over ``judged``, without the TRIMMED share that differs most from the reference."""
+    distance = np.mean((image - reference) ** 2 / (reference**2 + EPSILON), axis=-1)[judged]
     kept = np.argsort(distance)[: distance.size - int(TRIMMED * distance.size)]
-    return float(error.ravel()[kept].mean())
+    return float(error[judged][kept].mean())
 
 
-def extremes(gain: np.ndarray, width: int, height: int) -> list[tuple[int, int, int, int]]:
-    """The (left, top, width, height) where the mean of ``gain`` is largest, and where it is least, not overlapping."""
+def extremes(gain: np.ndarray, judged: np.ndarray, width: int, height: int) -> list[tuple[int, int, int, int]]:
+    """The (left, top, width, height) where the mean of ``gain`` is largest, and where it is least, not overlapping.
+
+    Only windows whose pixels are all ``judged`` count.
+    """
+
+    def windows(values: np.ndarray) -> np.ndarray:
+        sums = np.pad(values, ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
+        return sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
+
     # Bounded, so that a place with many pixels that differ wins over a single firefly.
-    sums = np.pad(np.clip(gain, -1, 1), ((1, 0), (1, 0))).cumsum(axis=0).cumsum(axis=1)
-    windows = sums[height:, width:] - sums[:-height, width:] - sums[height:, :-width] + sums[:-height, :-width]
-    y, x = np.unravel_index(np.argmax(windows), windows.shape)
-    windows[max(0, y - height) : y + height, max(0, x - width) : x + width] = np.inf
-    other_y, other_x = np.unravel_index(np.argmin(windows), windows.shape)
+    means = np.where(windows((~judged).astype(float)) > 0, np.nan, windows(np.clip(gain, -1, 1)))
+    y, x = np.unravel_index(np.nanargmax(means), means.shape)
+    means[max(0, y - height) : y + height, max(0, x - width) : x + width] = np.nan
+    other_y, other_x = np.unravel_index(np.nanargmin(means), means.shape)
     return [(int(x), int(y), width, height), (int(other_x), int(other_y), width, height)]
 
 
 def headings(numbers: dict[str, dict], spp: int, crop_spp: int) -> list[list[str]]:
-    titles = {"path tracing": "Path tracing", "OIDN": "Open Image Denoise", "ngpt": "ngpt"}
     lines = []
-    for name, row in numbers.items():
+    for name, title in TITLES.items():
+        row = numbers[name]
         kind = "spp with gradients" if name == "ngpt" else "spp"
-        title = f"ngpt ({row['method']})" if name == "ngpt" else titles[name]
-        extra = "" if name == "path tracing" else f" + {row['reconstruction CPU seconds']:.0f}"
+        extra = "" if name == "path tracing" else f" + {row['reconstruction CPU seconds']:.1f}"
         scores = f"relMSE {row['relMSE trimmed']:.4f}"
-        lines.append([title, f"{row['spp']} {kind}: {row['render CPU seconds']:.0f}{extra} s of CPU", scores])
+        lines.append(
+            [title.format(**row), f"{row['spp']} {kind}: {row['render CPU seconds']:.0f}{extra} s of CPU", scores]
+        )
     return [*lines, ["Reference", f"path tracing, {spp} spp", f"crops: {crop_spp} spp"]]
 
 
