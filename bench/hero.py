@@ -13,10 +13,10 @@ parts make two independent halves A and B. relMSE is the mean of (x - A)(x - B) 
 that the noise of the reference drops out in expectation; the 0.1 % of the pixels that are farthest from m are left out,
 as in the tables. Pixels within SPREAD of a light that the camera sees are left out too, in numbers and crops: ngpt
 keeps such light apart, OIDN is given it, and the comparison is of what is left. The numbers of the whole image are
-recorded beside them, and those of OIDN with such light kept apart and of ngpt without gradients. FLIP is computed against m and recorded beside its
-floor, the FLIP of A and B. The two crops of the reference are rendered again with --crop-spp samples, for the eye
-alone. All renders are kept in the cache, so a run that was broken off goes on. Written are the picture and
-bench/results/hero.json.
+recorded beside them, and those of OIDN with such light kept apart and of ngpt without gradients. FLIP is computed
+against m and recorded beside its floor, the FLIP of A and B. The two crops of the reference are rendered again with
+--crop-spp samples, for the eye alone. All renders are kept in the cache, so a run that was broken off goes on. Written
+are the picture and bench/results/hero.json.
 """
 
 import argparse

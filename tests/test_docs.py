@@ -51,7 +51,7 @@ def test_commands_exist(page, capsys):
         assert (ROOT / file).is_file(), file
     with pytest.raises(SystemExit):
         main(["--help"])
-    verbs = set(re.findall(r"^ +([a-z]+)", capsys.readouterr().out, re.M))
+    verbs = set(re.findall(r"^ {2,4}([a-z]+)(?: {2}|$)", capsys.readouterr().out, re.M))
     for verb in re.findall(r"(?:`|^ {4})ngpt ([a-z]+)", text, re.M):
         assert verb in verbs, f"ngpt {verb}"
 
