@@ -78,7 +78,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--from", dest="folder", type=Path, metavar="DIR", help="use these files, and run nothing")
     parser.add_argument("-k", dest="chosen", metavar="EXPRESSION", help="run only these")
-    parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help="default: docs/lab/RELIABILITY.md")
+    parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help=f"default: {PAGE}")
     args = parser.parse_args()
     from ngpt.system.files import atomic_output
 
