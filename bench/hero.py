@@ -31,17 +31,16 @@ import ngpt
 from bench import panels
 from bench.common import metadata, save, summary
 from ngpt.evaluation.config import scene_name
-from ngpt.measure.metrics import EPSILON
+from ngpt.measure.metrics import relative_squared_error, relmse, relmse_trimmed
 from ngpt.measure.perceptual import flip
 from ngpt.methods import reconstruct
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_json
 
 REFERENCE_SEED = 1 << 20  # far from the seed 0 of what is judged
 TIMING_SPP, REPEATS = 16, 3
 SPREAD = 3  # pixels
-TRIMMED = 0.001  # share of the pixels that relMSE leaves out
 ZOOM = 3
 COLUMN, ROW = 130 * ZOOM, 66 * ZOOM  # size of a crop in the picture
 TITLES = {"path tracing": "Path tracing", "OIDN": "Open Image Denoise", "ngpt": "ngpt ({method})"}
@@ -83,23 +82,23 @@ def main() -> None:
         images[name], methods[name] = result.image + (path["direct"] if stack is apart else 0), result.method
     reference = np.mean(halves, axis=0)
     judged = ~binary_dilation((path["direct"] > 0).any(axis=-1), iterations=SPREAD)
-    errors = {name: squared_error(image, halves) for name, image in images.items()}
     numbers = {
         name: {
             "method": methods[name],
             "spp": args.spp if name == "ngpt" else equal,
             "render CPU seconds": args.spp * cost["auto"]["median"],
             "reconstruction CPU seconds": seconds[name],
-            "relMSE trimmed": trimmed_mean(errors[name], image, reference, judged),
-            "relMSE trimmed, whole image": trimmed_mean(errors[name], image, reference, np.ones_like(judged)),
+            "relMSE trimmed": relmse_trimmed(*(part[judged][None] for part in (image, *halves))),
+            "relMSE trimmed, whole image": relmse_trimmed(image, *halves),
             "FLIP": flip(image, reference)[0],
         }
         for name, image in images.items()
     }
     floor = flip(*halves)[0]
-    noise = float(np.mean((halves[0] - halves[1]) ** 2 / (reference**2 + EPSILON))) / 4
+    noise = relmse((halves[0] - halves[1]) / 2 + reference, reference)
     spp = args.references * args.reference_spp
-    boxes = extremes(errors["OIDN"] - errors["ngpt"], judged, COLUMN // ZOOM, ROW // ZOOM)
+    errors = [relative_squared_error(images[name], *halves).mean(axis=-1) for name in ("OIDN", "ngpt")]
+    boxes = extremes(errors[0] - errors[1], judged, COLUMN // ZOOM, ROW // ZOOM)
     setup = {"benchmark": "hero", "scene": scene_name(args.scene), "size": args.size, "CPU seconds per spp": cost}
     quality = {"spp": spp, "crop spp": args.crop_spp, "relMSE of its noise": noise, "FLIP of its halves": floor}
     where = metadata("mitsuba", "mitsuba-oidn", "flip-evaluator")
@@ -124,8 +123,7 @@ def costs(args: argparse.Namespace) -> dict[str, dict[str, float]]:
                 render_stack(scene, TIMING_SPP, repeat, sampler)
                 if repeat:  # the first one compiles
                     values.append((time.process_time() - start) / TIMING_SPP)
-        with atomic_output(file) as temporary:
-            temporary.write_text(json.dumps({sampler: summary(values) for sampler, values in seconds.items()}))
+        write_json(file, {sampler: summary(values) for sampler, values in seconds.items()})
     return json.loads(file.read_text())
 
 
@@ -160,19 +158,6 @@ def reference_crop(args: argparse.Namespace, box: tuple[int, int, int, int]) -> 
         film.update()
         ngpt.write(file, render_stack(scene, args.crop_spp, REFERENCE_SEED, "primal", with_features=False))
     return ngpt.read(file)["primal"]
-
-
-def squared_error(image: np.ndarray, halves: list[np.ndarray]) -> np.ndarray:
-    """(H, W): relative squared error of each pixel against two independent halves of a reference; may be negative."""
-    a, b = halves
-    return np.mean((image - a) * (image - b) / (((a + b) / 2) ** 2 + EPSILON), axis=-1)
-
-
-def trimmed_mean(error: np.ndarray, image: np.ndarray, reference: np.ndarray, judged: np.ndarray) -> float:
-    """The mean of ``error`` over ``judged``, without the TRIMMED share that differs most from the reference."""
-    distance = np.mean((image - reference) ** 2 / (reference**2 + EPSILON), axis=-1)[judged]
-    kept = np.argsort(distance)[: distance.size - int(TRIMMED * distance.size)]
-    return float(error[judged][kept].mean())
 
 
 def extremes(gain: np.ndarray, judged: np.ndarray, width: int, height: int) -> list[tuple[int, int, int, int]]:
