@@ -2,10 +2,16 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo test test-slow reliability check bench setup-demo setup-dev
+.PHONY: demo quick test test-slow reliability check bench setup-demo setup-dev setup-quick
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
+
+# Half a minute: files, classical methods, denoisers, metrics, losses, docs; little that renders, runs a network or a browser.
+quick: setup-quick
+	$(PY) -m pytest -q -m "not slow" -k "not memory_per_pixel and not half_a_percent" --ignore tests/report/test_report.py \
+		tests/io tests/classical tests/denoisers tests/measure tests/report tests/system tests/network/test_unet.py \
+		tests/training/test_augment.py tests/training/test_losses.py tests/test_*.py
 
 test: setup-dev
 	$(PY) -m pytest -q -m "not slow"
@@ -32,3 +38,6 @@ setup-demo:
 
 setup-dev:
 	@scripts/setup dev llvm chromium
+
+setup-quick:
+	@scripts/setup dev

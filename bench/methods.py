@@ -3,7 +3,7 @@
     python -m bench.methods --scenes diffuse glossy environment lens SCENE.xml ... --cache /tmp/stacks
 
 Renders a stack for each sample count and a reference for each scene (kept in the cache folder, and taken from there the
-next time), runs every method, and writes bench/results/methods.json, docs/classical-table.md and, with --pictures
+next time), runs every method, and writes bench/results/methods.json, docs/lab/classical-table.md and, with --pictures
 docs/images, a picture for each method of the place where it does worst compared with the others, METHOD-fails.png.
 """
 
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--reference-spp", type=int, default=2048)
     parser.add_argument("--size", type=int, nargs=2, default=(320, 180), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder for the rendered stacks and references")
-    parser.add_argument("--table", type=Path, default=Path("docs/classical-table.md"))
+    parser.add_argument("--table", type=Path, default=Path("docs/lab/classical-table.md"))
     parser.add_argument("--pictures", type=Path, help="folder for the places where each method does worst")
     parser.add_argument("-o", "--output", default="bench/results/methods.json")
     args = parser.parse_args()

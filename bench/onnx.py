@@ -1,4 +1,4 @@
-"""Speed of the networks in their runtimes, and of OIDN beside them: the table of docs/onnx-table.md.
+"""Speed of the networks in their runtimes, and of OIDN beside them: the table of docs/lab/onnx-table.md.
 
     python -m bench.onnx
 
@@ -61,7 +61,7 @@ def main() -> None:
         result["peak MiB"] = {size: peak(size) for size in args.sizes}
         result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size if half else None}
     save(args.output, result)
-    (args.docs / "onnx-table.md").write_text(table(result))
+    (args.docs / "lab" / "onnx-table.md").write_text(table(result))
     print(table(result))
 
 

@@ -1,4 +1,4 @@
-"""What gradients cost and what they are worth, scene by scene, in one run: the table of docs/sampler-table.md.
+"""What gradients cost and what they are worth, scene by scene, in one run: the table of docs/lab/sampler-table.md.
 
     python -m bench.sampler --folder SCENES [--maps NAME ...]
 
@@ -91,7 +91,7 @@ def run(args: argparse.Namespace) -> None:
             result["scenes"][name] = row
             save(args.output, result)
             print(f"{line(name, row)} {time.perf_counter() - start:.0f} s", flush=True)
-    write_text(args.docs / "sampler-table.md", table(result))
+    write_text(args.docs / "lab" / "sampler-table.md", table(result))
 
 
 def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | None:

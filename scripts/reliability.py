@@ -1,4 +1,4 @@
-"""docs/RELIABILITY.md: runs the campaigns, which leave a JSON file each, and writes the page of what came out.
+"""docs/lab/RELIABILITY.md: runs the campaigns, which leave a JSON file each, and writes the page of what came out.
 
 python scripts/reliability.py                 what `make reliability` runs: all campaigns, then the page
 python scripts/reliability.py --from DIR      only the page, of the files in DIR
@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
-PAGE = ROOT / "docs" / "RELIABILITY.md"
+PAGE = ROOT / "docs" / "lab" / "RELIABILITY.md"
 
 HEAD = """\
 # Reliability
@@ -78,7 +78,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--from", dest="folder", type=Path, metavar="DIR", help="use these files, and run nothing")
     parser.add_argument("-k", dest="chosen", metavar="EXPRESSION", help="run only these")
-    parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help="default: docs/RELIABILITY.md")
+    parser.add_argument("-o", "--output", type=Path, default=PAGE, metavar="FILE", help=f"default: {PAGE}")
     args = parser.parse_args()
     from ngpt.system.files import atomic_output
 

@@ -1,4 +1,4 @@
-"""What campaigns leave behind for docs/RELIABILITY.md: how many bad inputs were tried, and what came out."""
+"""What campaigns leave behind for docs/lab/RELIABILITY.md: how many bad inputs were tried, and what came out."""
 
 import json
 import os

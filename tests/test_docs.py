@@ -1,0 +1,145 @@
+"""The pages hold what they promise: links, commands, pictures, tables and examples."""
+
+import json
+import re
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("export/**/*.md")])
+PAGES = [page for page in PAGES if "node_modules" not in page.parts]
+PICTURES = sorted(path for path in ROOT.glob("docs/images/*") if path.suffix in (".png", ".jpg", ".svg"))
+# Made by commands, which wrap no lines.
+GENERATED = re.compile(r"-table\.md$|RELIABILITY\.md$|RESULTS\.md$")
+
+
+def name(page):
+    return str(page.relative_to(ROOT))
+
+
+def anchors(page):
+    """The anchors of a page's headings, as GitHub makes them."""
+    heads = re.findall(r"^#+ (.*)$", page.read_text(), re.M)
+    return {re.sub(r"[^\w\- ]", "", head.lower()).strip().replace(" ", "-") for head in heads}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+        if re.match(r"[a-z]+:", target):
+            continue
+        file, _, anchor = target.partition("#")
+        other = (page.parent / file).resolve() if file else page
+        assert other.exists(), target
+        assert not anchor or anchor in anchors(other), target
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_commands_exist(page, capsys):
+    from ngpt.cli import main
+
+    text = page.read_text()
+    targets = set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), re.M))
+    # As code only: prose may well "make test sets".
+    for target in re.findall(r"(?:`|^ {4})make ([a-z-]+)", text, re.M):
+        assert target in targets, f"make {target}"
+    for module in re.findall(r"python -m ([a-z_.]+[a-z_])", text):
+        assert find_spec(module) is not None, f"python -m {module}"
+    for file in re.findall(r"python ((?:[\w-]+/)*[\w-]+\.py)", text):
+        assert (ROOT / file).is_file(), file
+    with pytest.raises(SystemExit):
+        main(["--help"])
+    verbs = set(re.findall(r"^ {2,4}([a-z]+)(?: {2}|$)", capsys.readouterr().out, re.M))
+    for verb in re.findall(r"(?:`|^ {4})ngpt ([a-z]+)", text, re.M):
+        assert verb in verbs, f"ngpt {verb}"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=name)
+def test_configurations_exist(page):
+    for config in re.findall(r"--config (?:configs/)?([a-z0-9-]+)(?:\.toml)?\b(?!\*)", page.read_text()):
+        assert list(ROOT.glob(f"configs/{config}*.toml")), config
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if not GENERATED.search(page.name)], ids=name)
+def test_prose_keeps_to_120_columns(page):
+    fenced = False
+    for number, line in enumerate(page.read_text().splitlines(), 1):
+        if line.startswith("```"):
+            fenced = not fenced
+        code = fenced or line.startswith("    ")
+        assert code or line.lstrip().startswith("|") or len(line) <= 120, f"{name(page)}:{number}: {len(line)} columns"
+
+
+def test_pictures_are_small_and_used():
+    text = "".join(page.read_text() for page in PAGES)
+    sizes = {path.name: path.stat().st_size for path in PICTURES}
+    assert max(sizes.values()) < 700_000 and sum(sizes.values()) < 2_000_000, sizes
+    assert [picture for picture in sizes if f"images/{picture}" not in text] == []
+
+
+def test_the_first_tables_of_the_results_are_those_of_the_cells():
+    from bench.groups import CELLS, cells, tables
+
+    text = (ROOT / "docs" / "RESULTS.md").read_text()
+    for table in tables(cells(CELLS)).split("\n\n"):
+        assert table in text
+
+
+def test_the_numbers_of_the_readme_are_in_the_results():
+    readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/RESULTS.md"))
+    hero = json.loads((ROOT / "bench" / "results" / "hero.json").read_text())["results"]
+    measured = {f"{value:.4f}" for row in hero.values() for value in row.values() if isinstance(value, float)}
+    for number in re.findall(r"\b0\.\d{4}\b", readme):
+        assert number in results or number in measured, number
+    for pair in re.findall(r"\b\d+ of \d+\b", readme):
+        assert pair in results, pair
+
+
+def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):
+    """The first block of Python, and what follows from it."""
+    import ngpt
+
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "from-your-renderer.md").read_text(), re.S)
+    made: dict = {}
+    exec(blocks[0], made)
+    stack = ngpt.read("stack.exr")
+    assert {"primal", "dx", "dy", "primal_var"} <= set(stack.names)
+    assert made["image"].shape == stack["primal"].shape
+
+
+def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
+    import ngpt
+    from ngpt.methods import METHODS, Method
+
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "add-a-method.md").read_text(), re.S)
+    made: dict = {"Method": Method}
+    exec(blocks[0] + blocks[1], made)
+    monkeypatch.setitem(METHODS, "median", made["METHODS"]["median"])
+    stack, _ = noisy_stack
+    assert ngpt.denoise(stack, "median", size=5).shape == stack["primal"].shape
+
+
+def test_the_example_of_a_sampler_runs(renderer, monkeypatch):
+    """It is random replay, to the last bit."""
+    import sys
+    from types import ModuleType
+
+    import numpy as np
+
+    from data_gen import samplers
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    module, entry = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "add-a-sampler.md").read_text(), re.S)
+    monkeypatch.setitem(sys.modules, "data_gen.samplers.replay", made := ModuleType("data_gen.samplers.replay"))
+    exec(module, made.__dict__)
+    monkeypatch.setattr(samplers, "SAMPLERS", dict(samplers.SAMPLERS))
+    for sampler in eval(f"[{entry}]", vars(samplers)):
+        samplers.register(sampler)
+    scene = load_scene("diffuse", (12, 8))
+    ours, theirs = render_stack(scene, 8, 0, "replay"), render_stack(scene, 8, 0, "gpt-basic")
+    assert ours.names == theirs.names
+    assert all(np.array_equal(ours[layer], theirs[layer], equal_nan=True) for layer in ours.names)
