@@ -27,6 +27,7 @@ check: setup-dev
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
+	$(PY) -m pytest -q tests/test_rooms.py
 	$(PY) scripts/supply.py check
 
 bench: setup-dev

@@ -32,11 +32,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.costs import measure
+    from data_gen.samplers import choose
+    from data_gen.scenes.facts import scene_facts
     from data_gen.scenes.load import load_scene
     from ngpt.evaluation.renders import DEFAULTS
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))
+    sampler, reason = choose(scene_facts(scene))
     # Gradients first, whose stack is the pilot.
     seconds, pilot = measure(scene, {render.name: render.options for render in DEFAULTS}, max(args.pilot, 2), 1)
     pixels = pilot.width * pilot.height
@@ -46,8 +49,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         f"{args.scene}: pilot of {max(args.pilot, 2)} spp, {time.perf_counter() - start:.1f} s with compilation"
     )
     if args.json:
-        print_json({"scene": args.scene, "size": [pilot.width, pilot.height], "advice": [asdict(a) for a in advices]})
+        report = {"scene": args.scene, "size": [pilot.width, pilot.height], "sampler": sampler}
+        print_json(report | {"advice": [asdict(a) for a in advices]})
         return 0
+    console.say(f"{args.scene}: gradients by sampler '{sampler}': {reason}")
     print(
         f"{'method':18}{'stack':11}{'spp':>7}{'seconds':>9}{table.get('metric', 'error'):>16}{'likely':>20}{'best':>7}"
     )
@@ -55,6 +60,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
         likely = f"{a.low:.2g} .. {a.high:.2g}"
         print(f"{a.method:18}{a.stack:11}{a.spp:7}{a.seconds:9.3g}{a.error:16.3g}{likely:>20}{a.sure:7.0%}")
     best = advices[0]
-    sampler = "" if best.stack == "gradients" else " --sampler primal"
-    console.say(f"ngpt render {args.scene} -o stack.exr --spp {best.spp}{sampler}; then method {best.method}")
+    option = "" if best.stack == "gradients" else " --sampler primal"
+    console.say(f"ngpt render {args.scene} -o stack.exr --spp {best.spp}{option}; then method {best.method}")
     return 0
