@@ -27,6 +27,7 @@ class Method:
     ``run``      Repaired, options -> (H, W, 3) float32 without direct emission
     ``options``  the options it takes, with their defaults
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
+    ``uses``     layers that it takes where the stack has them
     """
 
     summary: str
@@ -34,6 +35,7 @@ class Method:
     run: Callable[..., np.ndarray]
     options: dict[str, Any]
     missing: Callable[[], str] = lambda: ""
+    uses: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -108,11 +110,12 @@ METHODS = {
     ),
     "nfor": Method("peer: first-order regression on features", ("primal", *_FEATURES, "primal_var"), _nfor, {}),
     "oidn": Method(
-        "peer: Intel Open Image Denoise",
-        ("primal", "albedo", "normal"),
+        "peer: Intel Open Image Denoise, of colour alone, with albedo, or with albedo and normal",
+        ("primal",),
         oidn.oidn,
         {"auxiliary": "prefiltered", "quality": "high"},
         oidn.missing,
+        ("albedo", "normal"),
     ),
 }
 
@@ -123,9 +126,11 @@ def choose(stack: GradientStack) -> str:
     Geometric means of the trimmed relMSE over thirteen scenes at 4, 16, 64 and 256 spp, in thousandths, of
     docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.5, 6.0, 2.9, 1.7; ngpt-fast 19.1, 8.1, 3.7, 2.0; wcv 42.8,
     14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5. Beyond, the networks go over to wcv. ngpt-primal, for stacks without
-    gradients, has 12.0, 6.2, 3.6, 2.2 at the same time.
+    gradients, has 12.0, 6.2, 3.6, 2.2 at the same time. OIDN, which denoises any image, has 12.9, 6.3, 3.5, 2.1; nfor,
+    which needs features and a variance and no package, 29.8, 11.7, 4.8, 2.2. The identity is left for a stack of which
+    none of them can make anything.
     """
-    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal"):
+    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal", "oidn", "nfor"):
         entry = METHODS[name]
         if all(layer in stack for layer in entry.needs) and not entry.missing():
             return name

@@ -1,12 +1,16 @@
 """The registry, and what happens to pixels that are not finite."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from full_stack import full_stack
 
 import ngpt
+from ngpt.classical import bases
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -14,11 +18,38 @@ from ngpt.stack import GradientStack
 def test_auto_takes_what_the_stack_allows(noisy_stack):
     stack, _ = noisy_stack
     assert reconstruct(stack).method != "primal"
-    assert reconstruct(GradientStack.from_arrays(primal=stack["primal"])).method == "primal"
+
+
+FEATURES = ("albedo", "normal", "depth")
+
+
+@pytest.mark.parametrize(
+    ("layers", "with_oidn", "without"),
+    [
+        ((), "oidn", "primal"),
+        (("albedo",), "oidn", "primal"),
+        (("albedo", "normal"), "oidn", "primal"),
+        ((*FEATURES, "primal_var"), "ngpt-primal", "nfor"),
+        (("dx", "dy"), "l1", "l1"),
+        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "wcv", "wcv"),
+        ((*FEATURES, "dx", "dy", "primal_var", "dx_var", "dy_var"), "ngpt-combine", "ngpt-fast"),
+    ],
+)
+def test_auto_takes_the_best_that_layers_and_machine_allow(monkeypatch, layers, with_oidn, without):
+    """The input comes back only where there is nothing to denoise it with."""
+    stack = full_stack(18, 26)
+    stack = GradientStack({name: stack[name] for name in ("primal", *layers)})
+    for answer, expected in (("", with_oidn), ("OIDN is not installed", without)):
+        entries = {name: replace(METHODS[name], missing=lambda answer=answer: answer) for name in NEED_OIDN}
+        monkeypatch.setattr("ngpt.methods.METHODS", METHODS | entries)
+        assert choose(stack) == expected
+
+
+NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
 
 
 # Those that need nothing but a stack.
-CLASSICAL = [name for name, method in METHODS.items() if not {"albedo", "weights"} & {*method.needs, *method.options}]
+CLASSICAL = ["primal", *bases.CLASSICAL]
 
 
 @pytest.mark.parametrize("method", CLASSICAL)

@@ -11,7 +11,7 @@ from ngpt.io.aliases import format_aliases
 from ngpt.io.exr import pass_through, read
 from ngpt.layers import LAYERS
 from ngpt.merging import DIAGNOSTICS
-from ngpt.methods import METHODS
+from ngpt.methods import METHODS, choose
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.training.dataset import summary
@@ -123,6 +123,7 @@ def stack(stack: GradientStack) -> dict:
             for name, method in METHODS.items()
             if not method.missing() and all(layer in stack for layer in method.needs)
         ],
+        "auto": choose(stack),
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
     if not rates:

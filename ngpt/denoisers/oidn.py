@@ -18,7 +18,9 @@ def missing() -> str:
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
-    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo and normal.
+    """Intel Open Image Denoise, its filter "RT" for HDR images, with albedo, or albedo and normal, where there are any.
+
+    OIDN knows no normals without albedo: they are left out then.
 
     ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first and calls them
                    clean then, which is how its documentation has the best quality made; "clean" calls them clean as
@@ -41,7 +43,8 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
         features = _in_range(data.features)
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
-    options = {"hdr": True, "clean_aux": auxiliary in ("prefiltered", "clean"), "quality": level}
+    clean = bool(features) and auxiliary in ("prefiltered", "clean")
+    options = {"hdr": True, "clean_aux": clean, "quality": level}
     # A copy: the result is a view of a buffer that OIDN owns.
     return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
 
@@ -53,7 +56,9 @@ def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    layers = {name: np.ascontiguousarray(features[name]) for name in ("albedo", "normal")}
+    if "albedo" not in features:
+        return {}
+    layers = {name: np.ascontiguousarray(features[name]) for name in ("albedo", "normal") if name in features}
     return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
 
 

@@ -96,8 +96,8 @@ class Config:
         """A method or variant with each of the samplers that are listed for its kind of stack, or with its own."""
         table = dict(self.variants.get(name, {}))
         method, kind, sampler = table.pop("method", name), table.pop("stack", ""), table.pop("sampler", "")
-        needs = METHODS[method].needs if method in METHODS else ()
-        kind = kind or ("gradients" if "dx" in needs else "features" if len(needs) > 1 else "path")
+        layers = (*METHODS[method].needs, *METHODS[method].uses) if method in METHODS else ()
+        kind = kind or ("gradients" if "dx" in layers else "features" if len(layers) > 1 else "path")
         if sampler:
             return [Column(name, name, method, Render(kind, sampler), table)]
         samplers = self.samplers if kind == "gradients" else self.rivals

@@ -27,7 +27,7 @@ def test_importing_and_running_ngpt_does_not_import_torch():
     program = (
         "import sys, numpy as np, ngpt; a = np.ones((5, 4, 3), 'f');"
         "s = ngpt.GradientStack.from_arrays(primal=a, dx=a, dy=a, primal_var=a, dx_var=a, dy_var=a);"
-        "[ngpt.denoise(s, m) for m, e in ngpt.METHODS.items() if 'albedo' not in e.needs];"
+        "[ngpt.denoise(s, m) for m in ('primal', 'l2', 'l1', 'cv', 'wcv', 'wl2')];"
         "assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -133,6 +133,7 @@ def test_info_on_a_file(stack_file, capsys):
     report = json.loads(capsys.readouterr().out)
     assert report["size"] == [24, 17] and report["layers"]["albedo"]["mean"] == 0.25
     assert report["methods"] == ["primal", "l2", "l1"] or set(report["methods"]) >= {"primal", "l2", "l1"}
+    assert report["auto"] in report["methods"] and report["auto"] != "primal"
     assert "depth" in report["missing"]
     assert main(["info", stack_file("t.exr")]) == 0
     assert "channels dx.R dx.G dx.B" in capsys.readouterr().out

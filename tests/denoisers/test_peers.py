@@ -155,3 +155,21 @@ def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
         expected = oidn.oidn(replace(data, image=image), "prefiltered", "high")
         assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
     assert inputs.denoised(data, base, ("primal",)) == {} == inputs.denoised(data, None, ("denoised_base",))
+
+
+@pytest.mark.parametrize("layers", [(), ("albedo",), ("normal",), ("albedo", "normal")])
+@pytest.mark.parametrize("auxiliary", oidn.AUXILIARY)
+@pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
+def test_oidn_takes_what_there_is(rng, layers, auxiliary):
+    y, x = np.mgrid[0:30, 0:40]
+    clean = (1 + 0.5 * np.cos((x + y) / 9))[..., None] * np.array([1.0, 0.9, 0.8])
+    noisy = clean * (1 + 0.3 * rng.normal(size=clean.shape))
+    flat = {"albedo": np.full_like(clean, 0.5), "normal": np.broadcast_to([0.0, 0, 1], clean.shape)}
+    poor = GradientStack.from_arrays(primal=noisy, **{name: flat[name] for name in layers})
+    image = reconstruct(poor, "oidn", auxiliary=auxiliary).image
+    before, after = (float(np.mean((i - clean) ** 2 / clean**2)) for i in (noisy, image))
+    assert after < 0.2 * before
+    # It knows no normals without albedo.
+    if layers == ("normal",):
+        bare = reconstruct(GradientStack.from_arrays(primal=noisy), "oidn", auxiliary=auxiliary).image
+        assert np.array_equal(image, bare)
