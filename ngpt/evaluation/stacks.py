@@ -123,10 +123,13 @@ class SceneStacks:
         return USUAL if (render.kind, render.sampler) == (USUAL.kind, self._auto) else render
 
     def samples(self, render: Render, spp: int, costs: Costs) -> int:
-        """How many samples the time of ``spp`` of the clock's buys; two at least, for a variance."""
+        """How many samples the time of ``spp`` of the clock's buys; two at least, or two batches, for a variance."""
         if render == self.clock or not costs:
             return spp
-        return max(2, round(spp * costs[self.clock.name]["median"] / costs[render.name]["median"]))
+        from data_gen.samplers import SAMPLERS
+
+        least = 2 * max(1, SAMPLERS[costs[render.name]["sampler"]].batch)
+        return max(least, round(spp * costs[self.clock.name]["median"] / costs[render.name]["median"]))
 
     def stack(self, render: Render, spp: int, seed: int) -> GradientStack:
         """A stack with its time in the attribute ``ngpt:seconds``, without the compilation of kernels."""

@@ -180,6 +180,30 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     assert ngpt.read(target).attributes["ngpt:sampler"] == "toy"
 
 
+def test_a_toy_is_compared_at_equal_time(renderer, tmp_path):
+    from ngpt.evaluation.config import Config
+    from ngpt.evaluation.run import evaluate
+    from ngpt.system.console import Console
+
+    config = Config(
+        scenes=("diffuse",),
+        size=(16, 12),
+        spp=(64,),
+        seeds=1,
+        methods=("wcv",),
+        metrics=("relMSE",),
+        primary="relMSE",
+        samplers=("auto", "toy"),
+        reference_spp=256,
+        timing_spp=16,
+        timing_repeats=1,
+    )
+    rows = {cell["method"]: cell for cell in evaluate(config, tmp_path, Console(quiet=True), "")["cells"]}
+    assert rows.keys() == {"wcv (auto)", "wcv (toy)"} and not any(row["absent"] for row in rows.values())
+    # The toy, whose samples cost more, gets fewer in the time; but two batches, so that it has a variance.
+    assert 2 * TOY.batch <= rows["wcv (toy)"]["spp used"] < rows["wcv (auto)"]["spp used"] == 64
+
+
 def find_reason(name, facts):
     return SAMPLERS[name].refuses(facts)
 
