@@ -47,9 +47,13 @@ def unshare() -> tuple[str, ...]:
 
 
 def on_small_disk(arguments, place: Path, kibibytes: int, copy: Path):
-    """Runs a command with a disk of that size mounted on ``place``; what is there in the end is copied."""
+    """Runs a command with a disk of that size mounted on ``place``; what is there in the end is copied.
+
+    A disk of 0 KiB has a page, since none has less, but no room for a name beside its own.
+    """
+    options = f"size={kibibytes}k" if kibibytes else "size=4k,nr_inodes=1"
     copy.mkdir()
-    command = [*unshare(), "sh", "-c", MOUNTED, "sh", place, f"size={kibibytes}k", copy, *arguments]
+    command = [*unshare(), "sh", "-c", MOUNTED, "sh", place, options, copy, *arguments]
     return complete(command)
 
 
@@ -64,7 +68,7 @@ def disk_campaign(kind, folder, disks):
     outcomes = {"one line, nothing half-written": 0, "it was enough": 0}
     for i in range(disks):
         copy = folder / f"left{i}"
-        size = 4 * max(1, round(pages * (i + 0.5) / disks))
+        size = 4 * int(pages * (i + 0.5) / disks)
         run = on_small_disk(job.arguments(place), place, size, copy)
         assert half_written(copy) == [] and temporary_files(copy) == [], (size, run.stderr)
         if run.returncode:
