@@ -27,7 +27,6 @@ ngpt.methods
 ngpt.denoiser
 ngpt.report
 ngpt.measure
-ngpt.report.evaluation
 ngpt.training
 ngpt.export
 data_gen data_gen.llvm
