@@ -257,16 +257,6 @@ def test_mirrored_and_transposed_inputs_give_mirrored_and_transposed_results(nam
 # The registry
 
 
-def test_auto_takes_the_best_that_the_stack_allows():
-    _, primal, dx, dy, variances = noisy_stack(12, 9)
-    stack = ngpt.GradientStack.from_arrays(primal=primal)
-    assert ngpt.reconstruct(stack).method == "primal"
-    stack = stack.replace(dx=dx, dy=dy)
-    assert ngpt.reconstruct(stack).method == "l1"
-    stack = stack.replace(primal_var=variances[0], dx_var=variances[1], dy_var=variances[2])
-    assert ngpt.reconstruct(stack).method == "wcv"
-
-
 def test_alpha_may_be_derived():
     _, primal, dx, dy, variances = noisy_stack(20, 19)
     bare = ngpt.GradientStack.from_arrays(primal=primal, dx=dx, dy=dy)

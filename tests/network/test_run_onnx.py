@@ -184,11 +184,11 @@ def test_auto_takes_the_best_network_there_is(monkeypatch, oidn):
     if oidn and METHODS["oidn"].missing():
         pytest.skip(METHODS["oidn"].missing())
     if not oidn:
-        for name in ("ngpt-combine", "ngpt-primal"):
+        for name in ("ngpt-combine", "ngpt-primal", "oidn"):
             monkeypatch.setitem(METHODS, name, replace(METHODS[name], missing=lambda: "OIDN is not installed"))
     stack = full_stack(20, 30)
     first = "ngpt-combine" if oidn else "ngpt-fast"
     assert reconstruct(stack).method == first
     assert reconstruct(stack, memory=300).method == first
     bare = {name: layer for name, layer in stack.layers.items() if not name.startswith(("dx", "dy"))}
-    assert reconstruct(GradientStack(bare)).method == ("ngpt-primal" if oidn else "primal")
+    assert reconstruct(GradientStack(bare)).method == ("ngpt-primal" if oidn else "nfor")
