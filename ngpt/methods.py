@@ -5,7 +5,7 @@ A new method is one more entry in ``METHODS``; the command line, the reports and
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,7 @@ import numpy as np
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import nfor, nlm, oidn
 from ngpt.errors import NgptError
+from ngpt.network.identity import Identity, identify
 from ngpt.network.run import OPTIONS, Shipped
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
@@ -43,10 +44,12 @@ class Result:
     """A reconstruction and what is worth knowing about it.
 
     ``image``      (H, W, 3) float32, scene-linear, in the units of the stack's primal
-    ``method``     the method that made it ("auto" resolved)
+    ``method``     the method that made it ("auto" resolved); "own network FILE" for weights that are not ours
     ``seconds``    wall time of repair and reconstruction, without file access
     ``repaired``   pixels of the primal that were not finite and were replaced
     ``untrusted``  differences that were left out because they, or a pixel of theirs, were not finite
+    ``weights``    the file of the network that ran, None for methods without one
+    ``options``    those that are not the method's defaults, weights left out
     """
 
     image: np.ndarray
@@ -54,6 +57,18 @@ class Result:
     seconds: float
     repaired: int
     untrusted: int
+    weights: Identity | None = None
+    options: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def attributes(self) -> dict[str, Any]:
+        """What made the image, as header attributes: ``ngpt.write(path, image, like=stack, attributes=...)``."""
+        made: dict[str, Any] = {"ngpt:method": self.method, "ngpt:reconstructSeconds": self.seconds}
+        if self.weights:
+            made["ngpt:weights"] = str(self.weights)
+        if self.options:
+            made["ngpt:options"] = ", ".join(f"{name}={value}" for name, value in self.options.items())
+        return made
 
 
 def _primal(data: Repaired) -> np.ndarray:
@@ -145,7 +160,11 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     primal without any finite pixel.
     """
     start = time.perf_counter()
-    name = choose(stack) if method == "auto" else method
+    own = options.get("weights")
+    name = method
+    if method == "auto":
+        # Weights say themselves what they need: any method that runs them will do.
+        name = "ngpt" if own else choose(stack)
     if name not in METHODS:
         raise NgptError(f"unknown method '{name}'; choose one of: auto, {', '.join(METHODS)}")
     entry = METHODS[name]
@@ -156,23 +175,31 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     for option in options:
         if option not in entry.options:
             raise NgptError(f"method '{name}' has no option '{option}'; it has: {', '.join(entry.options) or 'none'}")
-    if entry.missing() and not options.get("weights"):
+    if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.
-    stack.require(*(("primal",) if options.get("weights") else entry.needs), why=f"method '{name}'")
+    stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     data = repair(stack)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **(entry.options | options)) + data.direct
+    seconds = time.perf_counter() - start
+    weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
     if lost:
-        file = f" with {options['weights']}" if options.get("weights") else ""
+        what = f"method '{name}'" if weights is None or weights.shipped else f"own network {weights}"
         raise NgptError(
-            f"{stack.path}: method '{name}'{file} gave {lost} non-finite pixels; the largest input value is "
+            f"{stack.path}: {what} gave {lost} non-finite pixels; the largest input value is "
             f"{np.abs(data.image).max():.3g}: scale the stack down, or use another method"
         )
     return Result(
-        np.ascontiguousarray(image, np.float32), name, time.perf_counter() - start, data.pixels, data.gradients
+        np.ascontiguousarray(image, np.float32),
+        weights.method if weights else name,
+        seconds,
+        data.pixels,
+        data.gradients,
+        weights,
+        {key: value for key, value in options.items() if key != "weights" and value != entry.options[key]},
     )
 
 

@@ -106,7 +106,7 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
 
 def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> Entry:
     result = reconstruct(stack, method)
-    write(target, result.image, like=stack, overwrite=force)
+    write(target, result.image, like=stack, overwrite=force, attributes=result.attributes)
     metrics = compare(result.image, reference)
     return Entry(method, result.image, result.seconds, {name: metrics[name] for name in TABLE_METRICS})
 

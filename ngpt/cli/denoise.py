@@ -13,6 +13,7 @@ from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run_onnx import MEMORY
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
+from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,6 +74,9 @@ def denoise_file(source: Path, target: Path, args, options: dict, reference: np.
         "input": str(source),
         "output": str(target),
         "method": result.method,
+        "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
+        "options": result.options,
+        "version": __version__,
         "seconds": result.seconds,
         "width": stack.width,
         "height": stack.height,
@@ -81,7 +85,7 @@ def denoise_file(source: Path, target: Path, args, options: dict, reference: np.
     }
     if reference is not None:
         report["metrics"] = compare(result.image, reference)
-    write(target, result.image, like=stack, overwrite=args.force)
+    write(target, result.image, like=stack, overwrite=args.force, attributes=result.attributes)
     return report
 
 
@@ -92,7 +96,10 @@ def alpha(text: str) -> float | str:
 
 def describe(report: dict) -> str:
     """One line about one file."""
-    text = f"{report['input']} -> {report['output']}: {report['method']}, {report['seconds']:.2f} s"
+    text = f"{report['input']} -> {report['output']}: {report['method']}"
+    if report["weights"] and report["method"] not in METHODS:
+        text += f", sha256 {report['weights']['sha256'][:12]}"
+    text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
         text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
     if "metrics" in report:

@@ -12,14 +12,23 @@ from ngpt.io.exr import pass_through, read
 from ngpt.layers import LAYERS
 from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS, choose
+from ngpt.network.describe import SUFFIXES as NETWORKS
+from ngpt.network.describe import describe
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.training.dataset import summary
+from ngpt.training.run_summary import is_run
+from ngpt.training.run_summary import summary as run_summary
 from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", nargs="?", metavar="FILE", help="an .exr file, a training set, a scene file or name")
+    parser.add_argument(
+        "file",
+        nargs="?",
+        metavar="FILE",
+        help="an .exr file, a network's weights, a training set or run, a scene file or name",
+    )
     parser.add_argument(
         "--aliases", action="store_true", help="print the layer names of other renderers that are known"
     )
@@ -36,10 +45,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
         print(format_aliases())
     elif args.file is None:
         show(overview(), args.json)
+    elif is_run(Path(args.file)):
+        show(run_summary(Path(args.file)), args.json)
     elif Path(args.file).is_dir():
         report = summary(Path(args.file))
         show(report, args.json)
         return 1 if report["problems"] else 0
+    elif Path(args.file).suffix.lower() in NETWORKS and Path(args.file).exists():
+        show(describe(args.file), args.json)
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
         show(scene(args.file, dict(args.define)), args.json)
     else:
@@ -66,7 +79,7 @@ def overview() -> dict:
 
 def scene(name: str, parameters: dict[str, str]) -> dict:
     """What a scene is made of and how it would be rendered."""
-    if Path(name).suffix.lower() == ".exr":
+    if Path(name).suffix.lower() in (".exr", *NETWORKS):
         raise NgptError(f"{name}: not found; check the name")
     use_renderer()
     from data_gen.inspect import inspect_scene

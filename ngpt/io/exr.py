@@ -8,6 +8,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -21,6 +22,7 @@ from ngpt.stack import GradientStack
 from ngpt.version import __version__
 
 __all__ = [
+    "MADE_BY",
     "ExrImage",
     "ExrPart",
     "StackSource",
@@ -37,6 +39,8 @@ __all__ = [
 _STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
+# Attributes that say what made a result; those of the stack are others, and stay.
+MADE_BY = ("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:reconstructSeconds")
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
 
@@ -95,6 +99,7 @@ def write(
     image: np.ndarray | GradientStack,
     like: GradientStack | None = None,
     overwrite: bool = False,
+    attributes: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
@@ -108,7 +113,12 @@ def write(
 
     Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` alone is written as float R G B.
+
+    ``attributes`` go into the header beside those of the stack: ``Result.attributes`` say what made a result. What a
+    stack that is itself a result says of its own making (``MADE_BY``) is left out of the new result.
     """
+    if structural := _STRUCTURE & (attributes or {}).keys():
+        raise NgptError(f"{path}: attribute '{min(structural)}' is OpenEXR's own; give it another name")
     if isinstance(image, GradientStack):
         if like is not None:
             raise NgptError(f"{path}: `like` goes with an image, not with a stack; pass one of the two")
@@ -121,9 +131,11 @@ def write(
                 f"{like.width}x{like.height}; results are written at the size of their stack"
             )
         result, main = _with_result(*_image_of(like, str(path))[:2], pixels), 0
+        for name in MADE_BY:
+            result.parts[0].header.pop(name, None)
     else:
         result, _, main = _image_of(GradientStack.from_arrays(path=str(path), primal=image), str(path))
-    result.parts[main].header["ngpt:version"] = __version__
+    result.parts[main].header.update({**(attributes or {}), "ngpt:version": __version__})
     return write_exr(path, result, overwrite)
 
 

@@ -55,7 +55,7 @@ class Shipped:
             layers = inputs.gather(data, names, network.base, f"weights {path}")
             return network.reconstruct(layers, memory=memory)
         if find_spec("torch") is None or find_spec("safetensors") is None:
-            raise NgptError(f"method '{self.name}': {path.name} needs PyTorch: pip install 'ngpt-recon[train]'")
+            raise NgptError(f"weights {path}: to run them needs PyTorch: pip install 'ngpt-recon[train]'")
         # torch takes seconds to come in.
         from ngpt.network import run_torch
 

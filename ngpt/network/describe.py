@@ -1,0 +1,104 @@
+"""What a file of weights says of itself, for ``ngpt info``."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from ngpt.errors import NgptError
+from ngpt.network import inputs, run_onnx
+from ngpt.network.identity import identify
+from ngpt.system.records import parse_json
+from ngpt.version import __version__
+
+SUFFIXES = (".onnx", ".safetensors")
+
+# What of a training's settings is worth a line, by table.
+_SETTINGS = {
+    "data": ("folders", "validation"),
+    "loss": ("kind",),
+    "optimizer": ("learning_rate",),
+    "run": ("steps", "batch", "precision"),
+}
+
+
+def describe(path: str | Path) -> dict[str, Any]:
+    """Whose network it is, what it reads and needs, and how it was trained: one table for people and for JSON.
+
+    Raises NgptError for a file that is no network of ngpt, and for .safetensors where PyTorch is not installed.
+    """
+    path = Path(path)
+    return _safetensors(path) if path.suffix.lower() == ".safetensors" else _onnx(path)
+
+
+def _onnx(path: Path) -> dict[str, Any]:
+    network = run_onnx.Network(path)
+    metadata = network.session.get_modelmeta().custom_metadata_map
+    training = parse_json(metadata.get("ngpt.training", "{}"), f"{path}: its record of the training")
+    claims = f"method '{metadata.get('ngpt.method', '')}', written by ngpt {metadata.get('ngpt.version', '?')}"
+    names = (*network.inputs, "base") if network.base else network.inputs
+    return (
+        _whose(path, claims)
+        | _reads(names, network.base, "ONNX Runtime")
+        | {
+            "alignment": network.alignment,
+            "overlap of tiles": network.overlap,
+            "bytes per pixel": network.bytes,
+            "precision": metadata.get("ngpt.precision", "?"),
+            "training": _training(training),
+        }
+    )
+
+
+def _safetensors(path: Path) -> dict[str, Any]:
+    if find_spec("torch") is None or find_spec("safetensors") is None:
+        raise NgptError(f"{path}: to read it needs PyTorch: pip install 'ngpt-recon[train]'")
+    # torch takes seconds to come in.
+    from ngpt.network.weights import load_weights
+
+    model, header = load_weights(path)
+    config, training = model.config, header.get("training", {})
+    version = training.get("version", "?") if isinstance(training, dict) else "?"
+    return (
+        _whose(path, f"weights, written by ngpt {version}")
+        | _reads(config.layers, config.base, "PyTorch")
+        | {"alignment": model.alignment, "training": _training(training)}
+    )
+
+
+def _whose(path: Path, claims: str) -> dict[str, Any]:
+    identity = identify(path)
+    ours = f"ngpt's own, method {identity.shipped}: the file that comes with ngpt {__version__}"
+    return {
+        "network": str(path),
+        "whose": ours if identity.shipped else f"none of those that come with ngpt {__version__}; it says: {claims}",
+        "sha256": identity.sha256,
+        "bytes": path.stat().st_size,
+    }
+
+
+def _reads(names: Collection[str], base: str, runtime: str) -> dict[str, Any]:
+    oidn = ["OIDN"] if set(inputs.DENOISED) & set(names) else []
+    return {
+        "inputs": list(names),
+        "needs layers": list(inputs.needs(names, base)),
+        "needs packages": [runtime, *oidn],
+        "base": base or "none",
+    }
+
+
+def _training(record: Any) -> dict[str, Any]:
+    """The facts of a record that anybody may have written: what is not as we write it is left out."""
+    if not isinstance(record, dict):
+        return {}
+    facts = {name: value for name, value in record.items() if isinstance(value, int | float | str)}
+    settings = record.get("settings")
+    for table, names in _SETTINGS.items():
+        values = settings.get(table) if isinstance(settings, dict) else None
+        if isinstance(values, dict):
+            for name in [name for name in names if name in values]:
+                value = values[name]
+                facts[f"{table}.{name}"] = "; ".join(map(str, value)) if isinstance(value, list) else value
+    return facts

@@ -1,0 +1,50 @@
+"""Which network a file holds: known by the file's contents, not by what the file calls itself."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+from ngpt.errors import NgptError
+from ngpt.network.run import WEIGHTS
+
+
+@dataclass(frozen=True)
+class Identity:
+    """A file of weights.
+
+    ``file``     its name, without the folder
+    ``sha256``   of its contents, 64 hexadecimal digits
+    ``shipped``  the method whose network it is, bit for bit as it comes with this package; "" for any other file
+    """
+
+    file: str
+    sha256: str
+    shipped: str
+
+    def __str__(self) -> str:
+        return f"{self.file} sha256:{self.sha256[:12]}"
+
+    @property
+    def method(self) -> str:
+        """The name for what the network makes: a method's for ours, and never one for a network of the user's own."""
+        return self.shipped or f"own network {self.file}"
+
+
+def identify(path: str | Path) -> Identity:
+    """Raises NgptError where the file cannot be read."""
+    try:
+        digest = _digest(str(path), Path(path).stat().st_mtime_ns)
+        ours = {_digest(str(own), own.stat().st_mtime_ns): own.stem for own in sorted(WEIGHTS.glob("*.onnx"))}
+    except OSError as error:
+        raise NgptError(f"{path}: cannot be read: {error.strerror}") from error
+    return Identity(Path(path).name, digest, ours.get(digest, ""))
+
+
+@lru_cache(maxsize=32)
+def _digest(path: str, _modified: int) -> str:
+    """Of a file; computed again when the file has changed."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,0 +1,91 @@
+"""What ``ngpt info`` says of the folder of a training run, without PyTorch and while the run goes on."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+from ngpt.errors import NgptError
+from ngpt.network.identity import identify
+from ngpt.system.records import check, parse_json, read_json
+
+CHECKPOINT, LOG, SETTINGS, WEIGHTS = "checkpoint.safetensors", "log.jsonl", "settings.json", "weights.safetensors"
+# Entries of the log that the loss is averaged over: one batch says little.
+_RECENT = 10
+# Bytes; far above what names and shapes of tensors take.
+_MAX_HEADER = 2**26
+
+
+def is_run(folder: Path) -> bool:
+    return any((folder / name).is_file() for name in (CHECKPOINT, LOG))
+
+
+def summary(folder: Path) -> dict[str, Any]:
+    """Steps, time, losses and validation scores of a run: a table for people and for JSON.
+
+    Raises NgptError for a checkpoint, settings or a log that cannot be read.
+    """
+    entries = _entries(folder / LOG) if (folder / LOG).is_file() else []
+    report: dict[str, Any] = {"training run": str(folder)}
+    settings: Any = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
+    if (folder / CHECKPOINT).is_file():
+        header = _header(folder / CHECKPOINT)
+        settings = settings or header["settings"]
+        report |= {"checkpoint at step": header["step"], "hours until then": round(header["seconds"] / 3600, 3)}
+        report |= {"version": header.get("version", "?")}
+    if settings:
+        check(settings, {"run": {"steps": int}}, f"{folder / SETTINGS}")
+        report |= {"steps planned": settings["run"]["steps"]}
+    if losses := [entry for entry in entries if "loss" in entry]:
+        last, recent = losses[-1], losses[-_RECENT:]
+        mean = sum(entry["loss"] for entry in recent) / len(recent)
+        report |= {"logged until step": entries[-1]["step"]}
+        report["loss"] = {"first": losses[0]["loss"], "last": last["loss"], f"mean of {len(recent)}": mean}
+        report["last step"] = {name: value for name, value in last.items() if name != "loss"}
+    if scores := [entry for entry in entries if "relMSE" in entry]:
+        best = min(scores, key=lambda entry: entry["relMSE"])
+        report |= {"validations": len(scores), "validation": {"best": best, "last": scores[-1]}}
+    if (folder / WEIGHTS).is_file():
+        report["weights"] = str(identify(folder / WEIGHTS))
+    if bad := sorted(path.name for path in folder.glob("bad-batch-*.safetensors")):
+        report["batches whose loss was not finite"] = bad
+    return report
+
+
+def _entries(path: Path) -> list[dict[str, float]]:
+    """The lines of a log; the last one may be cut short, as it is while it is written."""
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except (OSError, ValueError) as error:
+        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
+    entries = []
+    for number, line in enumerate(lines, 1):
+        where = f"{path}: line {number}"
+        try:
+            entry = parse_json(line, where)
+        except NgptError:
+            if number == len(lines):
+                break
+            raise
+        check(entry, {"step": int}, where)
+        check(entry, {str: (int, float)}, where)
+        entries.append(entry)
+    return entries
+
+
+def _header(path: Path) -> dict[str, Any]:
+    """The record in a checkpoint, without its tensors: a safetensors file begins with a length and so much JSON."""
+    try:
+        with open(path, "rb") as file:
+            (length,) = struct.unpack("<Q", file.read(8))
+            if length > _MAX_HEADER:
+                raise ValueError
+            text = json.loads(file.read(length))["__metadata__"]["ngpt"]
+    except (OSError, struct.error, ValueError, KeyError, TypeError, RecursionError) as error:
+        raise NgptError(f"{path}: is no checkpoint of ngpt, or damaged") from error
+    check(text, str, f"{path}: its header")
+    header = parse_json(text, f"{path}: its header")
+    check(header, {"settings": dict, "step": int, "seconds": (int, float)}, f"{path}: its header")
+    return header

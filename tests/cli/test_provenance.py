@@ -1,0 +1,197 @@
+"""Results say what made them, and files of networks and training runs say what they are."""
+
+import json
+import shutil
+import struct
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+
+import ngpt
+from ngpt.cli import main
+from ngpt.io.exr import MADE_BY
+from ngpt.methods import METHODS
+from ngpt.network.run import WEIGHTS
+
+FAST = WEIGHTS / "ngpt-fast.onnx"
+
+
+@pytest.fixture
+def stack(tmp_path):
+    stack = full_stack(20, 24)
+    stack.attributes["ngpt:sampler"] = "gpt"
+    return ngpt.read(ngpt.write(tmp_path / "s.exr", stack))
+
+
+@pytest.fixture
+def own(tmp_path):
+    """A network that computes what ours does, in another file that calls itself by our name."""
+    path = tmp_path / "ngpt-fast"
+    # One more field of protobuf: 14, the list of metadata, an entry without key and value.
+    path.write_bytes(FAST.read_bytes() + b"\x72\x00")
+    return path
+
+
+def attributes(path):
+    return ngpt.read(path).attributes
+
+
+def test_a_result_says_what_made_it(stack, tmp_path):
+    result = ngpt.reconstruct(stack, "l1", alpha=0.3)
+    path = ngpt.write(tmp_path / "o.exr", result.image, like=stack, attributes=result.attributes)
+    told = attributes(path)
+    assert told["ngpt:method"] == "l1" and told["ngpt:options"] == "alpha=0.3" and "ngpt:weights" not in told
+    assert told["ngpt:reconstructSeconds"] == pytest.approx(result.seconds) and told["ngpt:version"]
+    assert told["ngpt:sampler"] == "gpt"
+
+
+def test_defaults_are_no_options(stack):
+    default = METHODS["ngpt-fast"].options["memory"]
+    result = ngpt.reconstruct(stack, "ngpt-fast", memory=default)
+    assert result.options == {} and "ngpt:options" not in result.attributes
+    assert ngpt.reconstruct(stack, "ngpt-fast", memory=default - 1).options == {"memory": default - 1}
+
+
+def test_the_result_of_a_result_says_what_made_it_and_no_more(stack, tmp_path):
+    first = ngpt.reconstruct(stack, "ngpt-fast", memory=1000)
+    path = ngpt.write(tmp_path / "1.exr", first.image, like=stack, attributes=first.attributes)
+    assert attributes(path)["ngpt:weights"].startswith("ngpt-fast.onnx sha256:")
+    again = ngpt.read(path)
+    second = ngpt.reconstruct(again, "l2")
+    path = ngpt.write(tmp_path / "2.exr", second.image, like=again, attributes=second.attributes)
+    told = attributes(path)
+    assert told["ngpt:method"] == "l2" and not {"ngpt:weights", "ngpt:options"} & told.keys()
+    # Of an image that came from elsewhere nobody knows.
+    told = attributes(ngpt.write(tmp_path / "3.exr", second.image, like=again))
+    assert not set(MADE_BY) & told.keys() and told["ngpt:sampler"] == "gpt"
+    assert "ngpt:method" in again.attributes
+
+
+def test_attributes_cannot_change_how_a_file_is_stored(stack, tmp_path):
+    with pytest.raises(ngpt.NgptError, match="attribute 'dataWindow' is OpenEXR's own"):
+        ngpt.write(tmp_path / "o.exr", stack["primal"], like=stack, attributes={"dataWindow": 1})
+    assert not (tmp_path / "o.exr").exists()
+
+
+def test_our_network_is_known_wherever_it_lies(stack, tmp_path):
+    copy = shutil.copy(FAST, tmp_path / "copy.onnx")
+    result = ngpt.reconstruct(stack, weights=str(copy))
+    assert result.method == "ngpt-fast" and result.weights.file == "copy.onnx"
+    assert result.weights.sha256 == ngpt.reconstruct(stack, "ngpt-fast").weights.sha256
+
+
+@pytest.mark.parametrize("method", ["auto", "ngpt-fast", "ngpt-combine"])
+def test_a_network_of_ones_own_never_goes_by_our_name(method, stack, own, tmp_path, capsys):
+    """Whatever its file is called, whatever it says of itself, and whatever method it stands in for."""
+    target = tmp_path / "o.exr"
+    arguments = ["denoise", stack.path, "-o", str(target), "-m", method, "--weights", str(own), "--json"]
+    assert main(arguments) == 0
+    captured = capsys.readouterr()
+    (report,) = json.loads(captured.out)["files"]
+    digest = report["weights"]["sha256"]
+    assert report["method"] == "own network ngpt-fast" and report["weights"]["file"] == "ngpt-fast"
+    assert f": own network ngpt-fast, sha256 {digest[:12]}, " in captured.err
+    told = attributes(target)
+    assert told["ngpt:method"] == report["method"] and told["ngpt:weights"] == f"ngpt-fast sha256:{digest[:12]}"
+    assert main(["info", str(target)]) == 0
+    assert f"ngpt-fast sha256:{digest[:12]}" in capsys.readouterr().out
+
+
+def test_errors_of_a_network_of_ones_own_name_its_file(stack, own):
+    with pytest.raises(ngpt.NgptError, match=rf"weights {own} needs? layers dx"):
+        ngpt.reconstruct(ngpt.GradientStack.from_arrays(primal=stack["primal"]), weights=str(own))
+    huge = stack.replace(**{name: np.full_like(stack[name], 3e38) for name in ("primal", "albedo")})
+    with pytest.raises(ngpt.NgptError) as caught:
+        ngpt.reconstruct(huge.replace(dx=3e38 * np.ones_like(stack["dx"])), weights=str(own))
+    message = str(caught.value)
+    assert "own network ngpt-fast sha256:" in message and "method 'ngpt" not in message
+
+
+def test_info_on_our_network(capsys):
+    assert main(["info", str(WEIGHTS / "ngpt-combine.onnx"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert "ngpt's own, method ngpt-combine" in report["whose"] and len(report["sha256"]) == 64
+    assert "denoised" in report["inputs"] and report["needs packages"] == ["ONNX Runtime", "OIDN"]
+    assert "dx_var" in report["needs layers"] and "denoised" not in report["needs layers"]
+    assert report["base"] == "wcv" and report["alignment"] == 8 and report["training"]["step"] == 9000
+    assert report["bytes"] == (WEIGHTS / "ngpt-combine.onnx").stat().st_size
+
+
+def test_info_on_a_network_of_ones_own(own, capsys):
+    path = own.rename(own.with_name("x.onnx"))
+    assert main(["info", str(path)]) == 0
+    output = capsys.readouterr().out
+    assert "whose: none of those that come with ngpt" in output and "it says: method 'ngpt-fast'" in output
+
+
+def test_info_on_weights_of_pytorch(capsys):
+    pytest.importorskip("torch")
+    path = WEIGHTS.parents[1] / "export" / "weights" / "ngpt-primal.safetensors"
+    assert main(["info", str(path), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["needs packages"] == ["PyTorch", "OIDN"] and report["base"] == "none"
+    assert "primal_var" in report["needs layers"] and report["training"]["loss.kind"] == "structural"
+
+
+def write_run(folder, log, header=None):
+    folder.mkdir()
+    (folder / "log.jsonl").write_text(log)
+    if header is not None:
+        data = json.dumps({"__metadata__": {"ngpt": json.dumps(header)}}).encode()
+        (folder / "checkpoint.safetensors").write_bytes(struct.pack("<Q", len(data)) + data)
+    return folder
+
+
+LOG = (
+    '{"step": 50, "loss": 4.0, "seconds": 5}\n{"step": 50, "relMSE": 0.1, "relMSE primal": 0.5}\n'
+    '{"step": 100, "loss": 2.0, "seconds": 9}\n{"step": 100, "relMSE": 0.2, "relMSE primal": 0.5}\n'
+)
+HEADER = {"kind": "checkpoint", "step": 90, "seconds": 3600, "settings": {"run": {"steps": 200}}}
+
+
+def test_info_on_a_training_run(tmp_path, capsys):
+    # The last line is being written.
+    folder = write_run(tmp_path / "run", LOG + '{"step": 1', HEADER)
+    assert main(["info", str(folder), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["checkpoint at step"], report["logged until step"], report["steps planned"]) == (90, 100, 200)
+    assert report["loss"] == {"first": 4.0, "last": 2.0, "mean of 2": 3.0} and report["hours until then"] == 1
+    assert report["validations"] == 2 and report["validation"]["best"]["step"] == 50
+    assert report["validation"]["last"]["relMSE"] == 0.2
+    assert main(["info", str(write_run(tmp_path / "new", LOG))]) == 0
+    assert "relMSE 0.1" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "message"),
+    [
+        ("x.onnx", b"", "cannot load it"),
+        ("x.onnx", b"no network at all", "cannot load it"),
+        ("x.onnx", FAST.read_bytes()[:5000], "cannot load it"),
+        ("x.onnx", (WEIGHTS / "ngpt-fast.statistics.onnx").read_bytes(), "lacks the metadata 'ngpt.inputs'"),
+        ("x.safetensors", b"", "not a readable safetensors file"),
+        ("x.safetensors", struct.pack("<Q", 2) + b"{}", "holds no configuration of ngpt"),
+        ("run/checkpoint.safetensors", b"\0\0", "is no checkpoint of ngpt, or damaged"),
+        ("run/checkpoint.safetensors", struct.pack("<Q", 2**60) + b"{}", "is no checkpoint of ngpt, or damaged"),
+        ("run/log.jsonl", b"[]\n{}\n", "line 1 is []; it must be a table"),
+        ("run/log.jsonl", b'{"step": 1, "loss": "low"}\n', "line 1: 'loss' is 'low'"),
+        ("run/log.jsonl", b"garbage\n{}\n", "line 1: cannot be read"),
+        ("run/log.jsonl", b"\xff\xfe\n", "cannot be read"),
+    ],
+)
+def test_bad_files_are_one_line(name, data, message, tmp_path, capfd):
+    if name.endswith("x.safetensors"):
+        pytest.importorskip("torch")
+    path = tmp_path / name
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(data)
+    assert main(["info", str(path if name.startswith("x") else path.parent)]) == 2
+    out, err = capfd.readouterr()
+    assert out == "" and err.startswith("ngpt: error: ") and err.count("\n") == 1 and message in err
+
+
+@pytest.mark.parametrize("name", ["nowhere.onnx", "nowhere.safetensors"])
+def test_a_network_that_is_not_there(name, capfd):
+    assert main(["info", name]) == 2
+    assert capfd.readouterr().err == f"ngpt: error: {name}: not found; check the name\n"
