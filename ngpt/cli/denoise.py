@@ -15,6 +15,9 @@ from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.version import __version__
 
+# Layers that many renderers write into files of their own.
+FILES = ("albedo", "normal", "depth")
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     methods = "; ".join(f"{name}: {method.summary}" for name, method in METHODS.items())
@@ -35,6 +38,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
+    for layer in FILES:
+        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
     add_layers(parser)
     add_untrusted(parser)
     add_force(parser)
@@ -42,7 +47,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    files = {layer: file for layer in FILES if (file := getattr(args, layer))}
     pairs = output_paths(stack_files(args.stacks), args.output)
+    if files and len(pairs) > 1:
+        raise NgptError(
+            f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
+        )
     for _, target in pairs:
         check_output(target, args.force)
     reference = read_image(args.ref, args.untrusted) if args.ref else None
@@ -52,7 +62,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     reports = []
     for i, (source, target) in enumerate(pairs, 1):
         try:
-            report = denoise_file(source, target, args, options, reference)
+            report = denoise_file(source, target, args, files, options, reference)
             console.say(f"[{i}/{len(pairs)}] {describe(report)}")
         except NgptError as error:
             report = {"input": str(source), "error": str(error)}
@@ -66,9 +76,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def denoise_file(source: Path, target: Path, args, options: dict, reference: np.ndarray | None) -> dict:
+def denoise_file(
+    source: Path, target: Path, args, files: dict[str, str], options: dict, reference: np.ndarray | None
+) -> dict:
     """Reads, reconstructs and writes one stack; returns what there is to report."""
-    stack = read(source, dict(args.layer), args.untrusted)
+    stack = read(source, dict(args.layer), args.untrusted, files)
     result = reconstruct(stack, args.method, **options)
     report = {
         "input": str(source),

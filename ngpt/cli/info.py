@@ -7,7 +7,7 @@ import numpy as np
 
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
 from ngpt.errors import NgptError
-from ngpt.io.aliases import format_aliases
+from ngpt.io.aliases import format_aliases, propose
 from ngpt.io.exr import pass_through, read
 from ngpt.layers import LAYERS
 from ngpt.merging import DIAGNOSTICS
@@ -131,6 +131,10 @@ def stack(stack: GradientStack) -> dict:
         },
         "other channels": [name for name in further if name not in rates],
         "missing": [name for name in LAYERS if name not in stack],
+        "proposed": [
+            f'--layer {name}="{layer}"'
+            for name, layer in propose([(part.name, list(part.channels)) for part in parts], resolution).items()
+        ],
         "methods": [
             name
             for name, method in METHODS.items()
@@ -139,8 +143,9 @@ def stack(stack: GradientStack) -> dict:
         "auto": choose(stack),
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
-    if not rates:
-        del report["diagnostics"]
+    for name in ("diagnostics", "proposed"):
+        if not report[name]:
+            del report[name]
     return report
 
 

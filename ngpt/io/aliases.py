@@ -23,7 +23,8 @@ class Alias(NamedTuple):
 
 
 # The first name that a file holds wins, so order is preference. Absent on purpose: pbrt-v4's `Variance` and Mitsuba's
-# moments are variances of a sample, not of the pixel mean, and half of what other renderers call `diffuse` is light.
+# moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
+# V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
     *(Alias(name, "ngpt", name) for name in LAYERS if name != "direct"),
     Alias("direct", "ngpt", "direct", "only beside dx or dy: elsewhere `direct` is direct lighting"),
@@ -31,6 +32,7 @@ ALIASES: tuple[Alias, ...] = (
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),
     Alias("primal", "RenderMan", "Ci"),
     Alias("primal", "Arnold", "RGBA"),
+    Alias("primal", "Karma", "C"),
     Alias("primal", "V-Ray, Mitsuba 3, pbrt-v4", "", "root R G B of the first part, in files of ngpt too"),
     Alias("albedo", "Cycles", "Denoising Albedo", "follows mirrors and glass to what is seen in them"),
     Alias("albedo", "Arnold", "denoise_albedo"),
@@ -39,20 +41,27 @@ ALIASES: tuple[Alias, ...] = (
     Alias(
         "albedo", "V-Ray", "diffuse", "with red green blue only: elsewhere `diffuse` is light", ("red", "green", "blue")
     ),
+    Alias("albedo", "V-Ray for 3ds Max", "VRayDiffuseFilter"),
+    Alias("albedo", "Redshift", "DiffuseFilter"),
     Alias("albedo", "Cycles", "Diffuse Color", "diffuse closures only"),
     Alias("albedo", "Cycles", "DiffCol", "older files"),
     Alias("normal", "Cycles", "Denoising Normal", "camera space, but +z away from the viewer"),
     Alias("normal", "pbrt-v4", "Ns", "shading normal, camera space unless the film says otherwise"),
-    Alias("normal", "Arnold, pbrt-v4", "N"),
+    Alias("normal", "Redshift", "BumpNormals", "bump included"),
+    Alias("normal", "Arnold, pbrt-v4, Karma, Redshift", "N"),
     Alias("normal", "V-Ray", "bump_normals", "screen space"),
+    Alias("normal", "V-Ray for 3ds Max", "VRayBumpNormals", "screen space"),
+    Alias("normal", "V-Ray for 3ds Max", "VRayNormals", "without bump"),
+    Alias("normal", "Mitsuba 3", "normals", "the name in the documentation of its denoiser; world space"),
     Alias("normal", "Mitsuba 3", "sh_normal", "AOV names are the user's; world space"),
     Alias("normal", "Mitsuba 3", "nn", "the name in Mitsuba's documentation; world space"),
     Alias("normal", "Cycles", "Normal", "world space"),
     Alias("depth", "Cycles", "Denoising Depth", "ray length"),
     Alias("depth", "RenderMan", "zfiltered"),
     Alias("depth", "Mitsuba 3", "dd.y", "the name in Mitsuba's documentation; ray length"),
+    Alias("depth", "Mitsuba 3", "dd", "ray length"),
     Alias("depth", "Cycles", "Depth", "along the viewing axis, not the ray"),
-    Alias("depth", "Arnold", "Z"),
+    Alias("depth", "Arnold, Redshift", "Z"),
     Alias("alpha", "all", "A", "failing that, the A of the layer that holds primal"),
     Alias("alpha", "RenderMan", "a"),
 )
@@ -65,6 +74,16 @@ _SPELLINGS = {
     ("Z",): ((("Z", "z", "V", "v", "T", "t", "Y", "y", "D", "d", "R", "r", ""),),),
     ("A",): ((("A", "a", "alpha", ""),),),
 }
+# Parts of names, in small letters without blanks and underscores, that make a layer look like one of the contract.
+_LOOKS = {
+    "albedo": ("albedo", "diffusefilter", "diffusecol", "basecol", "diffcol", "reflectance"),
+    "normal": ("normal",),
+    "depth": ("depth", "distance"),
+    "dx": ("gradientx", "gradx"),
+    "dy": ("gradienty", "grady"),
+}
+# How names of variances and errors end.
+_NOISE = ("var", "variance", "mse", "error")
 
 
 class Found(NamedTuple):
@@ -154,6 +173,52 @@ def resolve(
     return found
 
 
+def resolve_alone(parts: Sequence[tuple[str, Sequence[str]]], name: str, path: str) -> Found:
+    """Finds layer ``name`` in a file of its own, ``parts`` as for ``resolve``.
+
+    That is the layer of one of its names, else the root of the first part, else the one layer with such channels.
+
+    Raises NgptError where there is none, or several and none of a known name.
+    """
+    groups, layer = _group(parts), LAYERS[name]
+    for alias in (alias for alias in ALIASES if alias.layer == name):
+        if found := _match(alias, layer, groups, None, path):
+            return found
+    fitting: dict[tuple[int, tuple[str, ...]], Found] = {}
+    for group in sorted(groups, key=lambda group: group.name != ""):
+        if channels := _complete(layer, group):
+            fitting.setdefault((group.part, channels), Found(group.part, channels, group.name))
+    candidates = list(fitting.values())
+    if not candidates:
+        raise NgptError(
+            f"{path}: no layer with channels {' '.join(layer.channels)} for '{name}'; the file holds {_listing(groups)}"
+        )
+    if len(candidates) > 1 and candidates[0].name:
+        names = ", ".join(f'"{candidate.name}"' for candidate in candidates)
+        raise NgptError(f"{path}: layer '{name}' could be any of {names}; write a file with one of them")
+    return candidates[0]
+
+
+def propose(parts: Sequence[tuple[str, Sequence[str]]], found: Resolution) -> dict[str, str]:
+    """Layers of a file that look like ones of the contract that ``found`` lacks: layer -> its name in the file.
+
+    A guess from names, for the user to judge: ``--layer albedo="NAME"`` takes it. Each layer is proposed once.
+    """
+    taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
+    proposed: dict[str, str] = {}
+    groups = _group(parts)
+    for name, looks in _LOOKS.items():
+        for group in groups if name not in found else ():
+            plain = group.name.lower().replace(" ", "").replace("_", "")
+            if not any(look in plain for look in looks) or plain.endswith(_NOISE) or group.name in proposed.values():
+                continue
+            channels = _complete(LAYERS[name], group)
+            if channels and not {(group.part, channel) for channel in channels} & taken:
+                proposed[name] = group.name
+                break
+    return proposed
+
+
 def _group(parts: Sequence[tuple[str, Sequence[str]]]) -> list[_Group]:
     """Sorts channels into layers; one without a dot also makes a layer of its own, called like the channel."""
     several = len(parts) > 1
@@ -222,6 +287,14 @@ def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> 
             )
         return tuple(channels[0] for channels in held)
     return ()
+
+
+def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
+    """``_channels``, or () where they are incomplete or one is there twice."""
+    try:
+        return _channels(layer, group, (), "")
+    except NgptError:
+        return ()
 
 
 def _no_primal(groups: list[_Group], path: str) -> NgptError:

@@ -14,7 +14,7 @@ import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import Found, Resolution, resolve
+from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.layers import LAYERS, RGB
@@ -53,7 +53,12 @@ class StackSource:
     resolution: Resolution
 
 
-def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None, isolated: bool = False) -> GradientStack:
+def read(
+    path: str | os.PathLike,
+    layers: Mapping[str, str] | None = None,
+    isolated: bool = False,
+    files: Mapping[str, str | os.PathLike] | None = None,
+) -> GradientStack:
     """Reads a gradient stack, or any render with an image in it.
 
     Layers are found by their names in the contract or in other renderers (``ngpt.io.aliases``). ``layers`` maps names
@@ -61,10 +66,14 @@ def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None, isola
     converted to float32; layers the toolkit does not know stay in ``stack.source`` and come back on writing. In a
     result file primal is the kept input, so that reconstructing a result gives the result again.
 
+    ``files`` maps names of the contract to files of their own, ``{"albedo": "albedo.exr"}``, which win over layers of
+    that name in ``path``. Of several layers in such a file the one of a known name counts, else its root.
+
     ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
     for files of strangers (``ngpt.io.isolated``).
 
-    Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place.
+    Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place; and for
+    such a file of a layer.
     """
     image = read_exr_isolated(path) if isolated else read_exr(path)
     resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path))
@@ -79,7 +88,29 @@ def read(path: str | os.PathLike, layers: Mapping[str, str] | None = None, isola
                 f"{path}: layer '{name}' starts at pixel {_corner(there)} but 'primal' at {_corner(here)}; "
                 "render them with one data window"
             )
-    return stack
+    alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
+    return stack.replace(**alone) if alone else stack
+
+
+def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
+    """Layer ``name`` (H, W, C) of a file of its own, of the size and place of ``main``, the part that holds primal."""
+    if name not in LAYERS or name == "primal":
+        raise NgptError(f"{file}: layer '{name}' cannot come from a file of its own")
+    parts = (read_exr_isolated(file) if isolated else read_exr(file)).parts
+    found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
+    layer = _gather(parts[found.part], found.channels)
+    if layer.shape[:2] != (stack.height, stack.width):
+        raise NgptError(
+            f"{file}: {name} is {layer.shape[1]}x{layer.shape[0]} but {stack.path} is {stack.width}x{stack.height}; "
+            "render them at one size"
+        )
+    here, there = main.header["dataWindow"], parts[found.part].header["dataWindow"]
+    if not np.array_equal(here, there):
+        raise NgptError(
+            f"{file}: {name} starts at pixel {_corner(there)} but {stack.path} at {_corner(here)}; "
+            "render them with one data window"
+        )
+    return layer
 
 
 def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:

@@ -3,7 +3,7 @@
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import ALIASES, format_aliases, resolve
+from ngpt.io.aliases import ALIASES, format_aliases, propose, resolve, resolve_alone
 from ngpt.layers import LAYERS
 
 
@@ -126,6 +126,59 @@ PRODUCERS = {
             "normal": names("nn.XYZ"),
             "depth": ["dd.y.T"],
         },
+    ),
+    "Mitsuba 3, as its denoiser is shown": (
+        [("", names("RGB", "albedo.RGB", "normals.XYZ", "dd.T"))],
+        {
+            "primal": list("RGB"),
+            "albedo": names("albedo.RGB"),
+            "normal": names("normals.XYZ"),
+            "depth": ["dd.T"],
+        },
+    ),
+    "V-Ray for 3ds Max": (
+        [
+            (
+                "",
+                names(
+                    "RGBA",
+                    "VRayDiffuseFilter.RGB",
+                    "VRayNormals.RGB",
+                    "VRayBumpNormals.RGB",
+                    "VRayZDepth.RGB",
+                    "VRayLighting.RGB",
+                ),
+            )
+        ],
+        {
+            "primal": list("RGB"),
+            "albedo": names("VRayDiffuseFilter.RGB"),
+            "normal": names("VRayBumpNormals.RGB"),
+            "alpha": ["A"],
+        },
+    ),
+    "Redshift": (
+        [("", names("RGBA", "DiffuseFilter.RGB", "N.RGB", "BumpNormals.RGB", "DiffuseLighting.RGB", "Z"))],
+        {
+            "primal": list("RGB"),
+            "albedo": names("DiffuseFilter.RGB"),
+            "normal": names("BumpNormals.RGB"),
+            "depth": ["Z"],
+            "alpha": ["A"],
+        },
+    ),
+    "Karma": (
+        [("", names("C.RGBA", "albedo.RGB", "N.XYZ", "directdiffuse.RGB", "C_key.RGB"))],
+        {
+            "primal": names("C.RGB"),
+            "albedo": names("albedo.RGB"),
+            "normal": names("N.XYZ"),
+            "alpha": ["C.A"],
+        },
+    ),
+    "Karma, multi-part": (
+        [("albedo", list("RGB")), ("C", list("RGBA"))],
+        {"primal": list("RGB"), "albedo": list("RGB"), "alpha": ["A"]},
     ),
     "pbrt-v4": (
         [("", names("RGB", "Albedo.RGB", "P.XYZ", "N.XYZ", "Ns.XYZ", "Variance.RGB", "RelativeVariance.RGB", "u"))],
@@ -259,6 +312,58 @@ def test_the_root_of_a_part_called_albedo_is_no_primal():
     with pytest.raises(NgptError, match="no primal image"):
         resolve([("albedo", list("RGB")), ("N", list("XYZ"))])
     assert resolve([("albedo", list("RGB")), ("Combined", list("RGB"))])["primal"].part == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "parts", "channels"),
+    [
+        ("albedo", [("", list("RGBA"))], list("RGB")),
+        ("normal", [("", list("RGB"))], list("RGB")),
+        ("normal", [("", list("XYZ"))], list("XYZ")),
+        ("depth", [("", ["Y"])], ["Y"]),
+        ("depth", [("", list("RGBA"))], ["R"]),
+        ("albedo", [("", names("ViewLayer.Paint.RGB"))], names("ViewLayer.Paint.RGB")),
+        ("albedo", [("", names("RGBA", "Denoising Albedo.RGB"))], names("Denoising Albedo.RGB")),
+        ("albedo", [("beauty", list("RGB")), ("paint", list("RGB"))], list("RGB")),
+        ("normal", [("", names("uv.RG", "bend.XYZ"))], names("bend.XYZ")),
+    ],
+)
+def test_a_layer_in_a_file_of_its_own(name, parts, channels):
+    found = resolve_alone(parts, name, "a.exr")
+    assert list(found.channels) == channels and found.part == 0
+
+
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ([("", names("uv.UV"))], "a.exr: no layer with channels R G B for 'albedo'; the file holds \"uv\" (U V)"),
+        ([("", names("a.RGB", "b.RGB"))], 'a.exr: layer \'albedo\' could be any of "a", "b"'),
+    ],
+)
+def test_a_file_without_the_layer_it_is_for(parts, message):
+    with pytest.raises(NgptError) as caught:
+        resolve_alone(parts, "albedo", "a.exr")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("channels", "expected"),
+    [
+        (names("RGB", "x.BaseColor.RGB", "shading_normal.XYZ", "CameraDistance.R"),
+         {"albedo": "x.BaseColor", "normal": "shading_normal", "depth": "CameraDistance"}),
+        (names("RGB", "Grad_X.RGB", "Grad_Y.RGB"), {"dx": "Grad_X", "dy": "Grad_Y"}),
+        (names("RGB", "albedo_variance.RGB", "diffuse.RGB", "emission.RGB"), {}),
+        (names("RGB", "albedo.RGB", "my_albedo.RGB"), {}),
+        (names("RGB", "myNormal.XZ"), {}),
+    ],
+)  # fmt: skip
+def test_layers_that_look_like_missing_ones_are_proposed(channels, expected):
+    parts = [("", channels)]
+    proposed = propose(parts, resolve(parts))
+    assert proposed == expected
+    # What is proposed can be asked for.
+    found = resolve(parts, proposed)
+    assert {name: found[name].name for name in proposed} == expected
 
 
 def test_direct_lighting_of_other_renderers_is_not_ngpts_direct():

@@ -1,0 +1,87 @@
+"""Beauty, albedo, normal and depth in files of their own."""
+
+import json
+
+import numpy as np
+import pytest
+from exr_files import window, write_raw
+from full_stack import full_stack
+
+import ngpt
+from ngpt.cli import main
+
+SEEN, FEATURES = ("primal", "primal_var"), ("albedo", "normal", "depth")
+
+
+@pytest.fixture
+def apart(tmp_path):
+    """The path of a file for each of primal, albedo, normal and depth; and the stack that they are of."""
+    stack = full_stack(10, 12)
+    paths = {}
+    for name in ("primal", "albedo", "normal"):
+        paths[name] = write_raw(tmp_path / f"{name}.exr", ({c: stack[name][..., i] for i, c in enumerate("RGB")},))
+    paths["depth"] = write_raw(tmp_path / "depth.exr", ({"Z": stack["depth"][..., 0]},))
+    return {name: str(path) for name, path in paths.items()}, stack
+
+
+def options(paths):
+    return [argument for name in FEATURES for argument in (f"--{name}", paths[name])]
+
+
+def test_layers_from_files_of_their_own(apart):
+    paths, stack = apart
+    files = {name: paths[name] for name in FEATURES}
+    together = ngpt.read(paths["primal"], files=files)
+    assert together.names == ("primal", "albedo", "normal", "depth")
+    for name in together.names:
+        assert np.array_equal(together[name], stack[name])
+
+
+def test_they_are_denoised_as_one_stack(apart, tmp_path):
+    paths, stack = apart
+    beauty, whole = (ngpt.GradientStack({name: stack[name] for name in names}) for names in (SEEN, (*SEEN, *FEATURES)))
+    sources = [str(ngpt.write(tmp_path / name, layers)) for name, layers in (("b.exr", beauty), ("w.exr", whole))]
+    results = [str(tmp_path / name) for name in ("out.exr", "same.exr")]
+    assert main(["denoise", sources[0], *options(paths), "-o", results[0], "-m", "nfor", "-q"]) == 0
+    assert main(["denoise", sources[1], "-o", results[1], "-m", "nfor", "-q"]) == 0
+    assert np.array_equal(*map(ngpt.read_image, results))
+    # The result holds them, so that it can be reconstructed again.
+    assert ngpt.read(results[0]).names == ngpt.read(results[1]).names
+
+
+def test_a_file_of_a_layer_wins_over_the_layer_in_the_stack(apart, tmp_path):
+    paths, stack = apart
+    whole = ngpt.write(tmp_path / "whole.exr", stack.replace(albedo=stack["albedo"] / 2))
+    assert np.array_equal(ngpt.read(whole, files={"albedo": paths["albedo"]})["albedo"], stack["albedo"])
+
+
+def test_what_does_not_fit_is_said_in_one_line(apart, tmp_path, capfd):
+    paths, stack = apart
+    small = str(write_raw(tmp_path / "small.exr", ({c: np.ones((4, 5), np.float32) for c in "RGB"},)))
+    moved = {"dataWindow": window(3, 2, 12, 10)}
+    moved = str(write_raw(tmp_path / "moved.exr", (dict.fromkeys("RGB", stack["albedo"][..., 0]), moved)))
+    for arguments, status, message in (
+        (["--albedo", small], 1, f"{small}: albedo is 5x4 but {paths['primal']} is 12x10; render them at one size"),
+        (["--normal", small], 1, f"{small}: normal is 5x4"),
+        (["--albedo", moved], 1, f"{moved}: albedo starts at pixel (3, 2) but {paths['primal']} at (0, 0)"),
+        (["--normal", paths["depth"]], 1, "depth.exr: no layer with channels X Y Z for 'normal'"),
+        (["--depth", "nowhere.exr"], 1, "nowhere.exr: not found"),
+        ([paths["albedo"], "--albedo", small], 2, "--albedo belongs to one stack, and 2 are given"),
+    ):
+        assert main(["denoise", paths["primal"], *arguments]) == status
+        out, err = capfd.readouterr()
+        assert err.startswith("ngpt: error: ") and message in err and err.count("\n") == 1 and out == ""
+    with pytest.raises(ngpt.NgptError, match="layer 'primal' cannot come from a file of its own"):
+        ngpt.read(paths["primal"], files={"primal": paths["albedo"]})
+    assert not (tmp_path / "primal_denoised.exr").exists()
+
+
+def test_info_proposes_the_option_for_a_layer_that_looks_like_a_missing_one(apart, tmp_path, capsys):
+    _, stack = apart
+    channels = {c: stack["primal"][..., i] for i, c in enumerate("RGB")}
+    channels |= {f"base color.{c}": stack["albedo"][..., i] for i, c in enumerate("RGB")}
+    path = str(write_raw(tmp_path / "odd.exr", (channels,)))
+    assert main(["info", path, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["proposed"] == ['--layer albedo="base color"']
+    assert main(["info", path, "--layer", "albedo=base color"]) == 0
+    assert "proposed" not in capsys.readouterr().out
