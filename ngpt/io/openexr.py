@@ -52,8 +52,8 @@ _ATTRIBUTE_TYPES = (
     OpenEXR.TileDescription,
     OpenEXR.TimeCode,
 )
-# Where open files have names by their number; Windows has none.
-_NUMBERS = Path("/dev/fd")
+# Where open files have names by their number, which open them anew; Linux alone has such.
+_NUMBERS = Path("/proc/self/fd")
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
@@ -135,7 +135,7 @@ def regular_file(path: Path) -> Iterator[BinaryIO]:
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if path.is_dir():  # which not every system says in its error
+        if os.path.isdir(path):  # which not every system says in its error
             raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
         raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
     with file:
