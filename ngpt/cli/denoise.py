@@ -1,6 +1,7 @@
 """``ngpt denoise``: from gradient stacks to images."""
 
 import argparse
+import os
 from pathlib import Path
 
 import numpy as np
@@ -123,7 +124,7 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
     """Where the result of each source goes; makes the output folder if there is to be one."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
-    elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith("/"):
+    elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
         targets = [Path(output)]
     else:
         folder = Path(output)

@@ -5,13 +5,13 @@ what renderers write. Layout of the format: https://openexr.com/en/latest/OpenEX
 """
 
 import os
-import resource
 import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import BinaryIO
 
 from ngpt.errors import NgptError
+from ngpt.system.limits import memory
 
 MAX_HEADER = 2**24  # bytes of all headers of a file
 MAX_ATTRIBUTES = 10_000
@@ -217,10 +217,3 @@ def _check_size(parts: list[PartHeader], length: int, path: str) -> None:
             f"{path}: its {channels} channels take {wanted / 2**30:.1f} GiB, more than half of the "
             f"{memory() / 2**30:.1f} GiB of memory; keep the channels that are needed, or cut it into pieces"
         )
-
-
-def memory() -> int:
-    """Bytes that this process may have: the machine's, or what its limits leave it."""
-    physical = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    return physical if limit == resource.RLIM_INFINITY else min(physical, limit)

@@ -1,14 +1,13 @@
 """OpenEXR files from strangers, decoded in a process of their own: what crashes or stalls the decoder stays there.
 
 The other process reads the file and writes it anew, without compression, to a folder that only this user can look into;
-here that copy is read. It has less memory than this one, a limit on time, and its death is an NgptError.
+here that copy is read. It has a limit on memory (on Linux) and on time, and its death is an NgptError.
 
     python -P -m ngpt.io.isolated FILE COPY BYTES         the other process
 """
 
 import json
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -20,6 +19,7 @@ import OpenEXR
 from ngpt.errors import NgptError
 from ngpt.io.header import read_headers
 from ngpt.io.openexr import ExrImage, read_exr, regular_file, write_exr
+from ngpt.system.limits import limit_address_space
 
 # Beside what its pixels take, twice over: Python, NumPy and the stacks of OpenEXR's threads.
 _BASE = 2**31
@@ -64,10 +64,7 @@ def _cause(done: subprocess.CompletedProcess) -> str:
 
 
 def _main(path: str, copy: str, limit: str) -> int:
-    own = resource.getrlimit(resource.RLIMIT_AS)[1]
-    most = int(limit) if own == resource.RLIM_INFINITY else min(int(limit), own)
-    resource.setrlimit(resource.RLIMIT_AS, (most, own))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    limit_address_space(int(limit))
     try:
         image = read_exr(path)
         told = [(int(part.header["compression"]), int(part.header["lineOrder"])) for part in image.parts]

@@ -52,6 +52,8 @@ _ATTRIBUTE_TYPES = (
     OpenEXR.TileDescription,
     OpenEXR.TimeCode,
 )
+# Where open files have names by their number, which open them anew; Linux alone has such.
+_NUMBERS = Path("/proc/self/fd")
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
@@ -116,8 +118,7 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
     if Path(path).suffix.lower() != ".exr":
         raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
     parts = [_writable(part, str(path)) for part in image.parts]
-    with atomic_output(path, overwrite) as temporary, open(temporary, "r+b") as file:
-        name = _numbered(file)
+    with atomic_output(path, overwrite) as temporary, _name_to_write(temporary) as name:
         try:
             OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
@@ -130,11 +131,11 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
 def regular_file(path: Path) -> Iterator[BinaryIO]:
     """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
     try:
-        file = open(path, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NONBLOCK))  # noqa: SIM115
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
     except FileNotFoundError:
         raise NgptError(f"{path}: not found; check the name") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if isinstance(error, IsADirectoryError):
+        if os.path.isdir(path):  # which not every system says in its error
             raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
         raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
     with file:
@@ -146,9 +147,23 @@ def regular_file(path: Path) -> Iterator[BinaryIO]:
             raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
+def _open_at_once(name: str, flags: int) -> int:
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+
+
 def _numbered(file: BinaryIO) -> str:
     """A name for an open file: its own may belong to another by now, or be one that OpenEXR cannot encode."""
-    return f"/dev/fd/{file.fileno()}"
+    return str(_NUMBERS / str(file.fileno())) if _NUMBERS.is_dir() else str(file.name)
+
+
+@contextlib.contextmanager
+def _name_to_write(path: Path) -> Iterator[str]:
+    """The same for a file to be written; where it has its own name only, it is closed, lest it be refused as in use."""
+    if _NUMBERS.is_dir():
+        with open(path, "r+b") as file:
+            yield _numbered(file)
+    else:
+        yield str(path)
 
 
 def _state(file: BinaryIO) -> tuple[int, int]:

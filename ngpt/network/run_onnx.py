@@ -6,8 +6,6 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 from __future__ import annotations
 
 import math
-import os
-import resource
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from itertools import product
@@ -18,6 +16,7 @@ import numpy as np
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network.exposure import statistics
+from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers.
 MEMORY = 2048
@@ -227,7 +226,7 @@ def _session(path: str, _modified: int, device: str, threads: int):
         have = [name for name, provider in DEVICES.items() if provider in available]
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or len(os.sched_getaffinity(0))
+    options.intra_op_num_threads = threads or processors()
     # What goes wrong comes as an exception; in the log it would stand a second time.
     options.log_severity_level = 4
     try:
@@ -237,16 +236,6 @@ def _session(path: str, _modified: int, device: str, threads: int):
     if session.get_providers()[0] != provider:
         raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
     return session
-
-
-def free_address_space() -> int:
-    """MiB that this process may still map, far more than any machine has where no limit (``ulimit -v``) is set."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    try:
-        used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
-    except OSError:  # not Linux
-        used = 0
-    return 2**40 if limit == resource.RLIM_INFINITY else max(0, limit - used) // 2**20
 
 
 def planes(layer: np.ndarray) -> np.ndarray:

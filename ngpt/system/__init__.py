@@ -1,1 +1,1 @@
-"""What every room stands on: console, files, records of JSON and TOML, worker processes."""
+"""What every room stands on: console, files, limits, records of JSON and TOML, worker processes."""

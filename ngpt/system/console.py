@@ -3,8 +3,8 @@
 Everything goes to standard error; standard output is kept for results (JSON, tables).
 """
 
+import io
 import os
-import resource
 import signal
 import sys
 import threading
@@ -14,6 +14,7 @@ from contextlib import contextmanager
 from typing import TextIO
 
 from ngpt.errors import NgptError
+from ngpt.system.limits import address_space
 
 # Elsewhere than on a terminal, a line at most this often: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
@@ -90,8 +91,8 @@ def _noted_interrupts() -> Iterator[list[int]]:
 
 def _check_address_space() -> None:
     """Raises NgptError for a limit (``ulimit -v``) at which the libraries we load hang or abort, OpenBLAS first."""
-    limit = resource.getrlimit(resource.RLIMIT_AS)[0]
-    if limit != resource.RLIM_INFINITY and limit < FEWEST_MIB << 20:
+    limit = address_space()
+    if limit is not None and limit < FEWEST_MIB << 20:
         raise NgptError(
             f"the address space is limited to {limit >> 20} MiB (ulimit -v); {FEWEST_MIB} are the least that works"
         )
@@ -121,6 +122,9 @@ def _open_standard_streams() -> None:
             os.open(os.devnull, os.O_RDWR)  # the lowest number that is free
         if getattr(sys, name) is None:
             setattr(sys, name, os.fdopen(number, "r" if number == 0 else "w", closefd=False))
+    # Files may have letters in them that standard output has not: on Windows a pipe has those of one language.
+    if isinstance(sys.stdout, io.TextIOWrapper) and sys.stdout.errors == "strict":
+        sys.stdout.reconfigure(errors="backslashreplace")
 
 
 class Console:

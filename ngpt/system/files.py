@@ -1,9 +1,10 @@
 """Output files: complete under their final name, or not there at all."""
 
-import fcntl
 import os
 import re
 import tempfile
+import time
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
@@ -11,9 +12,15 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 
+try:
+    import fcntl
+except ImportError:  # Windows, where a locked file could not be written by the block that it is locked for
+    fcntl = None  # type: ignore[assignment]
+
 # Temporary files have names of their own, so that what killed processes leave behind is known for what it is.
 _PREFIX = ".ngpt-"
 _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
+_FORGOTTEN = 24 * 3600.0  # seconds without a change, after which they are swept where nothing can be locked
 
 
 def check_output(path: str | os.PathLike, overwrite: bool = False) -> Path:
@@ -40,7 +47,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
     The temporary file keeps the suffix of ``path`` (writers choose the format by it), is flushed to disk before the
     rename, and is removed when the block fails, so nobody ever sees half a file under the final name. The block has to
     write into that file, not replace it. A process that is killed leaves its temporary file behind, hidden; the next
-    one that writes into the folder removes it.
+    one that writes into the folder removes it, on Windows when it is a day old.
 
     Raises NgptError when the file cannot be written; of several writers of one new file all but the first.
     """
@@ -50,7 +57,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         _sweep(path.parent.absolute())
         temporary, handle = _temporary(path)
         yield temporary
-        with open(temporary, "rb") as file:
+        with open(temporary, "r+b") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
         # mkstemp makes private files; give the result the permissions that open() would have given it.
         umask = os.umask(0)
@@ -68,10 +75,13 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
             os.close(handle)
 
 
-def _temporary(path: Path) -> tuple[Path, int]:
-    """A new file beside ``path``, and a handle whose lock tells other processes that its writer lives."""
+def _temporary(path: Path) -> tuple[Path, int | None]:
+    """A new file beside ``path``, and a handle whose lock tells other processes that its writer lives, if it can."""
     while True:
         handle, name = tempfile.mkstemp(prefix=_PREFIX, suffix=path.suffix, dir=path.parent)
+        if fcntl is None:
+            os.close(handle)
+            return Path(name), None
         with suppress(OSError):  # a file system without locks, on which nobody sweeps either
             fcntl.flock(handle, fcntl.LOCK_EX)
         if os.path.exists(name):
@@ -86,12 +96,21 @@ def _sweep(folder: Path) -> None:
     with suppress(OSError):  # what cannot be listed cannot be swept
         for name in filter(_LEFTOVER.fullmatch, os.listdir(folder)):
             with suppress(OSError):
-                handle = os.open(folder / name, os.O_RDWR | os.O_NOFOLLOW)
-                try:
-                    fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                    os.unlink(folder / name)
-                finally:
-                    os.close(handle)
+                _remove_abandoned(folder / name)
+
+
+def _remove_abandoned(path: Path) -> None:
+    """Removes a temporary file; raises OSError if its writer lives."""
+    if fcntl is None:
+        if time.time() - path.lstat().st_mtime > _FORGOTTEN:
+            path.unlink()
+        return
+    handle = os.open(path, os.O_RDWR | os.O_NOFOLLOW)
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        path.unlink()
+    finally:
+        os.close(handle)
 
 
 def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
@@ -109,12 +128,12 @@ def _publish(temporary: Path, path: Path, overwrite: bool) -> None:
 
 def _sync_folder(folder: Path) -> None:
     """Has the new name outlive a power cut."""
-    handle = os.open(folder, os.O_RDONLY)
-    try:
-        with suppress(OSError):  # file systems that cannot
+    with suppress(OSError):  # file systems that cannot, and Windows, which opens no folders
+        handle = os.open(folder, os.O_RDONLY)
+        try:
             os.fsync(handle)
-    finally:
-        os.close(handle)
+        finally:
+            os.close(handle)
 
 
 @contextmanager
@@ -124,36 +143,23 @@ def exclusive(folder: str | os.PathLike, wait: bool = False) -> Iterator[None]:
     Raises NgptError if one is at work there, or with ``wait`` waits until it is done. The lock goes with the process,
     however it ends, though processes that it forked live on.
     """
-    try:
-        handle = os.open(Path(folder) / ".lock", os.O_WRONLY | os.O_CREAT, 0o666)
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be written: {error.strerror or error}; name another folder") from error
-    _locks.add(handle)
-    try:
-        _lock(handle, folder, wait)
-        yield
-    finally:
-        _locks.discard(handle)
-        os.close(handle)
+    with warnings.catch_warnings():
+        # Where the system locks no files, one that names its process stands for a lock; those who use it need not know.
+        warnings.simplefilter("ignore")
+        # Imported only here: denoising locks no folder.
+        from filelock import FileLock, Timeout
 
-
-def _lock(handle: int, folder: str | os.PathLike, wait: bool) -> None:
+    lock = FileLock(Path(folder) / ".lock", blocking=wait)
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
-    except BlockingIOError as error:
+        os.stat(folder)  # which FileLock would make if it is not there
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            lock.acquire()
+    except Timeout as error:
         raise NgptError(f"{folder}: another process is writing there; wait for it, or name another folder") from error
     except OSError as error:
-        raise NgptError(f"{folder}: cannot be locked: {error.strerror or error}; name a folder elsewhere") from error
-
-
-# A forked process, such as a worker of a data loader, holds its parent's locks as long as it has their handles.
-_locks: set[int] = set()
-
-
-def _let_go() -> None:
-    for handle in _locks:
-        os.close(handle)
-    _locks.clear()
-
-
-os.register_at_fork(after_in_child=_let_go)
+        raise NgptError(f"{folder}: cannot be written: {error.strerror or error}; name another folder") from error
+    try:
+        yield
+    finally:
+        lock.release()

@@ -1,6 +1,5 @@
 """Where and with what numbers were made, as results record it."""
 
-import os
 import platform
 import subprocess
 from importlib.metadata import PackageNotFoundError
@@ -8,6 +7,7 @@ from importlib.metadata import version as installed
 from pathlib import Path
 from typing import Any
 
+from ngpt.system.limits import processors
 from ngpt.version import __version__
 
 
@@ -30,14 +30,14 @@ def metadata(*packages: str) -> dict[str, Any]:
         "python": platform.python_version(),
         "machine": platform.machine(),
         "cpu": _cpu(),
-        "threads": len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count(),
+        "threads": processors(),
         "commit": _commit(),
     }
 
 
 def _cpu() -> str:
     try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
         return next(line.partition(":")[2].strip() for line in lines if line.startswith("model name"))
     except (OSError, StopIteration):
         return platform.processor()

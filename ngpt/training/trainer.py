@@ -258,7 +258,7 @@ class Trainer:
         values = {"step": self.step} | {k: v for k, v in values.items() if not math.isnan(v)}
         path = self.out / "log.jsonl"
         try:
-            with open(path, "a") as file:
+            with open(path, "a", encoding="utf-8") as file:
                 file.write(json.dumps(values) + "\n")
         except OSError as error:
             raise NgptError(
@@ -296,7 +296,7 @@ def _keep_lines(path: Path, step: int) -> None:
     if not path.is_file():
         return
     lines = []
-    for line in path.read_text().splitlines():
+    for line in path.read_text(encoding="utf-8").splitlines():
         try:
             if json.loads(line)["step"] <= step:
                 lines.append(line)
