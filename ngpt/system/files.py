@@ -144,7 +144,7 @@ def exclusive(folder: str | os.PathLike, wait: bool = False) -> Iterator[None]:
     however it ends, though processes that it forked live on.
     """
     with warnings.catch_warnings():
-        # Where the system locks no files, one that names its process stands for a lock; those who use it need not know.
+        # It warns where the system locks no files, and a file that names its process has to stand for a lock.
         warnings.simplefilter("ignore")
         # Imported only here: denoising locks no folder.
         from filelock import FileLock, Timeout
