@@ -58,6 +58,12 @@ CONFIGS = {
     "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
     "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
     "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),
+    "of any image": ModelConfig(
+        *("dense", (4, 6), (1, 1), ("primal", "albedo", "normal")),
+        start=("primal",),
+        optional=("albedo", "normal"),
+        emission=True,
+    ),
     "primal alone": ModelConfig("plain", (4, 4, 4, 4, 4), (), ("primal",)),
 }
 
@@ -155,6 +161,37 @@ def test_a_combiner_is_the_same_by_either_runtime(tmp_path, weights, other_denoi
     without = {name: layer for name, layer in layers.items() if name != "albedo"}
     with pytest.raises(NgptError, match="albedo"):
         reconstruct(stack_of(without), "ngpt", weights=str(tmp_path / "p.onnx"))
+
+
+@pytest.fixture(params=["onnx", "safetensors"])
+def of_any_image(request, tmp_path, weights):
+    """A function of layers (1, C, H, W): the image by a network that needs colour alone, in either runtime."""
+    path = weights / "of any image.safetensors"
+    if request.param == "onnx":
+        path, twin = tmp_path / "c.onnx", path
+        path.write_bytes(network_model(twin, "c").SerializeToString())
+    return lambda layers: reconstruct(stack_of(layers), "ngpt", weights=str(path)).image
+
+
+def test_layers_that_a_network_can_do_without_are_zeros(of_any_image, weights):
+    layers = noisy(19, 26)
+    names = ("albedo", "normal")
+    bare = {"primal": layers["primal"]}
+    zeros = bare | {name: np.zeros_like(layers[name]) for name in names}
+    assert np.array_equal(of_any_image(bare), of_any_image(zeros))
+    assert not np.allclose(of_any_image(bare), of_any_image(layers), rtol=0.01), "they are not used"
+    assert_close(of_any_image(bare), in_torch(bare, weights / "of any image.safetensors")[0].transpose(1, 2, 0))
+
+
+def test_a_lamp_comes_through_whether_it_is_kept_aside_or_not(of_any_image, weights):
+    layers = noisy(19, 26)
+    lamp = np.zeros_like(layers["primal"])
+    lamp[..., 4:9, 5:12] = 50
+    whole = {"primal": layers["primal"] + lamp, "albedo": layers["albedo"]}
+    image = of_any_image(whole)
+    assert image[4:9, 5:12].mean() > 10 * image[12:].mean()
+    assert_close(of_any_image(whole | {"direct": lamp}), image)
+    assert_close(image, in_torch(whole, weights / "of any image.safetensors")[0].transpose(1, 2, 0))
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
