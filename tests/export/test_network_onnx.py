@@ -22,6 +22,7 @@ from ngpt.export.network import network_model, overlap, statistics_model
 from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import reconstruct
 from ngpt.network import inputs
+from ngpt.network.describe import describe
 from ngpt.network.exposure import statistics
 from ngpt.network.features import SOURCES, exposure
 from ngpt.network.model import ModelConfig, Reconstructor
@@ -181,6 +182,14 @@ def test_layers_that_a_network_can_do_without_are_zeros(of_any_image, weights):
     assert np.array_equal(of_any_image(bare), of_any_image(zeros))
     assert not np.allclose(of_any_image(bare), of_any_image(layers), rtol=0.01), "they are not used"
     assert_close(of_any_image(bare), in_torch(bare, weights / "of any image.safetensors")[0].transpose(1, 2, 0))
+
+
+def test_info_does_not_ask_for_what_a_network_can_do_without(tmp_path, weights):
+    path = weights / "of any image.safetensors"
+    (tmp_path / "c.onnx").write_bytes(network_model(path, "c").SerializeToString())
+    for file in (path, tmp_path / "c.onnx"):
+        assert describe(file)["needs layers"] == ["primal"]
+        assert describe(file)["inputs"] == ["primal", "albedo", "normal"]
 
 
 def test_a_lamp_comes_through_whether_it_is_kept_aside_or_not(of_any_image, weights):
