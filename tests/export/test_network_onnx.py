@@ -210,7 +210,7 @@ def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal"])
+@pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal", "ngpt-colour"])
 def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
     layers = noisy(37, 53)
     layers |= {other: k * layers["primal"] for other, k in (("denoised", 0.98), ("denoised_base", 0.99))}
