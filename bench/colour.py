@@ -37,20 +37,18 @@ def main() -> None:
     args.cache.mkdir(parents=True, exist_ok=True)
     references = {scene: cached(scene, args.reference_spp, "primal", 1, args)["primal"] for scene in SCENES}
     stacks = {(scene, spp): cached(scene, spp, "primal", 0, args) for scene in SCENES for spp in SPP}
-    print(f"| layers | method | {' | '.join(f'{spp} spp' for spp in SPP)} | seconds |\n|---|---|{'--:|' * 4}")
+    print(f"| layers | method | {' | '.join(f'{spp} spp' for spp in SPP)} |\n|---|---|{'--:|' * 3}")
     for title, names in LAYERS.items():
         for method in ("primal", "ngpt-colour", "nfor", "oidn"):
             if METHODS[method].missing() or not set(METHODS[method].needs) <= set(names):
                 continue
-            errors, seconds = {}, []
+            errors = {}
             for (scene, spp), stack in stacks.items():
                 part = GradientStack({name: stack[name] for name in names if name in stack})
-                result = reconstruct(part, method)
-                errors[scene, spp] = relmse_trimmed(result.image, references[scene])
-                seconds.append(result.seconds)
+                errors[scene, spp] = relmse_trimmed(reconstruct(part, method).image, references[scene])
             means = [np.exp(np.mean([np.log(errors[scene, spp]) for scene in SCENES])) for spp in SPP]
             cells = " | ".join(f"{mean:.4f}" for mean in means)
-            print(f"| {title} | `{method}` | {cells} | {np.median(seconds):.2f} |", flush=True)
+            print(f"| {title} | `{method}` | {cells} |", flush=True)
 
 
 if __name__ == "__main__":
