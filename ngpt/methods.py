@@ -85,9 +85,15 @@ def _classical(name: str, summary: str) -> Method:
     return Method(summary, entry.needs, entry.solve, entry.options)
 
 
-def _network(name: str, summary: str, needs: tuple[str, ...], also_missing: Callable[[], str] = lambda: "") -> Method:
+def _network(
+    name: str,
+    summary: str,
+    needs: tuple[str, ...],
+    also_missing: Callable[[], str] = lambda: "",
+    uses: tuple[str, ...] = (),
+) -> Method:
     network = Shipped(name, also_missing)
-    return Method(summary, needs, network.run, OPTIONS, network.missing)
+    return Method(summary, needs, network.run, OPTIONS, network.missing, uses)
 
 
 _GRADIENTS = ("primal", "dx", "dy")
@@ -113,6 +119,12 @@ METHODS = {
         "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
         ("primal", *_FEATURES, "primal_var"),
         oidn.missing,
+    ),
+    "ngpt-colour": _network(
+        "ngpt-colour",
+        "small neural network for any image: colour alone, or with albedo and normal",
+        ("primal",),
+        uses=("albedo", "normal"),
     ),
     "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES)),
     # Those below see no gradients.
@@ -142,10 +154,10 @@ def choose(stack: GradientStack) -> str:
     docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.5, 6.0, 2.9, 1.7; ngpt-fast 19.1, 8.1, 3.7, 2.0; wcv 42.8,
     14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5. Beyond, the networks go over to wcv. ngpt-primal, for stacks without
     gradients, has 12.0, 6.2, 3.6, 2.2 at the same time. OIDN, which denoises any image, has 12.9, 6.3, 3.5, 2.1; nfor,
-    which needs features and a variance and no package, 29.8, 11.7, 4.8, 2.2. The identity is left for a stack of which
-    none of them can make anything.
+    which needs features and a variance and no package, 29.8, 11.7, 4.8, 2.2. ngpt-colour, which needs neither, leaves
+    more (docs/ngpt-colour.md). The identity is left for a machine without ONNX Runtime.
     """
-    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal", "oidn", "nfor"):
+    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal", "oidn", "nfor", "ngpt-colour"):
         entry = METHODS[name]
         if all(layer in stack for layer in entry.needs) and not entry.missing():
             return name

@@ -6,7 +6,6 @@ from full_stack import full_layers, full_stack
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.methods import METHODS
 
 
 @pytest.fixture
@@ -31,7 +30,7 @@ def test_a_noisy_image_alone(arrays):
     identity = ngpt.Denoiser((26, 18), method="primal")
     assert np.array_equal(identity(arrays["noisy"]), arrays["noisy"])
     denoised = ngpt.Denoiser((26, 18))(arrays["noisy"])
-    assert np.array_equal(denoised, arrays["noisy"]) == bool(METHODS["oidn"].missing())
+    assert denoised.shape == arrays["noisy"].shape and not np.array_equal(denoised, arrays["noisy"])
 
 
 def test_methods_and_their_options(arrays):

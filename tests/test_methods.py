@@ -26,9 +26,9 @@ FEATURES = ("albedo", "normal", "depth")
 @pytest.mark.parametrize(
     ("layers", "with_oidn", "without"),
     [
-        ((), "oidn", "primal"),
-        (("albedo",), "oidn", "primal"),
-        (("albedo", "normal"), "oidn", "primal"),
+        ((), "oidn", "ngpt-colour"),
+        (("albedo",), "oidn", "ngpt-colour"),
+        (("albedo", "normal"), "oidn", "ngpt-colour"),
         ((*FEATURES, "primal_var"), "ngpt-primal", "nfor"),
         (("dx", "dy"), "l1", "l1"),
         (("dx", "dy", "primal_var", "dx_var", "dy_var"), "wcv", "wcv"),
@@ -36,7 +36,7 @@ FEATURES = ("albedo", "normal", "depth")
     ],
 )
 def test_auto_takes_the_best_that_layers_and_machine_allow(monkeypatch, layers, with_oidn, without):
-    """The input comes back only where there is nothing to denoise it with."""
+    """The input comes back only where it is asked for."""
     stack = full_stack(18, 26)
     stack = GradientStack({name: stack[name] for name in ("primal", *layers)})
     for answer, expected in (("", with_oidn), ("OIDN is not installed", without)):

@@ -59,6 +59,8 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
         "statistics": ", ".join(STATISTICS),
         "precision": precision,
         "base": model.config.base,
+        "optional": ", ".join(model.config.optional),
+        "emission": str(model.config.emission).lower(),
     }
 
 

@@ -6,6 +6,9 @@
     base                                       a classical reconstruction of ``ngpt.classical.bases``
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
+Radiance is without emission seen directly, but for networks that see it, which read images as other renderers write
+them. Features that a network may do without are zeros where the stack lacks them.
+
 OIDN sees no gradients, and removes what it takes for noise; control variates keep every gradient, and their noise.
 OIDN's image of the control variates has less noise to remove, so that it errs elsewhere than its image of the primal. A
 network that sees all three, and the gradients, tells in each pixel whom to believe [after Back et al. 2020, "Deep
@@ -32,13 +35,18 @@ DENOISED = ("denoised", "denoised_base")
 # The inputs that are no layers of a stack, but made of them.
 MADE = ("base", *DENOISED)
 
+# The inputs that a network may do without, and their channels; what a network may read that sees emission, too.
+OPTIONAL = {"albedo": 3, "normal": 3, "depth": 1}
+WITH_EMISSION = ("primal", *OPTIONAL)
 
-def needs(names: Collection[str], base: str) -> tuple[str, ...]:
+
+def needs(names: Collection[str], base: str, optional: Collection[str] = ()) -> tuple[str, ...]:
     """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
 
-    Names that no stack has come last, and so does "base" where an input is made of it and there is none.
+    Those in ``optional`` are left out, but for what OIDN reads. Names that no stack has come last, and so does "base"
+    where an input is made of it and there is none.
     """
-    wanted = {"primal"} | {_layer(name) for name in names if name not in MADE}
+    wanted = {"primal"} | {_layer(name) for name in names if name not in (*MADE, *optional)}
     if set(DENOISED) & set(names):
         wanted |= {"albedo", "normal"}
     if base:
@@ -48,22 +56,39 @@ def needs(names: Collection[str], base: str) -> tuple[str, ...]:
     return tuple(name for name in LAYERS if name in wanted) + tuple(sorted(wanted - set(LAYERS)))
 
 
-def gather(data: Repaired, names: Collection[str], base: str, reader: str = "the network's settings") -> dict:
+def gather(
+    data: Repaired,
+    names: Collection[str],
+    base: str,
+    reader: str = "the network's settings",
+    optional: Collection[str] = (),
+    emission: bool = False,
+) -> dict:
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
-    Radiance is without direct emission. Raises NgptError where the stack lacks layers they are made of (``reader`` is
-    what the message says needs them), and where OIDN is needed and not installed.
+    ``reader``    what the message says needs the layers that lack
+    ``optional``  those of ``OPTIONAL`` that are zeros where the stack lacks them
+    ``emission``  whether the primal includes emission seen directly; its results then are for ``without_emission``
+
+    Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
     """
-    held = {"primal": data.image, **data.features, **data.known_variances()}
+    primal = data.image + data.direct if emission else data.image
+    held = {name: np.zeros((*primal.shape[:2], OPTIONAL[name]), np.float32) for name in optional}
+    held |= {"primal": primal, **data.features, **data.known_variances()}
     if data.dx is not None:
         held |= {"dx": data.dx, "dy": data.dy}
-    if lacking := [name for name in needs(names, base) if name not in held]:
+    if lacking := [name for name in needs(names, base, optional) if name not in held]:
         raise NgptError(f"{reader} need layers {', '.join(lacking)}, which the stack lacks")
     made = {name: _standard_error(held[_layer(name)]) for name in names if name.endswith("_se")}
     if {"base", "denoised_base"} & set(names):
         made["base"] = base_image(data, base)
     arrays = held | made | denoised(data, made.get("base"), names)
     return {name: arrays[name] for name in names}
+
+
+def without_emission(image: np.ndarray, data: Repaired, emission: bool) -> np.ndarray:
+    """A network's result (H, W, 3) without direct emission; ``emission`` as of ``gather``."""
+    return image - data.direct if emission else image
 
 
 def base_image(data: Repaired, base: str) -> np.ndarray:

@@ -43,6 +43,8 @@ class ModelConfig:
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
                   ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel
+    ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
+    ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
     """
 
     network: str
@@ -53,19 +55,32 @@ class ModelConfig:
     start: tuple[str, ...] = ()
     quiet: float = 0.0
     kernel: int = 0
+    optional: tuple[str, ...] = ()
+    emission: bool = False
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise NgptError(f"network '{self.network}': choose one of: {', '.join(NETWORKS)}")
         if self.base and not self.start:
             object.__setattr__(self, "start", ("base",))
-        for name in ("channels", "units", "inputs", "start"):
+        for name in ("channels", "units", "inputs", "start", "optional"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in self.inputs:
             if name not in features.CHANNELS:
                 raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
         if "primal" not in self.inputs or len(set(self.inputs)) < len(self.inputs):
             raise NgptError(f"inputs {', '.join(self.inputs)}: each once, and 'primal' among them")
+        if not set(self.optional) <= set(inputs.OPTIONAL) & set(self.inputs):
+            raise NgptError(
+                f"optional {', '.join(self.optional)}: must be inputs, and among {', '.join(inputs.OPTIONAL)}"
+            )
+        if type(self.emission) is not bool:
+            raise NgptError(f"emission = {self.emission!r}: must be true or false")
+        if self.emission and not set(self.inputs) <= set(inputs.WITH_EMISSION):
+            raise NgptError(
+                f"emission with inputs {', '.join(self.inputs)}: only {', '.join(inputs.WITH_EMISSION)} go with it; "
+                "the others are without emission"
+            )
         levels = len(self.channels)
         if not 1 <= levels <= MAX_LEVELS or not _whole(self.channels, MAX_CHANNELS):
             raise NgptError(
@@ -112,7 +127,7 @@ class ModelConfig:
     @property
     def needs(self) -> tuple[str, ...]:
         """The layers a stack must hold, by the names of the contract."""
-        return inputs.needs(self.layers, self.base)
+        return inputs.needs(self.layers, self.base, self.optional)
 
     def to_dict(self) -> dict[str, Any]:
         """The fields as TOML and JSON have them."""
@@ -124,7 +139,7 @@ def _whole(numbers: tuple[Any, ...], most: int) -> bool:
 
 
 class Reconstructor(nn.Module):
-    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear, without direct emission.
+    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear; see ``ModelConfig.emission``.
 
         exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 

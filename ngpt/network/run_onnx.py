@@ -16,6 +16,7 @@ import numpy as np
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network.exposure import statistics
+from ngpt.network.inputs import OPTIONAL, WITH_EMISSION
 from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers.
@@ -61,6 +62,9 @@ class Network:
             self.base = metadata["ngpt.base"]
             self.overlap = int(metadata["ngpt.overlap with base" if self.base else "ngpt.overlap"])
             self.bytes = int(metadata["ngpt.bytes per pixel"])
+            # Files of earlier versions have neither.
+            self.optional = tuple(filter(None, metadata.get("ngpt.optional", "").split(", ")))
+            self.emission = metadata.get("ngpt.emission") == "true"
         except (KeyError, ValueError) as error:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
@@ -74,6 +78,10 @@ class Network:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
         if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
+        if not set(self.optional) <= set(OPTIONAL) & set(self.inputs):
+            raise NgptError(f"{self.path}: its optional inputs are {', '.join(self.optional)}: export it anew")
+        if self.emission and (self.base or not set(self.inputs) <= set(WITH_EMISSION)):
+            raise NgptError(f"{self.path}: reads emission and {', '.join(self.inputs)}: export it anew")
         own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}
         # Those that a host may leave out have a value in the graph.
@@ -94,9 +102,9 @@ class Network:
         progress: Progress = lambda done, total: None,
         stop: Callable[[], bool] = lambda: False,
     ) -> np.ndarray:
-        """The image (H, W, 3) float32, scene-linear, without direct emission.
+        """The image (H, W, 3) float32, scene-linear, with direct emission if ``emission``, and without otherwise.
 
-        ``layers``    (H, W, C) float32, all of ``inputs``; radiance without direct emission
+        ``layers``    (H, W, C) float32, all of ``inputs``; radiance with or without direct emission as the image
         ``base``      (H, W, 3) the reconstruction the network starts from, of networks that have one
         ``memory``    MiB that tiles may take; smaller ones take longer, and give the same image to 1e-5. Where the
                       machine has less to give, they shrink by themselves

@@ -28,12 +28,13 @@ def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE
     """
     model = _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
     layers = {name: layer[None] for name, layer in layers_of(data, model.config, f"weights {path}").items()}
-    return reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
+    image = reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
+    return inputs.without_emission(image, data, model.config.emission)
 
 
 def layers_of(data: Repaired, config: ModelConfig, reader: str = "the network's settings") -> dict[str, Tensor]:
     """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); see ``inputs.gather``."""
-    arrays = inputs.gather(data, config.layers, config.base, reader)
+    arrays = inputs.gather(data, config.layers, config.base, reader, config.optional, config.emission)
     return {name: torch.from_numpy(np.array(array.transpose(2, 0, 1), order="C")) for name, array in arrays.items()}
 
 

@@ -169,7 +169,7 @@ class Examples(TorchDataset):
         crop = self.crops[which]
         stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
         layers = layers_of(repair(stack), self.config)
-        target = (crop.reference - crop.reference_direct).transpose(2, 0, 1)
+        target = target_of(crop, self.config).transpose(2, 0, 1)
         layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
         size = sum(layer.numel() * layer.element_size() for layer in layers.values())
         if size <= self._free:
@@ -191,6 +191,11 @@ class Examples(TorchDataset):
             )
         y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
         return {name: layer[..., y : y + self.size, x : x + self.size] for name, layer in layers.items()}
+
+
+def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
+    """What a network of that configuration is to make of a crop's stacks, (H, W, 3)."""
+    return crop.reference if config.emission else crop.reference - crop.reference_direct
 
 
 def _scaled(layers: Layers) -> Layers:

@@ -16,6 +16,7 @@ from ngpt.repair import repair
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.files import atomic_output
+from ngpt.training.examples import target_of
 
 # Rows of the picture of a validation.
 _PICTURES = 6
@@ -23,7 +24,7 @@ _PICTURES = 6
 
 @dataclass(frozen=True)
 class Scores:
-    """Geometric means, over the views, of the trimmed relMSE without direct emission.
+    """Geometric means, over the views, of the trimmed relMSE; with direct emission if the network reads it.
 
     ``primal``, ``base``  of the input and of what the network starts from (NaN without)
     ``network``           of its result
@@ -53,17 +54,18 @@ def validate(
     shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
     for index, (crop, k) in enumerate(views):
         data = repair(crop.stack(k))
-        reference = crop.reference - crop.reference_direct
+        reference = target_of(crop, model.config)
         layers = {name: layer[None].to(device) for name, layer in layers_of(data, model.config).items()}
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
             image = model(layers)[0].permute(1, 2, 0).float().cpu().numpy()
-        primal.append(relmse_trimmed(data.image, reference))
+        given = layers["primal"][0].permute(1, 2, 0).cpu().numpy()
+        primal.append(relmse_trimmed(given, reference))
         network.append(relmse_trimmed(image, reference))
         if model.config.base:
             base.append(relmse_trimmed(base_image(data, model.config.base), reference))
         if picture and index in shown:
             stops = auto_exposure(reference)
-            rows.append(np.hstack([to_srgb8(i, stops) for i in (data.image, image, reference)]))
+            rows.append(np.hstack([to_srgb8(i, stops) for i in (given, image, reference)]))
     if picture and rows:
         # Folders of stacks may hold views of different sizes; those that do not fit are left out.
         rows = [row for row in rows if row.shape == rows[0].shape]

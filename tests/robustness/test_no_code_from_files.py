@@ -199,12 +199,17 @@ def test_networks_that_refer_to_other_files_are_refused(tmp_path, location):
         ("ngpt.base", "../x", r"base '\.\./x'"),
         ("ngpt.inputs", "primal, secret", "its metadata tell of base, primal, secret, statistics"),
         ("ngpt.alignment", "many", "lacks the metadata"),
+        ("ngpt.optional", "primal", "its optional inputs are primal"),
+        ("ngpt.emission", "true", "reads emission and primal, dx"),
     ],
 )
 def test_networks_whose_metadata_lie_are_refused(tmp_path, key, value, message):
     onnx = pytest.importorskip("onnx")
     model = onnx.load_from_string((WEIGHTS / "ngpt-fast.onnx").read_bytes())
-    next(entry for entry in model.metadata_props if entry.key == key).value = value
+    entry = next((entry for entry in model.metadata_props if entry.key == key), None) or model.metadata_props.add(
+        key=key
+    )
+    entry.value = value
     path = tmp_path / "a.onnx"
     path.write_bytes(model.SerializeToString())
     with pytest.raises(NgptError, match=rf"a\.onnx: .*{message}"):
