@@ -140,7 +140,7 @@ def test_the_denoiser_takes_any_arrays(layers, method, announced):
     noisy, normals = layers.pop("primal"), layers.pop("normal", None)
     height, width = noisy.shape[:2]
     try:
-        denoiser = ngpt.Denoiser((width, height), announced, announced, method)
+        denoiser = ngpt.Denoiser((width, height), announced, announced, method=method)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             result = denoiser(noisy, normals=normals, to_sensor=np.eye(4), **layers)
@@ -186,8 +186,8 @@ def test_a_converged_image_of_any_range_keeps_its_range(method):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda a: ngpt.Denoiser("large"), "size is 'large'; it must be"),
-        (lambda a: ngpt.Denoiser((1, 2, 3)), r"size is \(1, 2, 3\)"),
+        (lambda a: ngpt.Denoiser("large"), "input_size is 'large'; it must be"),
+        (lambda a: ngpt.Denoiser((1, 2, 3)), r"input_size is \(1, 2, 3\)"),
         (lambda a: ngpt.Denoiser((4, 3))(a.astype(complex)), "layer 'primal' is of type complex128"),
         (lambda a: ngpt.Denoiser((4, 3))(a.astype(object)), "layer 'primal' is of type object"),
         (lambda a: ngpt.Denoiser((4, 3))(a * 1e39), "12 values|36 values that float32 cannot hold"),
