@@ -5,8 +5,6 @@ denoiser = ngpt.Denoiser(size, albedo=True, normals=True)        # or called as 
 clean = denoiser(noisy, albedo, normals, sensor.world_transform().inverse())
 """
 
-from __future__ import annotations
-
 import inspect
 import os
 from collections.abc import Iterable, Mapping
