@@ -165,6 +165,25 @@ def test_bitmaps_of_many_channels(renderer, arrays, bitmap):
         denoiser(bitmap, "albedo", "nn")
 
 
+def test_normals_of_mitsuba_become_those_of_a_stack(renderer, monkeypatch):
+    """The code of its documentation on a scene, and the normals that our own renderer gives for it."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+    from ngpt.methods import METHODS, Method
+
+    mi = renderer
+    monkeypatch.setitem(METHODS, "normal", Method("", ("primal",), lambda data: data.features["normal"], {}))
+    scene = load_scene("diffuse", (24, 16))
+    aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normals:sh_normal", "image": {"type": "path"}})
+    sensor = scene.sensors()[0]
+    mi.render(scene, integrator=aov, spp=16)
+    to_sensor = sensor.world_transform().inverse()
+    denoiser = ngpt.Denoiser(sensor.film().crop_size(), albedo=True, normals=True, method="normal")
+    seen = denoiser(sensor.film().bitmap(), albedo_ch="albedo", normals_ch="normals", to_sensor=to_sensor)
+    error = np.abs(np.array(seen)[..., :3] - render_stack(scene, 16, 0)["normal"]).mean(axis=(0, 1))
+    assert (error < 0.05).all()
+
+
 def test_plain_bitmaps(renderer, arrays):
     image = renderer.Bitmap(arrays["noisy"])
     result = ngpt.Denoiser((26, 18))(image)
