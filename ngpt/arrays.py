@@ -46,18 +46,26 @@ def like(image: np.ndarray, example: Any) -> Any:
     A bitmap of many channels gives one of as many as the image has: RGB or RGBA. What is of no library gives NumPy's.
     """
     if isinstance(example, np.ndarray):
-        return image.astype(example.dtype) if example.dtype.kind == "f" else image
+        return _of_type(image, example.dtype) if example.dtype.kind == "f" else image
     if is_bitmap(example):
-        kinds, pixels = type(example.pixel_format()), np.asarray(example).dtype
+        kinds = type(example.pixel_format())
         kind = kinds.RGB if image.shape[2] == 3 else kinds.RGBA
-        return type(example)(np.ascontiguousarray(image, pixels), pixel_format=kind)
+        pixels = _of_type(image, np.asarray(example).dtype)
+        return type(example)(np.ascontiguousarray(pixels), pixel_format=kind)
     if hasattr(example, "new_tensor"):  # PyTorch
-        return example.new_tensor(image)
+        half = str(example.dtype) == "torch.float16"
+        return example.new_tensor(_of_type(image, np.dtype(np.float16)) if half else image)
     if hasattr(example, "__array_namespace__"):
         return example.__array_namespace__().asarray(image, dtype=example.dtype)
     if type(example).__module__.startswith("drjit"):
         return type(example)(np.ascontiguousarray(image, np.float32))
     return image
+
+
+def _of_type(image: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Half floats end at 65504: what a method adds beyond that stays finite."""
+    limits = np.finfo(dtype)
+    return (np.clip(image, limits.min, limits.max) if dtype.itemsize == 2 else image).astype(dtype)
 
 
 def layer(

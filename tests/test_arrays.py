@@ -58,6 +58,17 @@ def test_torch(layers, features, dtype):
     assert torch.equal(result, torch.tensor(expected).to(image.dtype))
 
 
+def test_halves_stay_finite(layers, monkeypatch):
+    """Where a method goes beyond what they hold."""
+    from ngpt.methods import Method
+
+    monkeypatch.setitem(METHODS, "more", Method("", ("primal",), lambda data: 4 * data.image, {}))
+    image = np.full((2, 3, 3), 60000, np.float16)
+    assert (ngpt.denoise(image, "more") == 65504).all()
+    torch = pytest.importorskip("torch")
+    assert (ngpt.denoise(torch.tensor(image), "more") == 65504).all()
+
+
 def test_torch_on_a_graphics_card(layers, features):
     torch = pytest.importorskip("torch")
     if not torch.cuda.is_available():

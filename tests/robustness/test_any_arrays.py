@@ -150,6 +150,24 @@ def test_the_denoiser_takes_any_arrays(layers, method, announced):
         assert result.shape == noisy.shape and np.isfinite(result).all()
 
 
+@QUICK
+@given(layers=stacks(), method=st.sampled_from(["auto", "l2", "wcv"]))
+def test_denoise_takes_any_arrays(layers, method):
+    image = layers.pop("primal")
+    if "alpha" in layers and layers["alpha"].dtype == image.dtype:
+        image = np.concatenate([image, layers["alpha"]], axis=-1)
+    layers.pop("alpha", None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            result = ngpt.denoise(image, method, **layers)
+    except NgptError as error:
+        named(error)
+    else:
+        assert result.shape == image.shape and np.isfinite(result[..., :3]).all()
+        assert result.dtype == image.dtype and np.array_equal(result[..., 3:], image[..., 3:], equal_nan=True)
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 def test_every_method_takes_many_arrays():
