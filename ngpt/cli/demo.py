@@ -13,7 +13,8 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, compare
 from ngpt.methods import METHODS, reconstruct
-from ngpt.report.page import Entry, Scene, median, write_report
+from ngpt.report.content import Entry, Scene, median
+from ngpt.report.page import oversize, write_report
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output

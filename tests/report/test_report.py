@@ -15,7 +15,8 @@ from errormap import error_map
 
 from ngpt.errors import NgptError
 from ngpt.report import display, pixelcodec
-from ngpt.report.page import Entry, Overview, Scene, write_report
+from ngpt.report.content import Entry, Overview, Scene
+from ngpt.report.page import write_report
 
 FACTS = {"command": "ngpt demo --spp 16", "footer": {"ngpt": "0.1.0", "device": "CPU"}}
 HOSTILE = """<img src=x onerror="document.title='owned'"> & '</script>' {{PAGE}}"""
