@@ -87,7 +87,7 @@ def oversize(path: str | os.PathLike) -> str:
     if size <= PAGE_LIMIT:
         return ""
     return (
-        f"{path}: {size / 1e6:.0f} MB, more than the {PAGE_LIMIT / 1e6:.0f} MB that mail and browsers take without "
+        f"{path}: {size / 1e6:.3g} MB, more than the {PAGE_LIMIT / 1e6:.3g} MB that mail and browsers take without "
         "complaint, though its pictures are stored as coarsely as possible; show fewer pictures, or smaller ones"
     )
 
