@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
+from ngpt.report.notebook import stack_html
 
 
 @dataclass(eq=False)
@@ -64,6 +65,13 @@ class GradientStack:
 
     def __contains__(self, name: object) -> bool:
         return name in self.layers
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a small picture of the primal and a table of all layers."""
+        title = f"GradientStack {self.path}, {self.width}x{self.height}"
+        if "ngpt:spp" in self.attributes:
+            title += f", {self.attributes['ngpt:spp']} spp"
+        return stack_html(title, {name: self.layers[name] for name in self.names})
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Returns layer ``name``; raises NgptError if the stack does not hold it."""
