@@ -48,8 +48,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
         metrics, lacks = available(height, width)
         for lack in lacks:
             console.say(lack)
+        with console.progress("errors", "images") as progress:
+            progress(0, len(entries))
+            for done, (entry, path) in enumerate(zip(entries, args.images, strict=True), 1):
+                add_errors(entry, metrics, reference, path, args.ref)
+                progress(done, len(entries))
         for entry, path in zip(entries, args.images, strict=True):
-            add_errors(entry, metrics, reference, path, args.ref, console)
+            if abs(stops := exposure_mismatch(entry.image, reference)) >= _STOPS:
+                much = f"{abs(stops):.1f} stops {'brighter' if stops > 0 else 'darker'}"
+                console.say(f"{path}: {much} than {args.ref}; is it of the same scene and exposure?")
         formulas = {name: METRICS[name].formula for name in metrics}
         print_table(entries)
     rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
@@ -85,18 +92,12 @@ def check_size(path: str, image: np.ndarray | None, first: str, expected: np.nda
         raise NgptError(f"{path} is {width}x{height} but {first} is {columns}x{rows}; render or crop them to one size")
 
 
-def add_errors(
-    entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, console: Console
-) -> None:
-    """Measures a picture against the reference; says so where they can hardly show the same."""
+def add_errors(entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str) -> None:
+    """Measures a picture of file ``path`` against the reference of file ``other``."""
     try:
         entry.metrics, entry.maps = judge(metrics, entry.image, reference)
     except NgptError as error:
         raise NgptError(f"{path} and {other}: {error}") from error
-    stops = exposure_mismatch(entry.image, reference)
-    if abs(stops) >= _STOPS:
-        relation = "brighter" if stops > 0 else "darker"
-        console.say(f"{path}: {abs(stops):.1f} stops {relation} than {other}; is it of the same scene and exposure?")
 
 
 def print_table(entries: list[Entry]) -> None:
