@@ -2,7 +2,7 @@
 
 import math
 import statistics
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -19,7 +19,7 @@ class Entry:
     image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
     seconds: float | None = None  # reconstruction time
     # e.g. {'relMSE': 0.012}, or one value per seed, of which the table shows the median and the range
-    metrics: dict[str, float | Sequence[float]] = field(default_factory=dict)
+    metrics: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
     # Maps of the difference to the reference by name, (H, W) from 0, equal, to 1: 'FLIP', 'SSIM'
     maps: dict[str, np.ndarray] = field(default_factory=dict)
 
