@@ -27,6 +27,7 @@ def test_a_stack_shows_a_picture_and_the_range_of_its_layers():
     html = stack._repr_html_()
     assert rows(html) == {"primal": ["0", "0.25", "1", "1"], "dx": ["-0.5", "-0.5", "-0.5", "0"]}
     assert "GradientStack &lt;b&gt;.exr, 700x40, 16 spp" in html and "<b>" not in html
+    assert repr(stack) == "<GradientStack <b>.exr, 700x40, 16 spp: primal, dx>"
     picture = base64.b64decode(re.search(r'base64,([^"]*)"', html).group(1))
     width, height = (int.from_bytes(picture[i : i + 4], "big") for i in (16, 20))
     assert (width, height) == (140, 8) and len(html) < 60_000
