@@ -36,10 +36,13 @@ class Head(ABC):
     ``radius``   how far around a pixel it reads them beyond the size of the prediction
     ``reach``    how far around a pixel its result depends on images and prediction
     ``neutral``  whether a prediction of 0 is a sensible image, so that training begins there
+    ``normalise``  whether the features that the prediction is made of are divided by their root mean square, in each
+                 pixel: softmax holds nothing back, so that features and logits would grow until nothing is learnt
     """
 
     start: tuple[str, ...] = ()
     neutral: ClassVar[bool] = True
+    normalise: ClassVar[bool] = False
 
     @property
     def reads(self) -> tuple[str, ...]:
@@ -169,12 +172,15 @@ class Pyramid(Head):
         o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
 
     o_0 is the result. A pixel that a rare bright path has hit is trusted by nobody, at no resolution [in the manner of
-    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. The prediction of k_s
+    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust is over 1 + D to
+    begin with, so that such pixels do not rule what is learnt. The prediction of k_s
     and a_s is averaged over the pixels of the resolution.
 
     ``demodulate``  the same kernels average the image over the reflectance, too, which is multiplied again afterwards;
                     a weight in each pixel blends both. What of the image is texture is not averaged then
     """
+
+    normalise = True
 
     size: int = 5
     scales: int = 4
@@ -196,7 +202,7 @@ class Pyramid(Head):
 
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
         image = torch.cat([images[0], images[0] / images[1]], 1) if self.demodulate else images[0]
-        weight = torch.sigmoid(prediction[:, :1]) + LEAST_TRUST
+        weight = (torch.sigmoid(prediction[:, :1]) + LEAST_TRUST) / (1 + images[0].abs().mean(1, keepdim=True))
         rest, taps = prediction[:, 1:], self.size**2
         filtered, shares = [], []
         for scale in range(self.scales):
@@ -237,7 +243,8 @@ class Pyramid(Head):
             return op.AveragePool(x, kernel_shape=[2, 2], strides=[2, 2])
 
         image = op.Concat(images[0], images[0] / images[1], axis=1) if self.demodulate else images[0]
-        weight = op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST
+        bright = op.ReduceMean(abs(images[0]), [1], keepdims=1) + 1.0
+        weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / bright
         rest, taps, border = part(prediction, 1, self.outputs), self.size**2, [self.size // 2] * 4
         filtered, shares = [], []
         for scale in range(self.scales):

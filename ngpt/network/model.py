@@ -113,7 +113,7 @@ class ModelConfig:
         if type(self.scales) is not int or not 1 <= self.scales <= levels:
             raise NgptError(f"scales = {self.scales!r}: must be from 1 to the {levels} levels of the network")
         if self.scales > 1 and (len(self.start) != 1 or self.kernel < 3 or self.quiet):
-            raise NgptError(f"scales = {self.scales}: kernels of 3 pixels or more, of one image in start, without quiet")
+            raise NgptError(f"scales = {self.scales}: kernels of 3 pixels or more of one image, without quiet")
         if type(self.demodulate) is not bool or (self.demodulate and (self.scales < 2 or "albedo" not in self.inputs)):
             raise NgptError(f"demodulate = {self.demodulate!r}: true or false; needs scales and the input albedo")
         if not isinstance(self.quiet, int | float) or isinstance(self.quiet, bool) or not 0 <= self.quiet < math.inf:
@@ -161,10 +161,11 @@ class Reconstructor(nn.Module):
         super().__init__()
         self.config = config
         channels, head = features.channels(config.inputs), config.head
+        last: dict[str, Any] = {"outputs": head.outputs, "zero": head.neutral, "normalise": head.normalise}
         self.network = (
-            DenseUNet(channels, config.channels, config.units, head.outputs, zero=head.neutral)
+            DenseUNet(channels, config.channels, config.units, **last)
             if config.network == "dense"
-            else PlainUNet(channels, config.channels, head.outputs, zero=head.neutral)
+            else PlainUNet(channels, config.channels, **last)
         )
 
     @property

@@ -48,10 +48,11 @@ class Crop:
         return len(self.spp)
 
     def stack(self, k: int) -> GradientStack:
-        """Input ``k``, with all layers of a rendered stack, gradients if its sampler has them; every value is finite."""
+        """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite."""
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
-        layers = {name: self.shard.input(name, self.index, k) for name in self.shard.names if name in INPUTS | GRADIENTS}
+        names = [name for name in self.shard.names if name in INPUTS | GRADIENTS]
+        layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"]
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
