@@ -114,8 +114,8 @@ class DenseUNet(nn.Module):
     """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
 
     ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius`` that
-    of the receptive field.
+    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius``
+    that of the receptive field.
     """
 
     def __init__(

@@ -218,7 +218,7 @@ def test_a_pyramid_learns(tmp_path):
     [
         ({"scales": 0}, "must be from 1 to the 3 levels of the network"),
         ({"scales": 4}, "must be from 1 to the 3 levels of the network"),
-        ({"kernel": 1}, "kernels of 3 pixels or more, of one image"),
+        ({"kernel": 1}, "kernels of 3 pixels or more of one image"),
         ({"start": ()}, "there is no image to average"),
         ({"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
         ({"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
