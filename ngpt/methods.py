@@ -5,7 +5,7 @@ A new method is one more entry in ``METHODS``; the command line, the reports and
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -29,6 +29,7 @@ class Method:
     ``options``  the options it takes, with their defaults
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
     ``uses``     layers that it takes where the stack has them
+    ``variant``  the method that it is with other options, "" for a method of its own
     """
 
     summary: str
@@ -37,6 +38,7 @@ class Method:
     options: dict[str, Any]
     missing: Callable[[], str] = lambda: ""
     uses: tuple[str, ...] = ()
+    variant: str = ""
 
 
 @dataclass(frozen=True)
@@ -96,6 +98,11 @@ def _network(
     return Method(summary, needs, network.run, OPTIONS, network.missing, uses)
 
 
+def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method:
+    """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
+    return replace(entry, summary=summary, options=entry.options | options, variant=method)
+
+
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
@@ -145,6 +152,17 @@ METHODS = {
         ("albedo", "normal"),
     ),
 }
+METHODS |= {
+    "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", METHODS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+    "oidn-fast": _variant(
+        "oidn",
+        METHODS["oidn"],
+        "OIDN's quickest network, with the features as they are",
+        auxiliary="clean",
+        quality="fast",
+    ),
+}
 
 
 def choose(stack: GradientStack) -> str:
@@ -184,9 +202,11 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         # Where and in how much memory concerns only some of those it may stand for.
         idle = {"device", "memory"} - entry.options.keys()
         options = {option: value for option, value in options.items() if option not in idle}
-    for option in options:
+    for option, value in options.items():
         if option not in entry.options:
             raise NgptError(f"method '{name}' has no option '{option}'; it has: {', '.join(entry.options) or 'none'}")
+        if isinstance(entry.options[option], int) and not isinstance(value, int):
+            raise NgptError(f"method '{name}': {option} is {value!r}; it must be a whole number")
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.

@@ -83,7 +83,8 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *METHODS)}
+    methods = {method: entry for method, entry in METHODS.items() if not entry.variant}
+    targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
     with console.progress(f"{name}: stack", "spp") as progress:
         stack = render_stack(scene, args.spp, progress=progress)
@@ -93,7 +94,7 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     write(targets["stack"], stack, overwrite=args.force)
     write(targets["ref"], reference, overwrite=args.force)
     entries = []
-    for method, entry in METHODS.items():
+    for method, entry in methods.items():
         if lack := entry.missing():
             console.say(f"{name}: without {method}: {lack}")
         elif all(layer in stack for layer in entry.needs):
