@@ -30,8 +30,9 @@ FEATURES = ("albedo", "normal", "depth")
         (("albedo",), "oidn", "ngpt-colour"),
         (("albedo", "normal"), "oidn", "ngpt-colour"),
         ((*FEATURES, "primal_var"), "ngpt-primal", "nfor"),
-        (("dx", "dy"), "l1", "l1"),
-        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "wcv", "wcv"),
+        (("dx", "dy"), "oidn", "l1"),
+        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "oidn", "wcv"),
+        ((*FEATURES, "dx", "dy"), "ngpt-combine", "ngpt-fast"),
         ((*FEATURES, "dx", "dy", "primal_var", "dx_var", "dy_var"), "ngpt-combine", "ngpt-fast"),
     ],
 )

@@ -146,7 +146,7 @@ def other_denoiser(monkeypatch):
 
     def images(layers):
         data = repair(stack_of(layers))
-        made = inputs.denoised(data, reconstruct(stack_of(layers), "wcv").image, inputs.DENOISED)
+        made = inputs.denoised(inputs.Oidn(data), reconstruct(stack_of(layers), "wcv").image, inputs.DENOISED)
         return {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in made.items()}
 
     return images
