@@ -29,7 +29,7 @@ FEATURES = ("albedo", "normal", "depth")
         ((), "oidn", "ngpt-colour"),
         (("albedo",), "oidn", "ngpt-colour"),
         (("albedo", "normal"), "oidn", "ngpt-colour"),
-        ((*FEATURES, "primal_var"), "ngpt-primal", "nfor"),
+        ((*FEATURES, "primal_var"), "oidn", "nfor"),
         (("dx", "dy"), "oidn", "l1"),
         (("dx", "dy", "primal_var", "dx_var", "dy_var"), "oidn", "wcv"),
         ((*FEATURES, "dx", "dy"), "ngpt-combine", "ngpt-fast"),
