@@ -1,7 +1,7 @@
 """Renderer x layers x OIDN: what `auto` takes of files with each renderer's names, and the error that it leaves.
 
 Two built-in scenes, 16 samples per pixel, 96x64 pixels; errors are geometric means of the trimmed relMSE over both. The
-same at 192x108 pixels over eight scenes is in docs/from-your-renderer.md, by `python -m bench.layers`.
+same at 192x108 pixels over four scenes is in docs/from-your-renderer.md, by `python -m bench.layers`.
 """
 
 import re
