@@ -113,6 +113,7 @@ def denoise_file(
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
         "options": result.options,
+        "estimated": list(result.estimated),
         "version": __version__,
         "seconds": result.seconds,
         "width": stack.width,
