@@ -13,11 +13,6 @@ from ngpt.repair import Repaired
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
 
-# Whether features are noisy is asked of large images only: the answer costs as much as filtering BLOCKS² blocks.
-BLOCK, BLOCKS, LARGE = 64, 4, 4
-# Root mean square of what OIDN's filter changes in the blocks, in the features' own units.
-NOISY = 0.004
-
 
 def missing() -> str:
     return "" if find_spec("mitsuba_oidn") else "OIDN (mitsuba-oidn) is not installed: pip install 'ngpt-recon[peers]'"
@@ -28,9 +23,9 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
 
     OIDN knows no normals without albedo: they are left out then.
 
-    ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first, where they
-                   are noisy, and calls them clean then, which is how its documentation has the best quality made;
-                   "clean" calls them clean as they are; "noisy" does not; "none" hides them
+    ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first and calls them
+                   clean then, which is how its documentation has the best quality made; "clean" calls them clean as
+                   they are; "noisy" does not; "none" hides them
     ``quality``    "high", "balanced" or "fast"
     """
     require_oidn()
@@ -55,35 +50,12 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
 
 
 def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them, which takes longer than the image itself.
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself.
 
-    Large ones without noise come back as they are. Normals without albedo are left out.
+    Whether they are noisy is not asked: no cheap answer was right (docs/lab/LOG.md). Who knows says "clean".
     """
     require_oidn()
-    layers = _in_range(features)
-    # Normals first: they are noisier, and one noisy layer settles it.
-    if any(_noisy(name, layers[name]) for name in ("normal", "albedo") if name in layers):
-        return {name: _prefiltered(name, layer) for name, layer in layers.items()}
-    return layers
-
-
-def _noisy(name: str, layer: np.ndarray) -> bool:
-    """Whether OIDN's filter would change a feature: judged by the blocks where its neighbouring pixels differ most.
-
-    Noise of features is at edges and in blur, where an image that is free of noise has much detail as well: no local
-    formula tells the two apart, but the filter leaves clean detail alone.
-    """
-    if layer.shape[0] * layer.shape[1] < LARGE * (BLOCK * BLOCKS) ** 2 or min(layer.shape[:2]) < BLOCK * BLOCKS:
-        return True
-    rows, columns = (n // BLOCK for n in layer.shape[:2])
-    blocks = layer[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK, 3)
-    activity = np.abs(np.diff(blocks, axis=1)).sum((1, 3, 4)) + np.abs(np.diff(blocks, axis=3)).sum((1, 3, 4))
-    most = np.argsort(activity, axis=None)[-(BLOCKS**2) :]
-    chosen = blocks.transpose(0, 2, 1, 3, 4).reshape(-1, BLOCK, BLOCK, 3)[most]
-    # One image of fixed size: its filter is made once.
-    mosaic = chosen.reshape(BLOCKS, BLOCKS, BLOCK, BLOCK, 3).transpose(0, 2, 1, 3, 4)
-    mosaic = np.ascontiguousarray(mosaic.reshape(BLOCKS * BLOCK, BLOCKS * BLOCK, 3))
-    return bool(np.sqrt(np.mean((_prefiltered(name, mosaic) - mosaic) ** 2)) > NOISY)
+    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
 
 
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:

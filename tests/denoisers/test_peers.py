@@ -174,26 +174,3 @@ def test_oidn_takes_what_there_is(rng, layers, auxiliary):
     if layers == ("normal",):
         bare = reconstruct(GradientStack.from_arrays(primal=noisy), "oidn", auxiliary=auxiliary).image
         assert np.array_equal(image, bare)
-
-
-@pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
-def test_large_features_are_filtered_only_where_they_are_noisy(rng, monkeypatch):
-    """Noise at edges, as samples of a box filter have it: what is flat inside is never noisy."""
-    calls = []
-    real = oidn._prefiltered
-    monkeypatch.setattr(oidn, "_prefiltered", lambda name, layer: calls.append(layer.shape) or real(name, layer))
-    y, x = np.mgrid[0:512, 0:512]
-    # How much of each pixel lies on one side of slanted edges: exact, and by four samples.
-    inside = np.clip(8.5 - np.abs((x + 0.4 * y) % 32 - 16), 0, 1)
-    sampled = rng.binomial(4, inside) / 4
-    for share, noisy in ((inside, False), (sampled, True)):
-        albedo = (0.2 + 0.6 * share[..., None] * np.ones(3)).astype(np.float32)
-        features = {"albedo": albedo, "normal": np.broadcast_to(np.float32([0, 0, 1]), albedo.shape)}
-        calls.clear()
-        ready = oidn.prefiltered(features)
-        assert ((512, 512, 3) in calls) == noisy
-        assert np.array_equal(ready["albedo"], albedo) == (not noisy)
-    # Small ones are not asked: the answer costs as much as the work.
-    calls.clear()
-    oidn.prefiltered({"albedo": np.full((40, 50, 3), 0.5, np.float32)})
-    assert calls == [(40, 50, 3)]
