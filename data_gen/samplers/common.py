@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import re
-
 import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
-from data_gen.scenes.load import reference_integrator
+from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 
@@ -52,13 +50,10 @@ def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
     Raises NgptError where the parameters cannot be read.
     """
     path = reference_integrator(scene)
-    # Mitsuba exposes neither depth as a parameter, only in print.
-    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
-    if depths.keys() != {"max_depth", "rr_depth"}:
+    depths = path_depths(path)
+    if not depths:
         raise NgptError(
             f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
             "use --sampler gpt-basic"
         )
-    unlimited = depths["max_depth"] >= 0x7FFFFFFF
-    depths["max_depth"] = -1 if unlimited else depths["max_depth"]
     return mi.load_dict({"type": plugin, "hide_emitters": path.hide_emitters, **depths, **options})

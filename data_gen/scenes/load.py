@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import mitsuba as mi
@@ -54,6 +55,15 @@ def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
     params = mi.traverse(sensor)
     params["film.size"] = list(size)
     params.update()
+
+
+def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:
+    """``max_depth`` (-1: no limit) and ``rr_depth`` of an integrator like ``path``; {} where they cannot be read."""
+    # Mitsuba exposes neither depth as a parameter, only in print.
+    depths = {key: int(value) for key, value in re.findall(r"(\w+_depth) = (\d+)", str(path))}
+    if depths.keys() != {"max_depth", "rr_depth"}:
+        return {}
+    return depths | {"max_depth": -1 if depths["max_depth"] >= 0x7FFFFFFF else depths["max_depth"]}
 
 
 def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
