@@ -105,34 +105,36 @@ def save_render(scene, path: Path) -> None:
 
 def read_exr(path: Path) -> dict[str, np.ndarray]:
     """The channels (H, W) of a file as ``save_render`` makes it: one part, scanlines, 32-bit floats, not compressed."""
-    data = path.read_bytes()
-    at, header = 8, {}
-
-    def text() -> str:
-        nonlocal at
-        start, at = at, data.index(b"\0", at) + 1
-        return data[start : at - 1].decode()
-
-    while name := text():
-        kind, (size,) = text(), struct.unpack_from("<i", data, at)
+    data, at, header = path.read_bytes(), 8, {}
+    while data[at]:
+        name, at = _text(data, at)
+        _, at = _text(data, at)  # its type
+        (size,) = struct.unpack_from("<i", data, at)
         header[name], at = data[at + 4 : at + 4 + size], at + 4 + size
-        del kind
+    listed, names = header["channels"], []
+    kinds, end = set(), 0
+    while listed[end]:
+        name, end = _text(listed, end)
+        names.append(name)
+        kinds.add(struct.unpack_from("<i", listed, end)[0])
+        end += 16
+    if header["compression"] != b"\0" or kinds != {2}:
+        raise NgptError(f"Blender {bpy.app.version_string} wrote the render in a form that this add-on does not read")
     x0, y0, x1, y1 = struct.unpack("<4i", header["dataWindow"])
     width, height = x1 - x0 + 1, y1 - y0 + 1
-    table, at, end, names, kinds = at, 0, header["channels"], [], set()
-    data, whole = end, data
-    while name := text():
-        names.append(name)
-        kinds.add(struct.unpack_from("<i", data, at)[0])
-        at += 16
-    if header["compression"] != b"\0" or kinds != {2}:
-        raise NgptError("Blender wrote the render in a form that this add-on does not read: please report its version")
-    first = table + 8 * height
-    lines = np.frombuffer(whole, np.uint8, height * (8 + 4 * width * len(names)), first).reshape(height, -1)
-    rows = lines[:, :4].copy().view("<i4")[:, 0] - y0
-    pixels = np.empty((height, len(names), width), np.float32)
-    pixels[rows] = lines[:, 8:].copy().view("<f4").reshape(height, len(names), width)
-    return {name: pixels[:, i] for i, name in enumerate(names)}
+    # After the header a table of positions; then each row: its number, its size, one channel after another.
+    count = height * (8 + 4 * width * len(names))
+    rows = np.frombuffer(data, np.uint8, count, at + 1 + 8 * height).reshape(height, -1)
+    numbers = rows[:, :4].copy().view("<i4")[:, 0] - y0
+    pixels = np.empty((len(names), height, width), np.float32)
+    pixels[:, numbers] = rows[:, 8:].copy().view("<f4").reshape(height, len(names), width).swapaxes(0, 1)
+    return dict(zip(names, pixels))
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    """The text that begins at ``at`` and ends with a zero, and what comes after it."""
+    end = data.index(0, at)
+    return data[at:end].decode(), end + 1
 
 
 # --- the network -----------------------------------------------------------------------------------------------------
