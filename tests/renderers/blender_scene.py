@@ -1,7 +1,7 @@
 """Renders a scene made by this script in Cycles, as ``PYTHON_WITH_BPY blender_scene.py FOLDER NAME=SPP:SEED ...``.
 
-Each ``NAME.exr`` is a multi-layer file with the denoising passes, as a user gets it who ticks *Denoising Data*. Imported
-by nobody: it runs in Blender's Python, where ngpt is not installed.
+Each ``NAME.exr`` is a multi-layer file with the denoising passes, as a user gets it who ticks *Denoising Data*. It runs
+in Blender's Python, where ngpt is not installed.
 
 Options before the folder: ``--blur`` opens the lens, ``--interleaved`` writes one part instead of one for each pass,
 ``--size WIDTHxHEIGHT``.
@@ -83,6 +83,30 @@ def build(blur):
     scene.world = bpy.data.worlds.new("night")
 
 
+def prepare(size, interleaved=False, blur=False):
+    """Makes the scene the one that is open, with Cycles, the passes and the file format set."""
+    addon_utils.enable("cycles")
+    build(blur)
+    scene, layer = bpy.context.scene, bpy.context.view_layer
+    scene.render.engine = "CYCLES"
+    scene.cycles.device, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = "CPU", False, False
+    scene.render.resolution_x, scene.render.resolution_y = map(int, size.split("x"))
+    layer.cycles.denoising_store_passes = True
+    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = True
+    written = scene.render.image_settings
+    if hasattr(written, "media_type"):  # since Blender 5.0
+        written.media_type = "MULTI_LAYER_IMAGE"
+    written.file_format, written.color_depth, written.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
+    written.use_exr_interleave = interleaved
+
+
+def render(path, spp, seed):
+    scene = bpy.context.scene
+    scene.cycles.samples, scene.cycles.seed = spp, seed
+    scene.render.filepath = str(path.resolve())
+    bpy.ops.render.render(write_still=True)
+
+
 def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--blur", action="store_true")
@@ -90,26 +114,12 @@ def main():
     parser.add_argument("--size", default="480x270")
     parser.add_argument("folder", type=Path)
     parser.add_argument("renders", nargs="+")
-    given = parser.parse_args(sys.argv[1:])
-
-    addon_utils.enable("cycles")
-    build(given.blur)
-    scene, layer = bpy.context.scene, bpy.context.view_layer
-    scene.render.engine = "CYCLES"
-    scene.cycles.device, scene.cycles.use_denoising, scene.cycles.use_adaptive_sampling = "CPU", False, False
-    scene.render.resolution_x, scene.render.resolution_y = map(int, given.size.split("x"))
-    layer.cycles.denoising_store_passes = True
-    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = True
-    written = scene.render.image_settings
-    if hasattr(written, "media_type"):  # since Blender 5.0
-        written.media_type = "MULTI_LAYER_IMAGE"
-    written.file_format, written.color_depth, written.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
-    written.use_exr_interleave = given.interleaved
-    for render in given.renders:
-        name, _, how = render.partition("=")
-        scene.cycles.samples, scene.cycles.seed = map(int, how.split(":"))
-        scene.render.filepath = str((given.folder / f"{name}.exr").resolve())
-        bpy.ops.render.render(write_still=True)
+    given = parser.parse_args()
+    prepare(given.size, given.interleaved, given.blur)
+    for wanted in given.renders:
+        name, _, how = wanted.partition("=")
+        render(given.folder / f"{name}.exr", *map(int, how.split(":")))
 
 
-main()
+if __name__ == "__main__":
+    main()

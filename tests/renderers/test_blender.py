@@ -1,0 +1,143 @@
+"""Files that Blender wrote: their layers, what `auto` makes of them, and the add-on in Blender itself."""
+
+import json
+
+import numpy as np
+import pytest
+from pythons import ROOT, run
+
+import ngpt
+from ngpt.denoisers import oidn
+from ngpt.measure.metrics import relmse_trimmed
+
+pytestmark = pytest.mark.slow
+
+SIZE = (256, 144)
+# `auto` where OIDN is not installed, over OIDN's error. ngpt-colour is what sets it: tighten it with every new one.
+WITHOUT_OIDN = 4.0
+
+
+@pytest.fixture(scope="module", params=["sharp", "blurred"])
+def rendered(request, tmp_path_factory):
+    """A folder with ``noisy`` at 16 spp, and two halves of a reference, of the scene with the lens closed or open."""
+    folder = tmp_path_factory.mktemp(request.param)
+    lens = ["--blur"] if request.param == "blurred" else []
+    size = ["--size", "{}x{}".format(*SIZE)]
+    run("bpy", "blender_scene.py", *lens, *size, folder, "noisy=16:1", "a=112:2", "b=112:3")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def errors(rendered):
+    """Of an image: its error against the reference, whose own noise does not count."""
+    halves = [ngpt.read(rendered / f"{name}.exr")["primal"] for name in "ab"]
+    return lambda image: relmse_trimmed(image, *halves)
+
+
+def check_layers(stack):
+    """What each pass is in Cycles, found by content: not by its name alone."""
+    assert stack.names == ("primal", "albedo", "normal", "depth", "alpha")
+    assert (stack.width, stack.height) == SIZE
+    lengths = np.linalg.norm(stack["normal"], axis=-1)
+    assert np.median(lengths) == pytest.approx(1, abs=1e-3)
+    # Camera space, z away from the viewer: the back wall looks at the camera, the floor up.
+    assert stack["normal"][SIZE[1] // 3, SIZE[0] // 2] == pytest.approx([0, 0, -1], abs=0.15)
+    assert stack["normal"][-3, 40] == pytest.approx([0, 1, 0], abs=0.15)
+    red, green = stack["albedo"][60, 8], stack["albedo"][60, -8]
+    assert red[0] > 5 * red[1] and green[1] > 3 * green[0]
+    assert 3 < stack["depth"][SIZE[1] // 2 :].min() < stack["depth"].max() < 20
+    assert np.all(stack["alpha"] == 1)
+
+
+def test_the_parts_of_a_file_are_found(rendered):
+    stack = ngpt.read(rendered / "noisy.exr")
+    check_layers(stack)
+    # Each pass is a part of its own, and the file holds others that a layer could be mistaken for.
+    found = stack.source.resolution
+    assert {name: where.name.partition(".")[2] for name, where in found.items()} == {
+        "primal": "Combined",
+        "albedo": "Denoising Albedo",
+        "normal": "Denoising Normal",
+        "depth": "Denoising Depth",
+        "alpha": "Combined",
+    }
+    assert len({where.part for where in found.values()}) == 4 < len(stack.source.image.parts)
+
+
+def test_one_part_holds_the_same(rendered, tmp_path):
+    if rendered.name.startswith("blurred"):
+        pytest.skip("once is enough")
+    run("bpy", "blender_scene.py", "--interleaved", "--size", "{}x{}".format(*SIZE), tmp_path, "noisy=16:1")
+    one, several = ngpt.read(tmp_path / "noisy.exr"), ngpt.read(rendered / "noisy.exr")
+    assert len(one.source.image.parts) == 1 and len(several.source.image.parts) > 4
+    check_layers(one)
+    for name in several.names:
+        assert np.allclose(one[name], several[name], rtol=1e-3, atol=1e-3), name
+
+
+def test_auto_is_as_good_as_oidn(rendered, errors):
+    pytest.importorskip("mitsuba_oidn")
+    stack = ngpt.read(rendered / "noisy.exr")
+    theirs = errors(ngpt.denoise(stack, method="oidn"))
+    assert errors(ngpt.denoise(stack)) <= 1.001 * theirs < 0.25 * errors(stack["primal"])
+
+
+def test_auto_without_oidn_is_near_it(rendered, errors, monkeypatch, record_property):
+    pytest.importorskip("mitsuba_oidn")
+    stack = ngpt.read(rendered / "noisy.exr")
+    theirs = errors(ngpt.denoise(stack, method="oidn"))
+    monkeypatch.setattr(oidn, "find_spec", lambda name: None)
+    result = ngpt.reconstruct(stack)
+    assert result.method not in ("oidn", "primal")
+    ours = errors(result.image)
+    record_property("without OIDN", f"{result.method}: {ours:.5f}, OIDN {theirs:.5f}, {ours / theirs:.2f}")
+    print(f"{result.method} {ours:.5f}, OIDN {theirs:.5f}: {ours / theirs:.2f}; input {errors(stack['primal']):.5f}")
+    assert ours <= WITHOUT_OIDN * theirs
+
+
+# --- the add-on ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def addon(tmp_path_factory):
+    """A folder with what the add-on did, and its report."""
+    folder = tmp_path_factory.mktemp("addon")
+    run("onnxruntime", "blender_addon.py", ROOT / "export" / "hosts" / "blender" / "ngpt_denoise.py",
+        ROOT / "ngpt" / "weights", folder, BLENDER_USER_RESOURCES=str(folder / "user"))  # fmt: skip
+    said = json.loads((folder / "report.json").read_text())
+    assert "failed" not in said, said["failed"]
+    return folder, said
+
+
+@pytest.mark.parametrize("name", ["passes", "tiles", "colour"])
+def test_the_addons_pixels_are_ours(addon, name):
+    folder, said = addon
+    assert said.get(name, "") == ""
+    stack = ngpt.read(folder / f"{'colour' if name == 'colour' else 'passes'}.exr")
+    assert ("albedo" in stack) == (name != "colour")
+    expected = ngpt.denoise(stack, method="ngpt-colour")
+    image = np.load(folder / f"{name}.npy")
+    assert image.shape[:2] == expected.shape[:2]
+    assert np.abs(image[..., :3] - expected).max() <= 1e-4 * expected.max()
+    if name == "colour":
+        assert np.array_equal(image[..., 3:], stack["alpha"]) and stack["alpha"].min() == 0
+
+
+def test_the_addon_leaves_the_scene_as_it_was(addon):
+    _, said = addon
+    assert "scripts" in said["installed"] and said["settings stay"] and said["removed"]
+    assert said["image"] == [True, "Linear Rec.709", True]
+
+
+@pytest.mark.parametrize(
+    ("case", "message"),
+    [
+        ("no render", "there is no render yet"),
+        ("no network", "there is no network at"),
+        ("needs gradients", "ngpt-fast.onnx needs dx, dy, "),
+        ("no onnxruntime", "-m pip install onnxruntime"),
+    ],
+)
+def test_the_addon_says_what_is_missing(addon, case, message):
+    said = addon[1][case]
+    assert message in said and "Traceback" not in said and "\n" not in said
