@@ -78,7 +78,8 @@ def main():
     addon.find_spec = importlib.util.find_spec
 
     # Another size, and a picture as the format; only colour, transparent where there is nothing.
-    layer.cycles.denoising_store_passes = layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = False
+    layer.cycles.denoising_store_passes = False
+    layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = False
     scene.render.resolution_x, scene.render.film_transparent = 80, True
     bpy.data.objects.remove(bpy.data.objects["back"])
     blender_scene.render(FOLDER / "colour.exr", 4, 2)

@@ -9,7 +9,6 @@ Options before the folder: ``--blur`` opens the lens, ``--interleaved`` writes o
 
 import argparse
 import math
-import sys
 from pathlib import Path
 
 import bpy  # isort: split
@@ -31,7 +30,7 @@ def material(name, colour=(0.8, 0.8, 0.8), roughness=1.0, metallic=0.0, transmis
     if texture:
         pattern = nodes.new("ShaderNodeTex" + texture[0])
         pattern.inputs["Scale"].default_value = texture[1]
-        for name, shade in zip(("Color1", "Color2", "Mortar"), texture[2:]):
+        for name, shade in zip(("Color1", "Color2", "Mortar"), texture[2:], strict=False):
             pattern.inputs[name].default_value = (*shade, 1)
         place = nodes.new("ShaderNodeTexCoord")
         links.new(place.outputs["Object"], pattern.inputs["Vector"])
@@ -52,25 +51,29 @@ def ball(name, centre, radius, surface):
     bpy.context.object.data.materials.append(surface)
 
 
+CHECKS = ("Checker", 3, (0.7, 0.65, 0.5), (0.1, 0.12, 0.2))
+BRICKS = ("Brick", 4, (0.55, 0.25, 0.15), (0.4, 0.18, 0.12), (0.6, 0.6, 0.58))
+WOOD = ("Brick", 9, (0.5, 0.3, 0.1), (0.4, 0.22, 0.08), (0.2, 0.1, 0.05))
+
+
 def build(blur):
     """A room: lamp and window in view, checked floor, coloured walls, bricks, metal, glass, gloss, small things."""
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    box("floor", (0, 0, -0.05), (6, 6, 0.1), material("checks", roughness=0.35, texture=("Checker", 3, (0.7, 0.65, 0.5), (0.1, 0.12, 0.2))))
+    box("floor", (0, 0, -0.05), (6, 6, 0.1), material("checks", roughness=0.35, texture=CHECKS))
     box("ceiling", (0, 0, 3.05), (6, 6, 0.1), material("white"))
     box("left", (-3.05, 0, 1.5), (0.1, 6, 3), material("red", (0.65, 0.06, 0.05)))
     box("right", (3.05, 0, 1.5), (0.1, 6, 3), material("green", (0.08, 0.5, 0.12)))
-    bricks = ("Brick", 4, (0.55, 0.25, 0.15), (0.4, 0.18, 0.12), (0.6, 0.6, 0.58))
-    box("back", (0, 3.05, 1.5), (6, 0.1, 3), material("bricks", texture=bricks))
+    box("back", (0, 3.05, 1.5), (6, 0.1, 3), material("bricks", texture=BRICKS))
     box("lamp", (0.8, 1.0, 2.9), (0.9, 0.6, 0.05), material("lamp", (1, 0.85, 0.6), glow=14))
     box("strip", (-2.95, 1.4, 1.9), (0.02, 1.0, 0.5), material("strip", (0.4, 0.6, 1), glow=6))
     ball("metal", (-1.3, 0.9, 0.75), 0.75, material("metal", (0.9, 0.8, 0.6), 0.12, metallic=1))
     ball("mirror", (1.9, 1.8, 0.6), 0.6, material("mirror", (0.95, 0.95, 0.95), 0.0, metallic=1))
     ball("glass", (0.5, -0.5, 0.45), 0.45, material("glass", (1, 1, 1), 0.0, transmission=1))
-    box("crate", (1.5, 0.3, 0.4), (0.8, 0.8, 0.8), material("wood", texture=("Brick", 9, (0.5, 0.3, 0.1), (0.4, 0.22, 0.08), (0.2, 0.1, 0.05))), 0.5)
+    box("crate", (1.5, 0.3, 0.4), (0.8, 0.8, 0.8), material("wood", texture=WOOD), 0.5)
     for i in range(24):  # thin and small things, which denoisers like to lose
-        angle = i * 2.4
-        ball(f"bead{i}", (-0.2 + 0.1 * i * math.cos(angle) * 0.8, 0.2 + 0.1 * i * math.sin(angle) * 0.5, 0.07), 0.07,
-             material(f"bead{i}", (0.5 + 0.5 * math.cos(angle), 0.5, 0.5 + 0.5 * math.sin(angle)), 0.3))
+        x, y = math.cos(2.4 * i), math.sin(2.4 * i)
+        bead = material(f"bead{i}", (0.5 + 0.5 * x, 0.5, 0.5 + 0.5 * y), 0.3)
+        ball(f"bead{i}", (-0.2 + 0.08 * i * x, 0.2 + 0.05 * i * y, 0.07), 0.07, bead)
         if i % 4 == 0:
             box(f"rod{i}", (-2.6 + 0.2 * i, 2.6, 1.2), (0.03, 0.03, 2.4), material(f"rod{i}", (0.8, 0.7, 0.1)))
     camera = bpy.data.cameras.new("camera")

@@ -1,4 +1,4 @@
-"""Renders a small room in LuxCore, as ``PYTHON_WITH_PYLUXCORE luxcore_scene.py FOLDER SPP SEED``: a file for each buffer.
+"""Renders a small room in LuxCore: ``PYTHON_WITH_PYLUXCORE luxcore_scene.py FOLDER SPP SEED``, a file for each buffer.
 
 ``colour.exr``, ``albedo.exr``, ``normal.exr`` and ``depth.exr``, as LuxCore names and writes their channels. It runs
 where ngpt is not installed.
@@ -38,8 +38,9 @@ def room():
     colours = {"white": [0.8, 0.8, 0.8], "red": [0.6, 0.05, 0.05], "green": [0.1, 0.5, 0.1]}
     for name, colour in colours.items():
         scene.Parse(properties(f"scene.materials.{name}", {"type": "matte", "kd": colour}))
-    scene.Parse(properties("scene.textures.checks", {"type": "checkerboard2d", "texture1": 0.7, "texture2": 0.1,
-                                                     "mapping.type": "uvmapping2d", "mapping.uvscale": [8, 8]}))  # fmt: skip
+    checks = {"type": "checkerboard2d", "texture1": 0.7, "texture2": 0.1}
+    checks |= {"mapping.type": "uvmapping2d", "mapping.uvscale": [8, 8]}
+    scene.Parse(properties("scene.textures.checks", checks))
     scene.Parse(properties("scene.materials.checks", {"type": "matte", "kd": "checks"}))
     scene.Parse(properties("scene.materials.lamp", {"type": "matte", "kd": [0, 0, 0], "emission": [9, 8, 6]}))
     squares = {

@@ -1,13 +1,14 @@
 """ngpt in Blender: denoises the last render by an ngpt network. An add-on of one file.
 
-*Edit > Preferences > Add-ons > Install from Disk* installs this file; put ``ngpt-colour.onnx``, and for images that need
-tiles ``ngpt-colour.statistics.onnx``, wherever you like, and name the first in the panel. Blender's Python needs ONNX
-Runtime: the panel shows the command. Then render with Cycles, *Denoising Data* on and denoising off, and press *Denoise*
-in the sidebar of the image editor, tab *ngpt*: the result is a new image.
+*Edit > Preferences > Add-ons > Install from Disk* installs this file. Put ``ngpt-colour.onnx``, and for images that
+need tiles ``ngpt-colour.statistics.onnx``, wherever you like, and name the first in the panel. Blender's Python needs
+ONNX Runtime: the panel shows the command. Then render with Cycles, *Denoising Data* on and denoising off, and press
+*Denoise* in the sidebar of the image editor, tab *ngpt*: the result is a new image.
 
 The network is any that reads nothing but colour, albedo, normal and depth. See export/CONTRACT.md.
 """
 
+import contextlib
 import math
 import struct
 import sys
@@ -48,9 +49,9 @@ class NgptError(Exception):
 
 
 def render_layers(scene, view_layer: str = "") -> dict[str, np.ndarray]:
-    """The passes of the last render: ``primal``, ``alpha`` and those of ``PASSES`` that there are, (1, C, H, W) float32.
+    """Those of ``PASSES``, and ``alpha``, that the last render has: (1, C, H, W) float32, row 0 on top.
 
-    Row 0 on top. Python sees no pixels of *Render Result*, so that it is saved and read again.
+    Python sees no pixels of *Render Result*, so that it is saved and read again.
     """
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "render.exr"
@@ -95,10 +96,9 @@ def save_render(scene, path: Path) -> None:
         raise NgptError("there is no render yet: press F12 first") from error
     finally:
         for name, value in before.items():
-            try:
+            # A codec, say, that the format of before does not know.
+            with contextlib.suppress(TypeError):
                 setattr(settings, name, value)
-            except TypeError:
-                pass  # a codec, say, that the format of before does not know
     if not path.is_file():
         raise NgptError("there is no render yet: press F12 first")
 
@@ -128,7 +128,7 @@ def read_exr(path: Path) -> dict[str, np.ndarray]:
     numbers = rows[:, :4].copy().view("<i4")[:, 0] - y0
     pixels = np.empty((len(names), height, width), np.float32)
     pixels[:, numbers] = rows[:, 8:].copy().view("<f4").reshape(height, len(names), width).swapaxes(0, 1)
-    return dict(zip(names, pixels))
+    return dict(zip(names, pixels, strict=True))
 
 
 def _text(data: bytes, at: int) -> tuple[str, int]:
