@@ -84,7 +84,7 @@ def main():
     bpy.data.objects.remove(bpy.data.objects["back"])
     blender_scene.render(FOLDER / "colour.exr", 4, 2)
     written = scene.render.image_settings
-    if hasattr(written, "media_type"):
+    if bpy.app.version >= (5, 0):
         written.media_type = "IMAGE"
     written.file_format, written.color_depth = "PNG", "16"
     before = settings()

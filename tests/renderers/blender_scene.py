@@ -97,10 +97,9 @@ def prepare(size, interleaved=False, blur=False):
     layer.cycles.denoising_store_passes = True
     layer.use_pass_z = layer.use_pass_normal = layer.use_pass_diffuse_color = True
     written = scene.render.image_settings
-    if hasattr(written, "media_type"):  # since Blender 5.0
-        written.media_type = "MULTI_LAYER_IMAGE"
+    if bpy.app.version >= (5, 0):  # those before write one part
+        written.media_type, written.use_exr_interleave = "MULTI_LAYER_IMAGE", interleaved
     written.file_format, written.color_depth, written.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
-    written.use_exr_interleave = interleaved
 
 
 def render(path, spp, seed):

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from pythons import ROOT, run
+from pythons import ROOT, python_with, run
 
 import ngpt
 from ngpt.denoisers import oidn
@@ -61,7 +61,8 @@ def test_the_parts_of_a_file_are_found(rendered):
         "depth": "Denoising Depth",
         "alpha": "Combined",
     }
-    assert len({where.part for where in found.values()}) == 4 < len(stack.source.image.parts)
+    if stack.attributes["Software"].split()[1] >= "5.":  # those before write one part
+        assert len({where.part for where in found.values()}) == 4 < len(stack.source.image.parts)
 
 
 def test_one_part_holds_the_same(rendered, tmp_path):
@@ -69,7 +70,7 @@ def test_one_part_holds_the_same(rendered, tmp_path):
         pytest.skip("once is enough")
     run("bpy", "blender_scene.py", "--interleaved", "--size", "{}x{}".format(*SIZE), tmp_path, "noisy=16:1")
     one, several = ngpt.read(tmp_path / "noisy.exr"), ngpt.read(rendered / "noisy.exr")
-    assert len(one.source.image.parts) == 1 and len(several.source.image.parts) > 4
+    assert len(one.source.image.parts) == 1
     check_layers(one)
     for name in several.names:
         assert np.allclose(one[name], several[name], rtol=1e-3, atol=1e-3), name
@@ -102,7 +103,8 @@ def test_auto_without_oidn_is_near_it(rendered, errors, monkeypatch, record_prop
 def addon(tmp_path_factory):
     """A folder with what the add-on did, and its report."""
     folder = tmp_path_factory.mktemp("addon")
-    run("onnxruntime", "blender_addon.py", ROOT / "export" / "hosts" / "blender" / "ngpt_denoise.py",
+    python_with("onnxruntime")
+    run("bpy", "blender_addon.py", ROOT / "export" / "hosts" / "blender" / "ngpt_denoise.py",
         ROOT / "ngpt" / "weights", folder, BLENDER_USER_RESOURCES=str(folder / "user"))  # fmt: skip
     said = json.loads((folder / "report.json").read_text())
     assert "failed" not in said, said["failed"]
