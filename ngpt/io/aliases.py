@@ -44,7 +44,7 @@ ALIASES: tuple[Alias, ...] = (
     Alias("albedo", "V-Ray for 3ds Max", "VRayDiffuseFilter"),
     Alias("albedo", "Redshift", "DiffuseFilter"),
     Alias("albedo", "Cycles", "Diffuse Color", "diffuse closures only"),
-    Alias("albedo", "Cycles", "DiffCol", "older files"),
+    Alias("albedo", "Cycles", "DiffCol", "before Blender 5.0"),
     Alias("albedo", "LuxCore", "ALBEDO", "in Blender's files; alone, each buffer has a file of its own"),
     Alias("normal", "Cycles", "Denoising Normal", "camera space, but +z away from the viewer"),
     Alias("normal", "pbrt-v4", "Ns", "shading normal, camera space unless the film says otherwise"),

@@ -33,7 +33,7 @@ RESULT = "ngpt"
 # Layer of the network -> names of Cycles' passes, the first that is there counts, and their channels.
 PASSES = {
     "primal": (("Noisy Image", "Combined"), "RGB"),
-    "albedo": (("Denoising Albedo", "Diffuse Color"), "RGB"),
+    "albedo": (("Denoising Albedo", "Diffuse Color", "DiffCol"), "RGB"),
     "normal": (("Denoising Normal", "Normal"), "XYZ"),
     "depth": (("Denoising Depth", "Depth"), "Z"),
 }
