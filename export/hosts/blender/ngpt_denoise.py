@@ -175,7 +175,7 @@ class Network:
         if not whole.is_file():
             raise NgptError(f"{width}x{height} needs tiles, and they {whole.name}: put it beside {self.path.name}")
         reader = session(whole)
-        statistics = reader.run(None, {given.name: feed[given.name] for given in reader.get_inputs()})[0]
+        statistics = reader.run(["statistics"], {given.name: feed[given.name] for given in reader.get_inputs()})[0]
         side = int(math.sqrt(memory / self.bytes)) - 2 * self.overlap
         side = max(side - side % self.alignment, self.alignment)
         image = np.empty((1, 3, height, width), np.float32)
