@@ -9,6 +9,7 @@ import json
 import sys
 import traceback
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import bpy  # isort: split
 
@@ -53,10 +54,11 @@ def main():
     bpy.ops.preferences.addon_enable(module="ngpt_denoise")
     addon = sys.modules["ngpt_denoise"]
     said["installed"] = addon.__file__
+    chosen = bpy.context.preferences.addons["ngpt_denoise"].preferences
     network = str(NETWORKS / "ngpt-colour.onnx")
 
     said["no network"] = press()
-    scene.ngpt_network = network
+    chosen.network = network
     said["no render"] = press()
     blender_scene.render(FOLDER / "passes.exr", 4, 1)
     before = settings()
@@ -70,9 +72,9 @@ def main():
     layers = addon.render_layers(scene, layer.name)
     np.save(FOLDER / "tiles.npy", addon.Network(Path(network)).run(layers, memory=0)[0].transpose(1, 2, 0))
 
-    scene.ngpt_network = str(NETWORKS / "ngpt-fast.onnx")
+    chosen.network = str(NETWORKS / "ngpt-fast.onnx")
     said["needs gradients"] = press()
-    scene.ngpt_network = network
+    chosen.network = network
     addon.find_spec = hidden
     said["no onnxruntime"] = press()
     addon.find_spec = importlib.util.find_spec
@@ -91,8 +93,14 @@ def main():
     said["colour"] = press()
     said["settings stay"] &= settings() == before
     np.save(FOLDER / "colour.npy", pixels())
+    panel = MagicMock()
+    bpy.types.IMAGE_PT_ngpt.draw(panel, bpy.context)
+    column = panel.layout.column.return_value
+    said["panel"] = [call.args[1] for call in column.prop.mock_calls] + [
+        call.args[0] for call in column.operator.mock_calls
+    ]
     bpy.ops.preferences.addon_disable(module="ngpt_denoise")
-    said["removed"] = not hasattr(bpy.types.Scene, "ngpt_network")
+    said["removed"] = not hasattr(bpy.types, "IMAGE_PT_ngpt")
 
 
 try:

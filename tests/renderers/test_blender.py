@@ -129,6 +129,7 @@ def test_the_addon_leaves_the_scene_as_it_was(addon):
     _, said = addon
     assert "scripts" in said["installed"] and said["settings stay"] and said["removed"]
     assert said["image"] == [True, "Linear Rec.709", True]
+    assert said["panel"] == ["network", "denoising_store_passes", "render.ngpt_denoise"]
 
 
 @pytest.mark.parametrize(

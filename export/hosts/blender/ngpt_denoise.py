@@ -231,6 +231,24 @@ def show(image: np.ndarray, alpha: np.ndarray | None):
     return held
 
 
+class NgptPreferences(bpy.types.AddonPreferences):
+    bl_idname = __name__
+
+    network: bpy.props.StringProperty(
+        name="Network",
+        description="An .onnx file of ngpt that reads colour, albedo, normal and depth",
+        subtype="FILE_PATH",
+        default=str(Path(__file__).resolve().with_name("ngpt-colour.onnx")),
+    )
+
+    def draw(self, context):
+        self.layout.prop(self, "network")
+
+
+def preferences(context) -> NgptPreferences:
+    return context.preferences.addons[__name__].preferences
+
+
 class RENDER_OT_ngpt_denoise(bpy.types.Operator):
     """Denoise the last render by an ngpt network, into a new image"""
 
@@ -240,7 +258,7 @@ class RENDER_OT_ngpt_denoise(bpy.types.Operator):
     def execute(self, context):
         scene, manager = context.scene, context.window_manager
         try:
-            network = Network(Path(bpy.path.abspath(scene.ngpt_network)))
+            network = Network(Path(bpy.path.abspath(preferences(context).network)))
             layers = render_layers(scene, context.view_layer.name)
             manager.progress_begin(0, 1)
             try:
@@ -268,28 +286,20 @@ class IMAGE_PT_ngpt(bpy.types.Panel):
         if problem := missing():
             column.label(text=problem.split(";")[0], icon="ERROR")
             column.label(text=problem.partition(": ")[2])
-        column.prop(context.scene, "ngpt_network")
+        column.prop(preferences(context), "network")
         if hasattr(context.view_layer, "cycles"):
             column.prop(context.view_layer.cycles, "denoising_store_passes", text="Denoising Data")
         column.operator(RENDER_OT_ngpt_denoise.bl_idname)
 
 
+CLASSES = (NgptPreferences, RENDER_OT_ngpt_denoise, IMAGE_PT_ngpt)
+
+
 def register():
-    bpy.types.Scene.ngpt_network = bpy.props.StringProperty(
-        name="Network",
-        description="An .onnx file of ngpt that reads colour, albedo, normal and depth",
-        subtype="FILE_PATH",
-        default=str(Path(__file__).resolve().with_name("ngpt-colour.onnx")),
-    )
-    bpy.utils.register_class(RENDER_OT_ngpt_denoise)
-    bpy.utils.register_class(IMAGE_PT_ngpt)
+    for made in CLASSES:
+        bpy.utils.register_class(made)
 
 
 def unregister():
-    bpy.utils.unregister_class(IMAGE_PT_ngpt)
-    bpy.utils.unregister_class(RENDER_OT_ngpt_denoise)
-    del bpy.types.Scene.ngpt_network
-
-
-if __name__ == "__main__":
-    register()
+    for made in reversed(CLASSES):
+        bpy.utils.unregister_class(made)
