@@ -31,7 +31,7 @@ def press():
 
 def pixels():
     """The image of the add-on, (H, W, 4), row 0 on top."""
-    image = bpy.data.images["ngpt"]
+    image = bpy.data.images["ngpt denoised"]
     values = np.empty(image.size[0] * image.size[1] * 4, np.float32)
     image.pixels.foreach_get(values)
     return values.reshape(image.size[1], image.size[0], 4)[::-1]
@@ -65,7 +65,7 @@ def main():
     said["passes"] = press()
     said["settings stay"] = settings() == before
     np.save(FOLDER / "passes.npy", pixels())
-    image = bpy.data.images["ngpt"]
+    image = bpy.data.images["ngpt denoised"]
     said["image"] = [image.is_float, image.colorspace_settings.name, image.packed_file is not None]
 
     # In tiles: of the least size that there is, and with the statistics of the whole.

@@ -4,7 +4,7 @@ Each ``NAME.exr`` is a multi-layer file with the denoising passes, as a user get
 in Blender's Python, where ngpt is not installed.
 
 Options before the folder: ``--blur`` opens the lens, ``--interleaved`` writes one part instead of one for each pass,
-``--size WIDTHxHEIGHT``.
+``--denoised`` has Cycles denoise, ``--size WIDTHxHEIGHT``.
 """
 
 import argparse
@@ -113,11 +113,13 @@ def main():
     parser = argparse.ArgumentParser()
     parser.add_argument("--blur", action="store_true")
     parser.add_argument("--interleaved", action="store_true")
+    parser.add_argument("--denoised", action="store_true")
     parser.add_argument("--size", default="480x270")
     parser.add_argument("folder", type=Path)
     parser.add_argument("renders", nargs="+")
     given = parser.parse_args()
     prepare(given.size, given.interleaved, given.blur)
+    bpy.context.scene.cycles.use_denoising = given.denoised
     for wanted in given.renders:
         name, _, how = wanted.partition("=")
         render(given.folder / f"{name}.exr", *map(int, how.split(":")))

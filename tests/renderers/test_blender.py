@@ -76,6 +76,16 @@ def test_one_part_holds_the_same(rendered, tmp_path):
         assert np.allclose(one[name], several[name], rtol=1e-3, atol=1e-3), name
 
 
+def test_what_cycles_denoised_is_not_denoised_again(tmp_path):
+    run("bpy", "blender_scene.py", "--denoised", "--size", "64x36", tmp_path, "both=4:1")
+    run("bpy", "blender_scene.py", "--size", "64x36", tmp_path, "noisy=4:1")
+    both, noisy = (ngpt.read(tmp_path / f"{name}.exr") for name in ("both", "noisy"))
+    assert both.source.resolution["primal"].name.endswith("Noisy Image")
+    assert np.allclose(both["primal"], noisy["primal"], rtol=1e-3, atol=1e-4)
+    denoised = ngpt.read(tmp_path / "both.exr", layers={"primal": "ViewLayer.Combined"})["primal"]
+    assert np.abs(denoised - noisy["primal"]).mean() > 0.01
+
+
 def test_auto_is_as_good_as_oidn(rendered, errors):
     pytest.importorskip("mitsuba_oidn")
     stack = ngpt.read(rendered / "noisy.exr")
