@@ -173,7 +173,7 @@ class Network:
         # All tiles share the statistics of the whole image, so that no seam shows.
         whole = self.path.with_suffix(".statistics.onnx")
         if not whole.is_file():
-            raise NgptError(f"{width}x{height} pixels go in tiles, which need {whole.name}: put it beside {self.path.name}")
+            raise NgptError(f"{width}x{height} goes in tiles, which need {whole.name}: put it beside {self.path.name}")
         reader = session(whole)
         statistics = reader.run(["statistics"], {given.name: feed[given.name] for given in reader.get_inputs()})[0]
         side = int(math.sqrt(memory / self.bytes)) - 2 * self.overlap
