@@ -14,24 +14,29 @@ pytestmark = pytest.mark.slow
 
 SIZE = (256, 144)
 # `auto` where OIDN is not installed, over OIDN's error. ngpt-colour is what sets it: tighten it with every new one.
-WITHOUT_OIDN = 4.0
+WITHOUT_OIDN = 3.5
 
 
-@pytest.fixture(scope="module", params=["sharp", "blurred"])
-def rendered(request, tmp_path_factory):
-    """A folder with ``noisy`` at 16 spp, and two halves of a reference, of the scene with the lens closed or open."""
-    folder = tmp_path_factory.mktemp(request.param)
-    lens = ["--blur"] if request.param == "blurred" else []
-    size = ["--size", "{}x{}".format(*SIZE)]
-    run("bpy", "blender_scene.py", *lens, *size, folder, "noisy=16:1", "a=112:2", "b=112:3")
-    return folder
+def render(folder, *options, size=SIZE):
+    run("bpy", "blender_scene.py", "--size", "{}x{}".format(*size), *options[:-1], folder, *options[-1])
 
 
 @pytest.fixture(scope="module")
-def errors(rendered):
-    """Of an image: its error against the reference, whose own noise does not count."""
-    halves = [ngpt.read(rendered / f"{name}.exr")["primal"] for name in "ab"]
-    return lambda image: relmse_trimmed(image, *halves)
+def noisy(tmp_path_factory):
+    """A file of 16 spp, the lens closed."""
+    folder = tmp_path_factory.mktemp("noisy")
+    render(folder, ["noisy=16:1"])
+    return folder / "noisy.exr"
+
+
+@pytest.fixture(scope="module", params=["sharp", "blurred"])
+def scene(request, tmp_path_factory):
+    """The stack at 16 spp, lens closed or open; and its images' error: the noise of the reference does not count."""
+    folder = tmp_path_factory.mktemp(request.param)
+    lens = ["--blur"] if request.param == "blurred" else []
+    render(folder, *lens, ["noisy=16:1", "a=112:2", "b=112:3"])
+    noisy, *halves = (ngpt.read(folder / f"{name}.exr") for name in ("noisy", "a", "b"))
+    return noisy, lambda image: relmse_trimmed(image, *(half["primal"] for half in halves))
 
 
 def check_layers(stack):
@@ -49,10 +54,10 @@ def check_layers(stack):
     assert np.all(stack["alpha"] == 1)
 
 
-def test_the_parts_of_a_file_are_found(rendered):
-    stack = ngpt.read(rendered / "noisy.exr")
+def test_the_parts_of_a_file_are_found(noisy):
+    stack = ngpt.read(noisy)
     check_layers(stack)
-    # Each pass is a part of its own, and the file holds others that a layer could be mistaken for.
+    # The file holds other passes that a layer could be mistaken for.
     found = stack.source.resolution
     assert {name: where.name.partition(".")[2] for name, where in found.items()} == {
         "primal": "Combined",
@@ -65,44 +70,36 @@ def test_the_parts_of_a_file_are_found(rendered):
         assert len({where.part for where in found.values()}) == 4
 
 
-def test_one_part_holds_the_same(rendered, tmp_path):
-    if rendered.name.startswith("blurred"):
-        pytest.skip("once is enough")
-    run("bpy", "blender_scene.py", "--interleaved", "--size", "{}x{}".format(*SIZE), tmp_path, "noisy=16:1")
-    one, several = ngpt.read(tmp_path / "noisy.exr"), ngpt.read(rendered / "noisy.exr")
+def test_one_part_holds_the_same(noisy, tmp_path):
+    render(tmp_path, "--interleaved", ["noisy=16:1"])
+    one, other = ngpt.read(tmp_path / "noisy.exr"), ngpt.read(noisy)
     assert len(one.source.image.parts) == 1
     check_layers(one)
-    for name in several.names:
-        assert np.allclose(one[name], several[name], rtol=1e-3, atol=1e-3), name
+    for name in other.names:
+        # Sums of samples in another order: a pixel or two may differ by more.
+        assert np.isclose(one[name], other[name], rtol=1e-3, atol=1e-3).mean() > 0.999, name
 
 
 def test_what_cycles_denoised_is_not_denoised_again(tmp_path):
-    run("bpy", "blender_scene.py", "--denoised", "--size", "64x36", tmp_path, "both=4:1")
-    run("bpy", "blender_scene.py", "--size", "64x36", tmp_path, "noisy=4:1")
+    render(tmp_path, "--denoised", ["both=4:1"], size=(64, 36))
+    render(tmp_path, ["noisy=4:1"], size=(64, 36))
     both, noisy = (ngpt.read(tmp_path / f"{name}.exr") for name in ("both", "noisy"))
     assert both.source.resolution["primal"].name.endswith("Noisy Image")
-    assert np.allclose(both["primal"], noisy["primal"], rtol=1e-3, atol=1e-4)
+    assert np.isclose(both["primal"], noisy["primal"], rtol=1e-3, atol=1e-3).mean() > 0.999
     denoised = ngpt.read(tmp_path / "both.exr", layers={"primal": "ViewLayer.Combined"})["primal"]
     assert np.abs(denoised - noisy["primal"]).mean() > 0.01
 
 
-def test_auto_is_as_good_as_oidn(rendered, errors):
+def test_auto_leaves_no_more_than_oidn_and_is_near_it_without(scene, monkeypatch):
     pytest.importorskip("mitsuba_oidn")
-    stack = ngpt.read(rendered / "noisy.exr")
-    theirs = errors(ngpt.denoise(stack, method="oidn"))
-    assert errors(ngpt.denoise(stack)) <= 1.001 * theirs < 0.25 * errors(stack["primal"])
-
-
-def test_auto_without_oidn_is_near_it(rendered, errors, monkeypatch, record_property):
-    pytest.importorskip("mitsuba_oidn")
-    stack = ngpt.read(rendered / "noisy.exr")
-    theirs = errors(ngpt.denoise(stack, method="oidn"))
+    stack, error = scene
+    theirs, noisy = error(ngpt.denoise(stack, method="oidn")), error(stack["primal"])
+    assert error(ngpt.denoise(stack)) <= 1.001 * theirs < 0.25 * noisy
     monkeypatch.setattr(oidn, "find_spec", lambda name: None)
     result = ngpt.reconstruct(stack)
     assert result.method not in ("oidn", "primal")
-    ours = errors(result.image)
-    record_property("without OIDN", f"{result.method}: {ours:.5f}, OIDN {theirs:.5f}, {ours / theirs:.2f}")
-    print(f"{result.method} {ours:.5f}, OIDN {theirs:.5f}: {ours / theirs:.2f}; input {errors(stack['primal']):.5f}")
+    ours = error(result.image)
+    print(f"{result.method} {ours:.5f}, OIDN {theirs:.5f}: {ours / theirs:.2f}; input {noisy:.5f}")
     assert ours <= WITHOUT_OIDN * theirs
 
 
