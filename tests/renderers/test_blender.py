@@ -34,7 +34,7 @@ def scene(request, tmp_path_factory):
     """The stack at 16 spp, lens closed or open; and its images' error: the noise of the reference does not count."""
     folder = tmp_path_factory.mktemp(request.param)
     lens = ["--blur"] if request.param == "blurred" else []
-    render(folder, *lens, ["noisy=16:1", "a=64:2", "b=64:3"])
+    render(folder, *lens, ["noisy=16:1", "a=112:2", "b=112:3"])
     noisy, *halves = (ngpt.read(folder / f"{name}.exr") for name in ("noisy", "a", "b"))
     return noisy, lambda image: relmse_trimmed(image, *(half["primal"] for half in halves))
 
