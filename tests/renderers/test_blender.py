@@ -34,7 +34,7 @@ def scene(request, tmp_path_factory):
     """The stack at 16 spp, lens closed or open; and the trimmed relMSE of an image of it.
 
     The reference is noisy itself. With two halves, squares have no part of that; what they are relative to would have,
-    and is OIDN's image of both halves for that reason: relative to their mean, OIDN's own error came out twice as large.
+    and is OIDN's image of both halves for that reason: relative to their mean, OIDN's error came out twice as large.
     """
     pytest.importorskip("mitsuba_oidn")
     folder = tmp_path_factory.mktemp(request.param)
