@@ -32,6 +32,7 @@ VERBS = {
     "denoise": Verb("reconstruct images from gradient stacks"),
     "info": Verb("say what a file holds, or what a scene requires"),
     "diff": Verb("compare two images"),
+    "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
     "advise": Verb("say which method and how many samples to use, for a time or an error"),
     "dataset": Verb("make a training set, or continue one", "train", _CONTINUES),
     "train": Verb("train a network, or continue a run", "train", _CONTINUES),
