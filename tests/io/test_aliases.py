@@ -180,6 +180,29 @@ PRODUCERS = {
         [("albedo", list("RGB")), ("C", list("RGBA"))],
         {"primal": list("RGB"), "albedo": list("RGB"), "alpha": ["A"]},
     ),
+    "LuxCore in Blender": (
+        [
+            (
+                "",
+                names(
+                    "View Layer.Combined.RGBA",
+                    "View Layer.Depth.Z",
+                    "View Layer.ALBEDO.RGB",
+                    "View Layer.GEOMETRY_NORMAL.XYZ",
+                    "View Layer.SHADING_NORMAL.XYZ",
+                    "View Layer.AVG_SHADING_NORMAL.XYZ",
+                    "View Layer.DIRECT_DIFFUSE.RGB",
+                ),
+            )
+        ],
+        {
+            "primal": names("View Layer.Combined.RGB"),
+            "albedo": names("View Layer.ALBEDO.RGB"),
+            "normal": names("View Layer.AVG_SHADING_NORMAL.XYZ"),
+            "depth": ["View Layer.Depth.Z"],
+            "alpha": ["View Layer.Combined.A"],
+        },
+    ),
     "pbrt-v4": (
         [("", names("RGB", "Albedo.RGB", "P.XYZ", "N.XYZ", "Ns.XYZ", "Variance.RGB", "RelativeVariance.RGB", "u"))],
         {"primal": list("RGB"), "albedo": names("Albedo.RGB"), "normal": names("Ns.XYZ")},
