@@ -159,7 +159,7 @@ def exposure(primal: Tensor) -> Tensor:
 
 
 def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]:
-    """The layers with radiance over exposure and depth over its maximum, and the exposure (N, 1, 1, 1).
+    """The layers, radiance over exposure, depth over its maximum, albedo in [0, 1]; and the exposure (N, 1, 1, 1).
 
     Both belong to the whole image: normalise before cutting tiles.
     """
@@ -167,6 +167,9 @@ def normalised(layers: Mapping[str, Tensor]) -> tuple[dict[str, Tensor], Tensor]
     result = dict(layers)
     for name in RADIANCE & result.keys():
         result[name] = result[name] / scale
+    if "albedo" in result:
+        # Some renderers write the brightness of lamps there.
+        result["albedo"] = result["albedo"].clamp(0, 1)
     if "depth" in result:
         result["depth"] = result["depth"] / (LEAST_DEPTH + torch.amax(result["depth"], (1, 2, 3), keepdim=True))
     return result, scale

@@ -19,6 +19,8 @@ def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Va
             scaled[name] = op.Sqrt(op.Max(clean(finite[name.replace("_se", "_var")]), 0.0)) / exposure
         elif name in finite:
             scaled[name] = finite[name] / exposure if name in RADIANCE else finite[name]
+    if "albedo" in scaled:
+        scaled["albedo"] = op.Min(op.Max(scaled["albedo"], 0.0), 1.0)
     if "depth" in scaled:
         scaled["depth"] = scaled["depth"] / (depth + LEAST_DEPTH)
     return scaled
