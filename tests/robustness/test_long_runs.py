@@ -28,11 +28,11 @@ def note():
 DENOISE = """
 import sys, ngpt.cli.denoise as verb
 from ngpt.cli import main
-one = verb.denoise_file
-def noted(*arguments):
-    try: return one(*arguments)
+one = verb.write_frame
+def noted(*arguments, **options):
+    try: return one(*arguments, **options)
     finally: note()
-verb.denoise_file = noted
+verb.write_frame = noted
 sys.exit(main(["denoise", sys.argv[1], "-o", sys.argv[2], "-q"]))
 """
 
