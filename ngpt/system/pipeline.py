@@ -19,9 +19,18 @@ def overlapped(
 
     ``read`` is one item ahead and ``write`` one behind, each in a thread of its own; ``compute`` runs in the caller's.
     So at most three items are held at once. Any other error is raised when its item's turn has come. Whatever ends the
-    work early, an interrupt or ``close()``, the threads finish what they have begun and start nothing else.
+    work early, an interrupt or ``close()``, the threads finish what they have begun and start nothing else. A single
+    item needs no threads. Raises MemoryError where there is no room for two.
     """
+    if len(items) == 1:
+        yield _told(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
+        return
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
+        try:
+            for thread in (reader, writer):
+                thread.submit(int)
+        except RuntimeError as error:  # what Python makes of it
+            raise MemoryError(str(error)) from error
         coming: Future | None = None
         going: Future | None = None
         for i, item in enumerate(items):
@@ -29,11 +38,11 @@ def overlapped(
             coming = reader.submit(_attempt, read, items[i + 1]) if i + 1 < len(items) else None
             value = _attempt(compute, value)
             if going:
-                yield _told(going)
+                yield _told(going.result())
             going = writer.submit(_attempt, write, value)
             del value  # the writer's alone, that it be gone when it is written
         if going:
-            yield _told(going)
+            yield _told(going.result())
 
 
 def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
@@ -46,8 +55,8 @@ def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
         return error
 
 
-def _told(done: Future) -> Any:
-    outcome = done.result()
+def _told(outcome: Any) -> Any:
+    """The outcome of an item, unless it is an error that concerns all of them."""
     if isinstance(outcome, Exception) and not isinstance(outcome, NgptError):
         raise outcome
     return outcome

@@ -19,10 +19,11 @@ SLOWER = 2.0
 
 # Printed by the process itself, one line each: seconds since its start, and MiB in memory.
 NOTE = """
-import gc, time
+import gc, sys, time
 def note():
     resident = int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
-    print("note", time.perf_counter(), resident, flush=True)
+    # Not standard output by its usual name, which is another while a file is read in another thread.
+    print("note", time.perf_counter(), resident, flush=True, file=sys.__stdout__)
 """
 
 DENOISE = """
