@@ -131,7 +131,8 @@ class Trainer:
     def run(self, progress: Callable[[int, int], None] = lambda done, total: None) -> bool:
         """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
 
-        ``progress`` is called with (steps done, all steps), before the first step of this run and after each. Raises NgptError when the loss or its gradient is not finite any more; the batch is saved then.
+        ``progress`` is called with (steps done, all steps), before the first step of this run and after each. Raises
+        NgptError when the loss or its gradient is not finite any more; the batch is saved then.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
         batches = self._batches()
