@@ -212,7 +212,7 @@ def test_the_commands_run_as_printed(renderer, tmp_path, capsys, monkeypatch, me
     # The best of the table is none of ours: what cannot be followed is not advised.
     table = {"metric": "relMSE", "methods": {"gone": kind, method: kind}, "scenes": scenes}
     (tmp_path / "t.json").write_text(json.dumps(table))
-    words = ["advise", str(scene), "--size", "24x16", "--seconds", "0.05", "--table", "t.json", "-D", "light=3"]
+    words = ["advise", str(scene), "--size", "24x16", "--seconds", "2", "--table", "t.json", "-D", "light=3"]
     assert main(words) == 0
     printed = capsys.readouterr().out
     assert "not here: this version has no method 'gone'" in printed
