@@ -5,6 +5,8 @@ import os
 import resource
 import subprocess
 import sys
+import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -52,6 +54,23 @@ def test_all_reports_arrive_in_order(frames, tmp_path):
     files = json.loads(run.stdout)["files"]
     assert [os.path.basename(f["input"]) for f in files] == [f"{i}.exr" for i in range(6)]
     assert ["error" in f for f in files] == [False, False, False, True, False, False]
+
+
+def test_three_frames_are_in_memory_at_most(frames, tmp_path, monkeypatch):
+    alive, most, lock = set(), [], threading.Lock()
+
+    def counted(*arguments):
+        stack = ngpt.read(arguments[0])
+        with lock:
+            alive.add(id(stack))
+            most.append(len(alive))
+        weakref.finalize(stack, alive.discard, id(stack))
+        return stack
+
+    monkeypatch.setattr("ngpt.cli.denoise.read", counted)
+    (frames / "2.exr").write_bytes(b"not an image")
+    assert main(["denoise", str(frames), "-o", str(tmp_path / "out"), "-m", "l2", "-q"]) == 1
+    assert len(most) == 5 and max(most) <= 3 and not alive
 
 
 def test_frames_that_the_disk_has_no_room_for(frames, tmp_path):
