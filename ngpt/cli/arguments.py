@@ -13,7 +13,7 @@ from ngpt.system import configs
 RESULT_SUFFIX = "_denoised"
 
 
-def add_force(parser: argparse.ArgumentParser) -> None:
+def add_force(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
 
 
