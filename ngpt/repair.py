@@ -9,8 +9,8 @@ from scipy.ndimage import uniform_filter
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
-# Sides of the blocks from which the insides of holes are filled: powers of it.
-BLOCK = 4
+# Sides of the blocks from which the insides of holes are filled: powers of it. Tiles of networks begin at multiples.
+BLOCK = 8
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -
     """primal - direct, with pixels that are not good replaced.
 
     By the mean of the good ones among their eight neighbours, or where there is none, in the inside of a larger hole,
-    by the mean of those in the smallest block that has any: of 4x4 pixels, 16x16, 64x64 and so on.
+    by the mean of those in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
     """
     image = np.subtract(primal, direct, where=good[..., None], out=np.zeros_like(primal))
     weight = uniform_filter(good.astype(np.float64), 3, mode="constant")

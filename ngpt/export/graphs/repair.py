@@ -10,8 +10,8 @@ from ngpt.repair import BLOCK
 
 _IMAGE = ("tiles", 3, "height", "width")
 _UNKNOWN = np.float32(np.nan)
-# Blocks of 4^7 = 16384 pixels hold any image that files may.
-_LEVELS = 7
+# Blocks of 8^5 = 32768 pixels hold any image that files may.
+_LEVELS = 5
 
 
 @dataclass(frozen=True)
