@@ -14,7 +14,7 @@ from ngpt.classical.bases import BASES
 from ngpt.export.vector import example_layers, quiet
 from ngpt.io.rawlayers import write_layers
 from ngpt.methods import reconstruct
-from ngpt.network.inputs import DENOISED, denoised
+from ngpt.network.inputs import DENOISED, Oidn, denoised
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -66,7 +66,7 @@ def test_of_the_same_images_of_oidn_the_graph_makes_the_pixels_of_denoise(stack,
     onnxruntime = pytest.importorskip("onnxruntime")
     layers, held = stack
     data = repair(held)
-    made = denoised(data, BASES["wcv"](data), DENOISED)
+    made = denoised(Oidn(data), BASES["wcv"](data), DENOISED)
     given = layers | {name: planes_of(image + data.direct) for name, image in made.items()}
     session = onnxruntime.InferenceSession(WEIGHTS / f"{method}.onnx", quiet())
     image = session.run(["image"], {each.name: given[each.name] for each in session.get_inputs()})[0]
