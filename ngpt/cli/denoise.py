@@ -11,11 +11,13 @@ import numpy as np
 
 from ngpt.cli.arguments import (
     RESULT_SUFFIX,
+    add_files,
     add_force,
     add_json,
     add_layers,
     add_untrusted,
     assignment,
+    given_files,
     print_json,
     stack_files,
 )
@@ -29,9 +31,6 @@ from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
-
-# Layers that many renderers write into files of their own.
-FILES = ("albedo", "normal", "depth")
 
 # The options of methods that are numbers; they may be "auto" as well.
 NUMBERS = {
@@ -67,8 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"an option of the method; may be repeated. With their defaults: {_options()}",
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
-    for layer in FILES:
-        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
+    add_files(parser)
     add_layers(parser)
     add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
@@ -80,7 +78,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    files = {layer: file for layer in FILES if (file := getattr(args, layer))}
+    files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
         raise NgptError(
