@@ -28,19 +28,19 @@ def timed(scene: mi.Scene, options: Mapping[str, Any], spp: int, seed: int) -> t
 
 
 def measure(
-    scene: mi.Scene, renders: Mapping[str, Mapping[str, Any]], spp: int, repeats: int
+    scene: mi.Scene, renders: Mapping[str, Mapping[str, Any]], spp: int, repeats: int, seed: int = 0
 ) -> tuple[dict[str, list[float]], GradientStack]:
     """Seconds per sample of the whole image for each render, name -> options, and the last stack of the first of them.
 
-    Each is rendered ``repeats`` times, in turn, so that a busy moment hits all alike.
+    Each is rendered ``repeats`` times, with seeds from ``seed`` on, in turn, so that a busy moment hits all alike.
     """
     seconds: dict[str, list[float]] = {name: [] for name in renders}
     first = next(iter(renders))
     for options in renders.values():
         warm_up(scene, options)
-    for seed in range(repeats):
+    for i in range(repeats):
         for name, options in renders.items():
-            rendered, duration = timed(scene, options, spp, seed)
+            rendered, duration = timed(scene, options, spp, seed + i)
             seconds[name].append(duration / spp)
             if name == first:
                 stack = rendered

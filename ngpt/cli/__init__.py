@@ -29,8 +29,12 @@ VERBS = {
     "demo": Verb("render built-in scenes, reconstruct with every method, and write a report to open in a browser"),
     "render": Verb("render a scene to a gradient stack"),
     "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
-    "denoise": Verb("reconstruct images from gradient stacks"),
+    "denoise": Verb(
+        "reconstruct images from gradient stacks",
+        interrupted="interrupted; --skip-existing goes on with what is not done yet",
+    ),
     "info": Verb("say what a file holds, or what a scene requires"),
+    "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
     "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
     "advise": Verb("say which method and how many samples to use, for a time or an error"),

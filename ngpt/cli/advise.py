@@ -1,11 +1,15 @@
 """``ngpt advise``: which method, and how many samples, for the time there is or the error to reach."""
 
 import argparse
+import shlex
 import time
 from dataclasses import asdict
+from pathlib import Path
 
 from ngpt.cli.arguments import add_json, assignment, duration, natural, positive, print_json, size
-from ngpt.measure.advice import advise, describe, read_table
+from ngpt.errors import NgptError
+from ngpt.measure.advice import Advice, advise, describe, read_table
+from ngpt.methods import METHODS
 from ngpt.system.console import Console
 
 
@@ -41,16 +45,20 @@ def run(args: argparse.Namespace, console: Console) -> int:
     scene = load_scene(args.scene, args.size, dict(args.define))
     sampler, reason = choose(scene_facts(scene))
     # Gradients first, whose stack is the pilot.
-    seconds, pilot = measure(scene, {render.name: render.options for render in DEFAULTS}, max(args.pilot, 2), 1)
+    seconds, pilot = measure(
+        scene, {render.name: render.options for render in DEFAULTS}, max(args.pilot, 2), 1, args.seed
+    )
     pixels = pilot.width * pilot.height
     cost = {kind: min(values) / pixels for kind, values in seconds.items()}
     advices = advise(table, describe(pilot), cost, pixels, seconds=args.seconds, error=args.error)
     console.say(
         f"{args.scene}: pilot of {max(args.pilot, 2)} spp, {time.perf_counter() - start:.1f} s with compilation"
     )
+    lacks = {a.method: absence(call(a.method, table)[0]) for a in advices}
     if args.json:
         report = {"scene": args.scene, "size": [pilot.width, pilot.height], "sampler": sampler}
-        print_json(report | {"advice": [asdict(a) for a in advices]})
+        rows = [asdict(a) | {"missing": lacks[a.method], "commands": commands(a, args, table)} for a in advices]
+        print_json(report | {"advice": rows})
         return 0
     console.say(f"{args.scene}: gradients by sampler '{sampler}': {reason}")
     print(
@@ -58,8 +66,41 @@ def run(args: argparse.Namespace, console: Console) -> int:
     )
     for a in advices:
         likely = f"{a.low:.2g} .. {a.high:.2g}"
-        print(f"{a.method:18}{a.stack:11}{a.spp:7}{a.seconds:9.3g}{a.error:16.3g}{likely:>20}{a.sure:7.0%}")
-    best = advices[0]
-    option = "" if best.stack == "gradients" else " --sampler primal"
-    console.say(f"ngpt render {args.scene} -o stack.exr --spp {best.spp}{option}; then method {best.method}")
+        note = f"  not here: {lacks[a.method]}" if lacks[a.method] else ""
+        print(f"{a.method:18}{a.stack:11}{a.spp:7}{a.seconds:9.3g}{a.error:16.3g}{likely:>20}{a.sure:7.0%}{note}")
+    # The best of those that run here; the table goes on for those who can install what another lacks.
+    best = next((a for a in advices if not lacks[a.method]), None)
+    if best is None:
+        raise NgptError(f"none of these methods runs here; {advices[0].method}: {lacks[advices[0].method]}")
+    print("", *commands(best, args, table), sep="\n")
     return 0
+
+
+def call(name: str, table: dict) -> tuple[str, dict]:
+    """What a row of the table is to ``ngpt denoise``: a method, and options that are not its defaults."""
+    entry = table.get("calls", {}).get(name, {})
+    return entry.get("method", name), entry.get("options", {})
+
+
+def absence(method: str) -> str:
+    """Why a method cannot be used here, "" if it can."""
+    return METHODS[method].missing() if method in METHODS else f"this version has no method '{method}'"
+
+
+def commands(advice: Advice, args: argparse.Namespace, table: dict) -> list[str]:
+    """What to type to follow the advice: a line that renders the stack, and one that denoises it."""
+    stem = f"{Path(args.scene).stem}-{advice.spp}spp"
+    render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(advice.spp)]
+    if advice.stack != "gradients":
+        render += ["--sampler", "primal"]
+    if args.size:
+        render += ["--size", "{}x{}".format(*args.size)]
+    if args.variant:
+        render += ["--variant", args.variant]
+    for name, value in args.define:
+        render += ["-D", f"{name}={value}"]
+    method, options = call(advice.method, table)
+    denoise = ["ngpt", "denoise", f"{stem}.exr", "-o", f"{stem}-{advice.method}.exr", "--method", method]
+    for name, value in options.items():
+        denoise += ["-O", f"{name}={value}"]
+    return [shlex.join(render), shlex.join(denoise)]

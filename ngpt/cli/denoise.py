@@ -2,31 +2,35 @@
 
 import argparse
 import os
+from contextlib import closing, nullcontext
+from functools import partial
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ngpt.cli.arguments import (
     RESULT_SUFFIX,
+    add_files,
     add_force,
     add_json,
     add_layers,
     add_untrusted,
     assignment,
+    given_files,
     print_json,
     stack_files,
 )
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import METHODS, Result, reconstruct
 from ngpt.network.run_onnx import MEMORY
+from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
+from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
-
-# Layers that many renderers write into files of their own.
-FILES = ("albedo", "normal", "depth")
 
 # The options of methods that are numbers; they may be "auto" as well.
 NUMBERS = {
@@ -62,54 +66,101 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"an option of the method; may be repeated. With their defaults: {_options()}",
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
-    for layer in FILES:
-        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
+    add_files(parser)
     add_layers(parser)
     add_untrusted(parser)
-    add_force(parser)
+    existing = parser.add_mutually_exclusive_group()
+    add_force(existing)
+    existing.add_argument(
+        "--skip-existing", action="store_true", help="leave stacks out whose results are there: goes on with a folder"
+    )
     add_json(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    files = {layer: file for layer in FILES if (file := getattr(args, layer))}
+    files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
         raise NgptError(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
     for _, target in pairs:
-        check_output(target, args.force)
+        check_output(target, args.force or args.skip_existing)
+        if target.suffix.lower() != ".exr":
+            raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
     reference = read_image(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
     options |= {name: number(text) if name in NUMBERS else text for name, text in args.option}
+    # One stack has no progress to tell, but somebody who looks on sees that it is at work.
+    shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
+    frames = overlapped(
+        pairs,
+        partial(read_frame, args=args, files=files),
+        partial(compute_frame, method=args.method, options=options, reference=reference),
+        partial(write_frame, overwrite=args.force),
+    )
     reports = []
-    for i, (source, target) in enumerate(pairs, 1):
-        try:
-            report = denoise_file(source, target, args, files, options, reference)
-            console.say(f"[{i}/{len(pairs)}] {describe(report)}")
-        except NgptError as error:
-            report = {"input": str(source), "error": str(error)}
-            console.error(error)
-        reports.append(report)
+    with shown as progress, closing(frames):
+        progress(0, len(pairs))
+        for i, ((source, _), report) in enumerate(zip(pairs, frames, strict=True), 1):
+            if isinstance(report, NgptError):
+                console.error(report)
+                report = {"input": str(source), "error": str(report)}
+            else:
+                console.say(f"[{i}/{len(pairs)}] {describe(report)}")
+            reports.append(report)
+            progress(i, len(pairs))
     failed = sum("error" in report for report in reports)
+    skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:
         console.error(f"{failed} of {len(pairs)} stacks were not reconstructed")
+    if skipped:
+        console.say(f"{skipped} of {len(pairs)} stacks were skipped: their results are there")
     if args.json:
         print_json({"ok": failed == 0, "files": reports})
     return 1 if failed else 0
 
 
-def denoise_file(
-    source: Path, target: Path, args, files: dict[str, str], options: dict, reference: np.ndarray | None
-) -> dict:
-    """Reads, reconstructs and writes one stack; returns what there is to report."""
-    stack = read(source, dict(args.layer), args.untrusted, files)
-    result = reconstruct(stack, args.method, **options)
-    report = {
-        "input": str(source),
-        "output": str(target),
+def _unseen(done: int, total: int) -> None:
+    """Progress that nobody is shown."""
+
+
+class Frame(NamedTuple):
+    """A stack on its way from its file to that of its result; without ``stack`` its result was there already."""
+
+    source: Path
+    target: Path
+    stack: GradientStack | None
+    result: Result | None = None
+    metrics: dict[str, float] | None = None
+
+
+def read_frame(pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str]) -> Frame:
+    source, target = pair
+    # Only now, for several machines may be at work on one folder.
+    if args.skip_existing and target.exists():
+        return Frame(source, target, None)
+    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files))
+
+
+def compute_frame(frame: Frame, method: str, options: dict, reference: np.ndarray | None) -> Frame:
+    if frame.stack is None:
+        return frame
+    result = reconstruct(frame.stack, method, **options)
+    metrics = compare(result.image, reference) if reference is not None else None
+    return frame._replace(result=result, metrics=metrics)
+
+
+def write_frame(frame: Frame, overwrite: bool) -> dict:
+    """Writes the result, and returns what there is to report."""
+    source, target, stack, result, metrics = frame
+    report: dict[str, Any] = {"input": str(source), "output": str(target)}
+    if stack is None or result is None:
+        return report | {"skipped": True}
+    write(target, result.image, like=stack, overwrite=overwrite, attributes=result.attributes)
+    report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
         "options": result.options,
@@ -121,10 +172,7 @@ def denoise_file(
         "repaired": result.repaired,
         "untrusted": result.untrusted,
     }
-    if reference is not None:
-        report["metrics"] = compare(result.image, reference)
-    write(target, result.image, like=stack, overwrite=args.force, attributes=result.attributes)
-    return report
+    return report | ({"metrics": metrics} if metrics else {})
 
 
 def alpha(text: str) -> float | str:
@@ -155,6 +203,8 @@ def _options() -> str:
 
 def describe(report: dict) -> str:
     """One line about one file."""
+    if "skipped" in report:
+        return f"{report['input']} -> {report['output']}: skipped, exists already"
     text = f"{report['input']} -> {report['output']}: {report['method']}"
     if report["weights"] and report["method"] not in METHODS:
         text += f", sha256 {report['weights']['sha256'][:12]}"
@@ -174,8 +224,10 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         targets = [Path(output)]
     else:
         folder = Path(output)
-        if folder.exists() and not folder.is_dir():
-            raise NgptError(f"{folder}: is a file; the results of {len(sources)} stacks need a folder")
+        named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
+        if not folder.is_dir() and (folder.exists() or named_file):
+            kind = "is a file" if folder.exists() else "is the name of a file"
+            raise NgptError(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
         targets = [folder / path.name for path in sources]
         repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
         if repeated:

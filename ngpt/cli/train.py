@@ -64,7 +64,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if processes.rank == 0:
             with atomic_output(out / "settings.json", overwrite=True) as temporary:
                 temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
-        finished = trainer.run()
+        # Of several processes one is enough to listen to.
+        listener = console if processes.rank == 0 else Console(quiet=True)
+        with listener.progress("train", "steps", rate=True) as progress:
+            finished = trainer.run(progress)
     processes.close()
     say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
     return 0 if finished or not trainer.signal else 128 + trainer.signal

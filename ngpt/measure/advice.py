@@ -101,9 +101,13 @@ def make_table(results: dict[str, Any]) -> dict[str, Any]:
         scene["methods"] = {m: scene["methods"][m] for m in shared}
     if len(scenes) < 3 or not shared:
         raise NgptError(f"advice needs measurements of at least 3 scenes with a method in common; got {len(scenes)}")
+    # What to ask ``ngpt denoise`` for, where it is not the method of that name as it is.
+    entries = {m: results["methods"][m] for m in shared}
+    calls = {m: {"method": e.get("method", m), "options": e.get("options") or {}} for m, e in entries.items()}
     return {
         "metric": primary,
         "methods": {m: kinds[m] for m in shared},
+        "calls": {m: entry for m, entry in calls.items() if entry != {"method": m, "options": {}}},
         "scenes": scenes,
         "made by": results["command"],
     }

@@ -9,6 +9,7 @@ import signal
 import sys
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
@@ -16,8 +17,10 @@ from typing import TextIO
 from ngpt.errors import NgptError
 from ngpt.system.limits import address_space
 
-# Elsewhere than on a terminal, a line at most this often: a log should show life, not fill up.
+# Elsewhere than on a terminal, a line at most this often, and the next when work has gone on for one part more of so
+# many that it took: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
+LINES = 50
 
 # MiB of address space.
 FEWEST_MIB = 512
@@ -31,7 +34,7 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
     """
     _open_standard_streams()
     console = Console(name=name)
-    with _noted_interrupts() as pressed:
+    with _own_stderr(), _noted_interrupts() as pressed:
         try:
             _check_address_space()
             try:
@@ -127,6 +130,20 @@ def _open_standard_streams() -> None:
         sys.stdout.reconfigure(errors="backslashreplace")
 
 
+@contextmanager
+def _own_stderr() -> Iterator[None]:
+    """Gives messages a descriptor of their own: while any thread reads an OpenEXR file, number 2 leads nowhere."""
+    stream = sys.stderr
+    if type(stream) is not io.TextIOWrapper or stream.fileno() != 2:  # a test's, or a notebook's
+        yield
+        return
+    with open(os.dup(2), "w", buffering=1, encoding=stream.encoding, errors=stream.errors) as sys.stderr:
+        try:
+            yield
+        finally:
+            sys.stderr = stream
+
+
 class Console:
     """Messages and progress for one command. ``quiet`` leaves only errors; ``name`` is what those begin with."""
 
@@ -140,49 +157,92 @@ class Console:
     def error(self, text: object) -> None:
         print_line(f"{self.name}: error: {' '.join(str(text).split())}", sys.stderr)
 
+    @property
+    def terminal(self) -> bool:
+        """Whether somebody is looking on."""
+        return not self.quiet and sys.stderr.isatty()
+
     @contextmanager
-    def progress(self, label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
-        """Yields ``update(done, total)``."""
+    def progress(self, label: str, unit: str, rate: bool = False) -> Iterator[Callable[[int, int], None]]:
+        """Yields ``update(done, total)``; the first call says what was done before. ``rate``: units per second, too."""
         if self.quiet:
             yield lambda done, total: None
-        elif sys.stderr.isatty():
-            with _bar(label, unit) as update:
+        elif self.terminal:
+            with _bar(label, unit, rate) as update:
                 yield update
         else:
-            yield _Lines(self, label, unit)
+            yield _Lines(self, label, unit, rate)
+
+
+class _Pace:
+    """What is left, at the pace of the later half of the time so far: what lay ready in a cache is soon forgotten."""
+
+    def __init__(self, unit: str, rate: bool):
+        self.unit, self.rate = unit, rate
+        self.start, self.elapsed = time.monotonic(), 0.0
+        # (seconds, done), the first of them at half the time or before.
+        self.past: deque[tuple[float, int]] = deque()
+
+    def __call__(self, done: int, total: int) -> list[str]:
+        """What there is to tell of the pace, in a few words each."""
+        self.elapsed = time.monotonic() - self.start
+        if not self.past:
+            self.past.append((0.0, done))
+            return []
+        while len(self.past) > 1 and self.past[1][0] <= self.elapsed / 2:
+            self.past.popleft()
+        then, before = self.past[0]
+        pace = (done - before) / (self.elapsed - then) if self.elapsed > then else 0.0
+        if self.elapsed > 1.01 * self.past[-1][0]:
+            self.past.append((self.elapsed, done))
+        words = [f"{pace:.3g} {self.unit}/s"] if self.rate and pace else []
+        if pace and done < total:
+            words.append(f"about {_span((total - done) / pace)} left")
+        return words
+
+
+def _span(seconds: float) -> str:
+    """A duration, roughly."""
+    for unit, size in (("s", 1), ("min", 60)):
+        if seconds < 100 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds / 3600:.1f} h"
 
 
 @contextmanager
-def _bar(label: str, unit: str) -> Iterator[Callable[[int, int], None]]:
+def _bar(label: str, unit: str, rate: bool) -> Iterator[Callable[[int, int], None]]:
     # Imported only here: a pipeline without a terminal does not pay for it.
     from rich.console import Console as Terminal
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
     columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
+        TextColumn("{task.description}", markup=False),
+        BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TextColumn(unit),
-        TimeRemainingColumn(),
+        TimeElapsedColumn(),
+        TextColumn("{task.fields[pace]}"),
     )
-    with Progress(*columns, console=Terminal(stderr=True)) as progress:
-        task = progress.add_task(label, total=None)
-        yield lambda done, total: progress.update(task, completed=done, total=total)
+    pace = _Pace(unit, rate)
+    # Lines on standard output go above the bar, unless they go into a file.
+    with Progress(*columns, console=Terminal(stderr=True), redirect_stdout=sys.stdout.isatty()) as progress:
+        task = progress.add_task(label, total=None, pace="")
+        yield lambda done, total: progress.update(task, completed=done, total=total, pace=", ".join(pace(done, total)))
 
 
 class _Lines:
     """Progress as lines of text: the first, the last, and now and then one between."""
 
-    def __init__(self, console: Console, label: str, unit: str):
-        self.console, self.label, self.unit = console, label, unit
-        self.start = self.last = time.monotonic()
+    def __init__(self, console: Console, label: str, unit: str, rate: bool):
+        self.console, self.label, self.unit, self.pace = console, label, unit, _Pace(unit, rate)
+        self.first: int | None = None
+        self.last = 0.0
 
     def __call__(self, done: int, total: int) -> None:
-        now = time.monotonic()
-        if done in (0, total) or now - self.last >= SECONDS_BETWEEN_LINES:
-            self.last = now
-            elapsed = now - self.start
-            times = f", {elapsed:.1f} s" if done else ""
-            if 0 < done < total:
-                times += f", about {elapsed * (total - done) / done:.0f} s left"
-            self.console.say(f"{self.label}: {done}/{total} {self.unit}{times}")
+        words, elapsed = self.pace(done, total), self.pace.elapsed
+        begun, self.first = self.first is not None, done if self.first is None else self.first
+        if begun and done != total and elapsed - self.last < max(SECONDS_BETWEEN_LINES, elapsed / LINES):
+            return
+        self.last = elapsed
+        times = [f"{elapsed:.1f} s"] if done > self.first else []
+        self.console.say(", ".join([f"{self.label}: {done}/{total} {self.unit}", *times, *words]))

@@ -128,19 +128,22 @@ class Trainer:
         # What was logged after the checkpoint will be logged again.
         _keep_lines(self.out / "log.jsonl", self.step)
 
-    def run(self) -> bool:
+    def run(self, progress: Callable[[int, int], None] = lambda done, total: None) -> bool:
         """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
 
-        Raises NgptError when the loss or its gradient is not finite any more; the batch is saved then.
+        ``progress`` is called with (steps done, all steps), before the first step of this run and after each. Raises
+        NgptError when the loss or its gradient is not finite any more; the batch is saved then.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
         batches = self._batches()
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
+        progress(self.step, run.steps)
         try:
             while self.step < run.steps and not self._stop:
                 entry = self._train(next(batches))
                 self.step += 1
                 self.seconds = before + time.monotonic() - start
+                progress(self.step, run.steps)
                 last = self.step == run.steps
                 if self.step % run.log == 0 or last:
                     self._log(entry | {"seconds": round(self.seconds, 1)})

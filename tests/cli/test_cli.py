@@ -284,6 +284,24 @@ def test_lines_of_progress_tell_the_time_left(capsys, monkeypatch):
     assert lines == ["render: 0/100 spp", "render: 25/100 spp, 8.0 s, about 24 s left", "render: 100/100 spp, 30.0 s"]
 
 
+def test_what_lay_ready_says_nothing_about_the_time_left(capsys, monkeypatch):
+    """500 of 1000 were done before; 100 more come out of a cache at once; then each takes a second."""
+    import ngpt.system.console as console
+
+    clock = iter((0.0, 0.0, 1.0, 21.0, 41.0, 341.0, 344.0, 352.0))
+    monkeypatch.setattr(console.time, "monotonic", lambda: next(clock))
+    with console.Console().progress("evaluate", "cells", rate=True) as update:
+        for done in (500, 600, 620, 640, 940, 943, 1000):
+            update(done, 1000)
+    assert capsys.readouterr().err.splitlines() == [
+        "evaluate: 500/1000 cells",
+        "evaluate: 620/1000 cells, 21.0 s, 1 cells/s, about 6 min left",
+        "evaluate: 640/1000 cells, 41.0 s, 1 cells/s, about 6 min left",
+        "evaluate: 940/1000 cells, 341.0 s, 1 cells/s, about 60 s left",
+        "evaluate: 1000/1000 cells, 352.0 s, 1.16 cells/s",
+    ]
+
+
 @pytest.mark.parametrize("presses", [1, 2])
 def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path, presses):
     # In a process of its own, with a sampler that presses the keys once the first pass is done.

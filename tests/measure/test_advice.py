@@ -2,11 +2,13 @@
 
 import json
 import math
+import shlex
 import statistics
 
 import numpy as np
 import pytest
 
+import ngpt
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.measure import advice
@@ -151,6 +153,7 @@ def test_the_table_of_an_evaluation(tmp_path):
     kinds = {"primal": "path", "l1": "gradients", "rare": "gradients", "l1 (gpt-basic)": "gradients"}
     methods = {name: {"stack": kind, "render": kind} for name, kind in kinds.items()}
     methods["l1 (gpt-basic)"]["render"] = "gradients gpt-basic"
+    methods["l1"] |= {"method": "l1", "options": {"alpha": 0.3}}
     results = {"primary": "relMSE", "methods": methods, "scenes": {}, "cells": [], "summary": [], "command": "c"}
     for i, name in enumerate("abc"):
         cost = {kind: {"median": value * 200} for kind, value in COST.items()}
@@ -161,10 +164,8 @@ def test_the_table_of_an_evaluation(tmp_path):
             results["summary"].append({**cell, "error": 0.1, "seconds": {"reconstruct": 2.0}})
     table = make_table(results)
     # "rare" is not there on all scenes, and gpt-basic is not what a pilot is rendered by.
-    assert table["methods"] == {
-        "primal": "path",
-        "l1": "gradients",
-    }
+    assert table["methods"] == {"primal": "path", "l1": "gradients"}
+    assert table["calls"] == {"l1": {"method": "l1", "options": {"alpha": 0.3}}}
     assert table["scenes"][0]["methods"]["primal"] == {"spp": [9.0], "error": [0.1], "reconstruct": [0.01]}
     assert table["scenes"][0]["cost"] == pytest.approx({kind: COST[kind] for kind in ("gradients", "path")})
     path = tmp_path / "table.json"
@@ -196,3 +197,47 @@ def test_the_command(renderer, table, tmp_path, capsys):
     assert main([*arguments, "--seconds", "1e-9"]) == 2
     assert "nothing fits" in capsys.readouterr().err
     assert found[0]["spp"] < advice.LARGEST_SPP
+
+
+@pytest.mark.parametrize(("method", "kind"), [("wcv", "gradients"), ("ngpt-colour", "features"), ("primal", "path")])
+def test_the_commands_run_as_printed(renderer, tmp_path, capsys, monkeypatch, method, kind):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "my scene").mkdir()
+    scene = tmp_path / "my scene" / "a box.xml"
+    scene.write_text(BOX)
+    rng = np.random.default_rng(7)
+    scenes = [make_scene(f"s{i}", 10 ** rng.uniform(-1, 1), 10 ** rng.uniform(-0.5, 1.5)) for i in range(4)]
+    for entry in scenes:
+        entry["methods"] = {"gone": entry["methods"]["l1"], method: entry["methods"]["primal"]}
+    # The best of the table is none of ours: what cannot be followed is not advised.
+    table = {"metric": "relMSE", "methods": {"gone": kind, method: kind}, "scenes": scenes}
+    (tmp_path / "t.json").write_text(json.dumps(table))
+    words = ["advise", str(scene), "--size", "24x16", "--seconds", "2", "--table", "t.json", "-D", "light=3"]
+    assert main(words) == 0
+    printed = capsys.readouterr().out
+    assert "not here: this version has no method 'gone'" in printed
+    lines = [line for line in printed.splitlines() if line.startswith("ngpt ")]
+    assert len(lines) == 2
+    for line in lines:
+        assert main(shlex.split(line)[1:]) == 0, line
+    # In the folder of the call, and what was advised.
+    (result,) = [p for p in tmp_path.glob("*.exr") if p.stem.endswith(method)]
+    attributes, image = ngpt.read(result).attributes, ngpt.read_image(result)
+    assert attributes["ngpt:method"] == method and image.shape == (16, 24, 3)
+    assert attributes["ngpt:sampler"] == ("primal" if kind != "gradients" else attributes["ngpt:sampler"])
+    assert f"--spp {attributes['ngpt:spp']} " in lines[0]
+    assert main([*words, "--json", "-q"]) == 0
+    rows = json.loads(capsys.readouterr().out)["advice"]
+    assert {row["method"]: bool(row["missing"]) for row in rows} == {"gone": True, method: False}
+    assert all(len(row["commands"]) == 2 for row in rows)
+
+
+BOX = """
+<scene version="3.0.0">
+    <default name="light" value="1"/>
+    <integrator type="path"/>
+    <sensor type="perspective"><film type="hdrfilm"/></sensor>
+    <shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape>
+    <emitter type="constant"><spectrum name="radiance" value="$light"/></emitter>
+</scene>
+"""

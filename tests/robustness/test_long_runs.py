@@ -19,20 +19,21 @@ SLOWER = 2.0
 
 # Printed by the process itself, one line each: seconds since its start, and MiB in memory.
 NOTE = """
-import gc, time
+import gc, sys, time
 def note():
     resident = int(open("/proc/self/statm").read().split()[1]) * 4096 / 2**20
-    print("note", time.perf_counter(), resident, flush=True)
+    # Not standard output by its usual name, which is another while a file is read in another thread.
+    print("note", time.perf_counter(), resident, flush=True, file=sys.__stdout__)
 """
 
 DENOISE = """
 import sys, ngpt.cli.denoise as verb
 from ngpt.cli import main
-one = verb.denoise_file
-def noted(*arguments):
-    try: return one(*arguments)
+one = verb.write_frame
+def noted(*arguments, **options):
+    try: return one(*arguments, **options)
     finally: note()
-verb.denoise_file = noted
+verb.write_frame = noted
 sys.exit(main(["denoise", sys.argv[1], "-o", sys.argv[2], "-q"]))
 """
 

@@ -124,8 +124,11 @@ def test_views_of_ones_own_train_a_network(train, tmp_path):
     status, output, errors = train("--config", "configs/fast.toml", "--out", str(out), *arguments)
     assert status == 0, errors
     assert "finished at step 2" in output and "relMSE" in output
-    _, output, _ = train("--config", "configs/fast.toml", "--out", str(out), *arguments, "--set", "run.steps=3")
+    # No terminal here: plain lines, beside the log and not in it.
+    assert errors.startswith("train: 0/2 steps\n") and "train: 2/2 steps, " in errors and " steps/s" in errors
+    _, output, errors = train("--config", "configs/fast.toml", "--out", str(out), *arguments, "--set", "run.steps=3")
     assert "at step 2 of 3" in output and "finished at step 3" in output
+    assert errors.startswith("train: 2/3 steps\n") and "train: 3/3 steps, " in errors
     # By name, and without a word.
     quietly = train("--config", "fast", "--out", str(out), *arguments, "--set", "run.steps=4", "-q")
     assert quietly == (0, "", "")

@@ -1,0 +1,62 @@
+"""Reading, computing and writing at the same time: what waits for a disk or decodes a file holds up nothing else."""
+
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any, TypeVar
+
+from ngpt.errors import NgptError
+
+Item = TypeVar("Item")
+Read = TypeVar("Read")
+Made = TypeVar("Made")
+Told = TypeVar("Told")
+
+
+def overlapped(
+    items: Sequence[Item], read: Callable[[Item], Read], compute: Callable[[Read], Made], write: Callable[[Made], Told]
+) -> Generator[Told | NgptError, None, None]:
+    """``write(compute(read(item)))`` of each item, in order; of an item that fails, its NgptError.
+
+    ``read`` is one item ahead and ``write`` one behind, each in a thread of its own; ``compute`` runs in the caller's.
+    So at most three items are held at once. Any other error is raised when its item's turn has come. Whatever ends the
+    work early, an interrupt or ``close()``, the threads finish what they have begun and start nothing else. A single
+    item needs no threads. Raises MemoryError where there is no room for two.
+    """
+    if len(items) == 1:
+        yield _told(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
+        return
+    with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
+        try:
+            for thread in (reader, writer):
+                thread.submit(int)
+        except RuntimeError as error:  # what Python makes of it
+            raise MemoryError(str(error)) from error
+        coming: Future | None = None
+        going: Future | None = None
+        for i, item in enumerate(items):
+            value = (coming or reader.submit(_attempt, read, item)).result()
+            coming = reader.submit(_attempt, read, items[i + 1]) if i + 1 < len(items) else None
+            value = _attempt(compute, value)
+            if going:
+                yield _told(going.result())
+            going = writer.submit(_attempt, write, value)
+            del value  # the writer's alone, that it be gone when it is written
+        if going:
+            yield _told(going.result())
+
+
+def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
+    """What the stage makes of a value; errors are values, which later stages hand on."""
+    if isinstance(value, Exception):
+        return value
+    try:
+        return stage(value)
+    except Exception as error:
+        return error
+
+
+def _told(outcome: Any) -> Any:
+    """The outcome of an item, unless it is an error that concerns all of them."""
+    if isinstance(outcome, Exception) and not isinstance(outcome, NgptError):
+        raise outcome
+    return outcome

@@ -1,0 +1,154 @@
+"""Folders of frames: the same images and reports as one by one, whatever happens to some of them."""
+
+import json
+import os
+import resource
+import subprocess
+import sys
+import threading
+import weakref
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+from processes import ENVIRONMENT, ROOT, complete, half_written, temporary_files, timeless
+
+import ngpt
+from ngpt.cli import main
+
+NGPT = (sys.executable, "-m", "ngpt")
+
+
+@pytest.fixture
+def frames(tmp_path):
+    """A folder of six frames of several sizes."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for i in range(6):
+        ngpt.write(folder / f"{i}.exr", full_stack(24 + 4 * i, 40 - 3 * i, seed=i))
+    return folder
+
+
+@pytest.mark.parametrize("method", ["wcv", "ngpt-fast", "nfor"])
+def test_a_folder_gives_the_bits_of_its_frames(frames, tmp_path, method):
+    assert main(["denoise", str(frames), "-o", str(tmp_path / "all"), "-m", method, "-q"]) == 0
+    for path in sorted(frames.iterdir()):
+        alone = tmp_path / path.name
+        assert main(["denoise", str(path), "-o", str(alone), "-m", method, "-q"]) == 0
+        assert timeless(alone) == timeless(tmp_path / "all" / path.name)
+
+
+def test_all_reports_arrive_in_order(frames, tmp_path):
+    """A process that really shares its standard error with the reader of OpenEXR files, which hushes number 2."""
+    (frames / "3.exr").write_bytes(b"not an image")
+    run = complete([*NGPT, "denoise", frames, "-o", tmp_path / "out", "-m", "l2", "--json"])
+    assert run.returncode == 1
+    told = [line for line in run.stderr.splitlines() if not line.startswith("denoise: ")]
+    assert [line[:5] for line in told[:3]] == ["[1/6]", "[2/6]", "[3/6]"] and [line[:5] for line in told[4:6]] == [
+        "[5/6]",
+        "[6/6]",
+    ]
+    assert told[3].startswith("ngpt: error: ") and "3.exr: not an OpenEXR file" in told[3]
+    assert told[6:] == ["ngpt: error: 1 of 6 stacks were not reconstructed"]
+    assert run.stderr.startswith("denoise: 0/6 frames\n") and "denoise: 6/6 frames, " in run.stderr
+    files = json.loads(run.stdout)["files"]
+    assert [os.path.basename(f["input"]) for f in files] == [f"{i}.exr" for i in range(6)]
+    assert ["error" in f for f in files] == [False, False, False, True, False, False]
+
+
+def test_three_frames_are_in_memory_at_most(frames, tmp_path, monkeypatch):
+    alive, most, lock = set(), [], threading.Lock()
+
+    def counted(*arguments):
+        stack = ngpt.read(arguments[0])
+        with lock:
+            alive.add(id(stack))
+            most.append(len(alive))
+        weakref.finalize(stack, alive.discard, id(stack))
+        return stack
+
+    monkeypatch.setattr("ngpt.cli.denoise.read", counted)
+    (frames / "2.exr").write_bytes(b"not an image")
+    assert main(["denoise", str(frames), "-o", str(tmp_path / "out"), "-m", "l2", "-q"]) == 1
+    assert len(most) == 5 and max(most) <= 3 and not alive
+
+
+def test_frames_that_the_disk_has_no_room_for(frames, tmp_path):
+    """A limit on the size of files stands for a full disk: larger frames fail, smaller ones come after them."""
+    ngpt.write(frames / "1.exr", full_stack(90, 120), overwrite=True)
+    limit = (frames / "1.exr").stat().st_size // 2
+    out = tmp_path / "out"
+    run = complete(
+        [*NGPT, "denoise", frames, "-o", out, "-m", "l2"],
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
+    )
+    assert run.returncode == 1 and "1.exr: cannot be written" in run.stderr
+    assert sorted(os.listdir(out)) == ["0.exr", "2.exr", "3.exr", "4.exr", "5.exr"]
+    assert half_written(out) == [] and temporary_files(out) == []
+
+
+def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
+    out = tmp_path / "out"
+    words = ["denoise", str(frames), "-o", str(out), "-m", "l2"]
+    assert main([*words, "-q"]) == 0
+    before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    (out / "2.exr").unlink()
+    capsys.readouterr()
+    assert main(words) == 2
+    assert "--force" in capsys.readouterr().err and not (out / "2.exr").exists()
+    assert main([*words, "--skip-existing", "--json"]) == 0
+    told = capsys.readouterr()
+    files = json.loads(told.out)["files"]
+    assert [f.get("skipped", False) for f in files] == [True, True, False, True, True, True]
+    assert "5.exr: skipped, exists already" in told.err and "5 of 6 stacks were skipped" in told.err
+    after = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
+    assert after.keys() == before.keys() and {n for n in after if after[n] != before[n]} == {"2.exr"}
+    assert np.array_equal(ngpt.read_image(out / "2.exr"), ngpt.denoise(ngpt.read(frames / "2.exr"), "l2"))
+    # One of the two, not both.
+    with pytest.raises(SystemExit):
+        main([*words, "--skip-existing", "--force"])
+
+
+@pytest.mark.parametrize("exists", [False, True])
+def test_several_stacks_are_not_written_into_one_file(frames, tmp_path, capsys, exists):
+    out = tmp_path / "one.exr"
+    if exists:
+        out.write_text("precious")
+    assert main(["denoise", str(frames / "0.exr"), str(frames / "1.exr"), "-o", str(out), "--force"]) == 2
+    assert "file; the results of 2 stacks need a folder" in capsys.readouterr().err
+    assert out.exists() == exists and not out.is_dir()
+    # A folder of such a name is one if it is there, or if the name says so.
+    assert main(["denoise", str(frames), "-o", f"{tmp_path / 'two.exr'}/", "-m", "primal", "-q"]) == 0
+    assert main(["denoise", str(frames), "-o", str(tmp_path / "two.exr"), "-m", "primal", "-q", "--force"]) == 0
+
+
+def test_a_name_that_cannot_be_written_is_an_error_before_any_work(frames, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr("ngpt.cli.denoise.reconstruct", lambda *_, **__: pytest.fail("worked"))
+    assert main(["denoise", str(frames / "0.exr"), "-o", str(tmp_path / "o.png")]) == 2
+    assert "let the name end in .exr" in capsys.readouterr().err
+
+
+def on_terminal(*words):
+    """What a command writes to a terminal that is its standard error, and its status."""
+    ours, its = os.openpty()
+    environment = ENVIRONMENT | {"TERM": "xterm", "COLUMNS": "200", "NO_COLOR": "1"}
+    process = subprocess.Popen([*NGPT, *words], stderr=its, stdout=subprocess.DEVNULL, env=environment, cwd=ROOT)
+    os.close(its)
+    seen = b""
+    try:
+        while piece := os.read(ours, 1 << 16):
+            seen += piece
+    except OSError:  # the end, where a terminal is concerned
+        pass
+    os.close(ours)
+    return seen.decode(), process.wait(60)
+
+
+def test_on_a_terminal_there_is_a_bar_and_above_it_a_line_for_each_frame(frames, tmp_path):
+    pytest.importorskip("rich")
+    seen, status = on_terminal("denoise", frames, "-o", tmp_path / "out", "-m", "l2")
+    assert status == 0 and "6/6" in seen and "frames" in seen and "0:00:0" in seen
+    assert all(f"[{i}/6] " in seen for i in range(1, 7)) and "denoise: " not in seen
+    assert on_terminal("denoise", frames, "-o", tmp_path / "quiet", "-m", "l2", "-q") == ("", 0)
+    seen, status = on_terminal("denoise", frames / "0.exr", "-o", tmp_path / "one.exr", "-m", "l2")
+    assert status == 0 and "1/1" in seen
