@@ -1,0 +1,194 @@
+// The C functions: checks of what they are given, and exceptions as messages.
+#include "network.hpp"
+
+#include <cstdio>
+#include <exception>
+#include <memory>
+#include <new>
+
+using namespace ngpt;
+
+struct ngpt_network {
+    std::shared_ptr<Network> shared;
+};
+
+struct ngpt_job {
+    std::shared_ptr<Network> network;
+    Layers layers;
+    View output{};
+    char message[512] = "";
+};
+
+namespace {
+
+constexpr int DEFAULT_MEMORY = 2048, LARGEST = 65536;
+
+ngpt_status tell(char *message, size_t size, ngpt_status status, const std::exception &error) try {
+    if (message && size) std::snprintf(message, size, "%s", one_line(error.what()).c_str());
+    return status;
+} catch (const std::bad_alloc &) {
+    std::snprintf(message, size, "out of memory");
+    return NGPT_OUT_OF_MEMORY;
+}
+
+// What `action` throws, as a status and a message.
+template <typename Action> ngpt_status guarded(char *message, size_t size, Action action) {
+    if (message && size) *message = 0;
+    try {
+        action();
+        return NGPT_OK;
+    } catch (const Failure &error) {
+        return tell(message, size, error.status, error);
+    } catch (const std::bad_alloc &) {
+        return tell(message, size, NGPT_OUT_OF_MEMORY, std::runtime_error("out of memory; free some, or allow less"));
+    } catch (const std::exception &error) {
+        // ONNX Runtime has no code of its own for this.
+        const std::string text = error.what();
+        const bool memory = text.find("allocate memory") != text.npos || text.find("bad_alloc") != text.npos;
+        return tell(message, size, memory ? NGPT_OUT_OF_MEMORY : NGPT_FAILED, error);
+    } catch (...) {
+        return tell(message, size, NGPT_FAILED, std::runtime_error("an unknown exception"));
+    }
+}
+
+template <typename Action> ngpt_status guarded(ngpt_job *job, Action action) {
+    return job ? guarded(job->message, sizeof job->message, action) : NGPT_BAD_ARGUMENT;
+}
+
+[[noreturn]] void refuse(const std::string &message) { throw Failure(NGPT_BAD_ARGUMENT, message); }
+
+void check(const std::string &name, const View &view, int least) {
+    if (view.format != NGPT_FLOAT && view.format != NGPT_HALF)
+        refuse(name + ": the format is " + std::to_string(int(view.format)) + "; it must be NGPT_FLOAT or NGPT_HALF");
+    if (view.channels < least)
+        refuse(name + ": has " + std::to_string(view.channels) + " channels; it must have " + std::to_string(least));
+}
+
+const Input *input_at(const ngpt_network *network, int index) {
+    return index >= 0 && index < ngpt_layer_count(network) ? &network->shared->inputs[index] : nullptr;
+}
+
+}  // namespace
+
+const char *ngpt_version(void) { return NGPT_VERSION; }
+
+int ngpt_abi(void) { return NGPT_ABI; }
+
+ngpt_network *ngpt_open(const char *path, int threads, char *message, size_t size) {
+    ngpt_network *network = nullptr;
+    guarded(message, size, [&] {
+        if (!path) refuse("the path of the network is NULL");
+        if (threads < 0) refuse("the number of threads is " + std::to_string(threads) + "; it must be 0 or more");
+        auto shared = std::make_shared<Network>(path, threads);
+        network = new ngpt_network{std::move(shared)};
+    });
+    return network;
+}
+
+void ngpt_close(ngpt_network *network) { delete network; }
+
+int ngpt_layer_count(const ngpt_network *network) { return network ? int(network->shared->inputs.size()) : 0; }
+
+const char *ngpt_layer_name(const ngpt_network *network, int index) {
+    const Input *input = input_at(network, index);
+    return input ? input->name.c_str() : nullptr;
+}
+
+int ngpt_layer_channels(const ngpt_network *network, int index) {
+    const Input *input = input_at(network, index);
+    return input ? input->channels : 0;
+}
+
+int ngpt_layer_required(const ngpt_network *network, int index) {
+    const Input *input = input_at(network, index);
+    return input && input->required;
+}
+
+const char *ngpt_metadata(const ngpt_network *network, const char *key) try {
+    if (!network || !key) return nullptr;
+    const auto found = network->shared->metadata.find(key);
+    return found == network->shared->metadata.end() ? nullptr : found->second.c_str();
+} catch (const std::bad_alloc &) {
+    return nullptr;
+}
+
+ngpt_job *ngpt_job_new(const ngpt_network *network) {
+    ngpt_job *job = network ? new (std::nothrow) ngpt_job : nullptr;
+    if (job) job->network = network->shared;
+    return job;
+}
+
+void ngpt_job_free(ngpt_job *job) { delete job; }
+
+const char *ngpt_message(const ngpt_job *job) { return job ? job->message : "the job is NULL"; }
+
+ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void *pixels, ngpt_format format, int channels,
+                           ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride) {
+    return guarded(job, [&] {
+        if (!name) refuse("the name of the layer is NULL");
+        const Input *input = job->network->input(name);
+        if (!input) {
+            std::string known;
+            for (const Input &one : job->network->inputs) known += (known.empty() ? "" : ", ") + one.name;
+            refuse("the network reads no layer '" + std::string(name).substr(0, 40) + "'; it reads " + known);
+        }
+        // `read` gets the same structure as `write`, and only reads.
+        const View view{const_cast<void *>(pixels), format, channels, channel_stride, pixel_stride, row_stride};
+        if (!pixels) {
+            job->layers.erase(name);
+        } else {
+            check(name, view, input->channels);
+            job->layers[name] = view;
+        }
+    });
+}
+
+ngpt_status ngpt_set_output(ngpt_job *job, void *pixels, ngpt_format format, int channels, ptrdiff_t channel_stride,
+                            ptrdiff_t pixel_stride, ptrdiff_t row_stride) {
+    return guarded(job, [&] {
+        const View view{pixels, format, channels, channel_stride, pixel_stride, row_stride};
+        if (pixels) check("the output", view, 3);
+        job->output = view;
+    });
+}
+
+ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user) {
+    return guarded(job, [&] {
+        // Copies, in case that the progress function sets others.
+        const Layers layers = job->layers;
+        const View output = job->output;
+        Network &network = *job->network;
+        if (width < 1 || height < 1 || width > LARGEST || height > LARGEST)
+            refuse("the image has " + std::to_string(width) + "x" + std::to_string(height) + " pixels; sides must be 1 to " +
+                   std::to_string(LARGEST));
+        if (memory < 0) refuse("the memory is " + std::to_string(memory) + " MiB; it must be 0 or more");
+        std::string missing;
+        for (const Input &one : network.inputs)
+            if (one.required && !layers.count(one.name)) missing += (missing.empty() ? "" : ", ") + one.name;
+        if (!missing.empty()) throw Failure(NGPT_MISSING_LAYER, "the network needs the layers " + missing + ": set them");
+        if (!output.pixels) throw Failure(NGPT_MISSING_LAYER, "the output is not set");
+
+        const auto tiles = network.plan(width, height, memory ? memory : DEFAULT_MEMORY, layers.count("base"));
+        double done = 0;
+        Cancelled cancelled;
+        if (progress) cancelled = [&] { return progress(user, done) != 0; };
+        const auto advance = [&](double fraction) {
+            done = fraction;
+            if (cancelled && cancelled()) throw Failure(NGPT_CANCELLED, "cancelled");
+        };
+        advance(0);
+        std::vector<float> image(size_t(3) * width * height), shared;
+        if (tiles.size() > 1) shared = network.statistics(layers, width, height, cancelled);
+        for (size_t i = 0; i < tiles.size(); i++) {
+            const auto &[inner, outer] = tiles[i];
+            const std::vector<float> part = network.run(layers, width, outer, shared, cancelled);
+            for (int64_t c = 0; c < 3; c++)
+                for (int64_t y = inner.top; y < inner.top + inner.height; y++) {
+                    const float *from = &part[(c * outer.height + y - outer.top) * outer.width + inner.left - outer.left];
+                    std::copy(from, from + inner.width, &image[(c * height + y) * width + inner.left]);
+                }
+            advance(double(i + 1) / double(tiles.size()));
+        }
+        write(output, width, height, image.data());
+    });
+}
