@@ -4,10 +4,13 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt, uniform_filter
+from scipy.ndimage import uniform_filter
 
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
+
+# Sides of the blocks from which the insides of holes are filled: powers of it. Tiles of networks begin at multiples.
+BLOCK = 8
 
 
 @dataclass(frozen=True)
@@ -102,7 +105,7 @@ def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -
     """primal - direct, with pixels that are not good replaced.
 
     By the mean of the good ones among their eight neighbours, or where there is none, in the inside of a larger hole,
-    by the nearest good pixel.
+    by the mean of those in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
     """
     image = np.subtract(primal, direct, where=good[..., None], out=np.zeros_like(primal))
     weight = uniform_filter(good.astype(np.float64), 3, mode="constant")
@@ -111,6 +114,21 @@ def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -
     image[near] = mean[near] / weight[near, None]
     far = ~good & ~near
     if far.any():
-        rows, columns = distance_transform_edt(~good, return_distances=False, return_indices=True)
-        image[far] = image[rows[far], columns[far]]
+        there = np.where(good[..., None], image, 0).astype(np.float64)
+        image[far] = _from_blocks(there, good[..., None].astype(np.float64))[far]
     return image
+
+
+def _from_blocks(total: np.ndarray, count: np.ndarray) -> np.ndarray:
+    """Sums (H, W, 3) over counts (H, W, 1); where nothing was counted, those of the smallest block that has any."""
+    mean = total / np.maximum(count, 1)
+    if count.all() or count.size == 1:
+        return mean
+    coarse = _from_blocks(_block_sums(total), _block_sums(count))
+    spread = coarse.repeat(BLOCK, axis=0).repeat(BLOCK, axis=1)[: len(total), : total.shape[1]]
+    return np.where(count > 0, mean, spread)
+
+
+def _block_sums(values: np.ndarray) -> np.ndarray:
+    rows, columns = (np.arange(0, length, BLOCK) for length in values.shape[:2])
+    return np.add.reduceat(np.add.reduceat(values, rows, axis=0), columns, axis=1)

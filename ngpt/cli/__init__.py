@@ -31,6 +31,7 @@ VERBS = {
     "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
     "denoise": Verb("reconstruct images from gradient stacks"),
     "info": Verb("say what a file holds, or what a scene requires"),
+    "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
     "advise": Verb("say which method and how many samples to use, for a time or an error"),
     "dataset": Verb("make a training set, or continue one", "train", _CONTINUES),

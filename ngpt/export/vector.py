@@ -1,40 +1,23 @@
 """A small stack and what a model makes of it, in files that any language reads: for those who write a host."""
 
-import hashlib
-import json
 from pathlib import Path
 
 import numpy as np
 import onnx
 import onnxruntime
 
-from ngpt.errors import NgptError
-from ngpt.system.files import atomic_output
+from ngpt.io.rawlayers import write_layers
 
 SIZE = 29, 23  # width and height: odd, and no multiple of any alignment
 
 
 def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) -> None:
-    """Writes ``NAME.f32``, the inputs, ``image.f32``, what the model makes of them, and ``vector.json`` into a folder.
-
-    The former are float32, little-endian, (1, C, height, width) in C order; the latter lists their shapes and SHA-256
-    sums. Raises NgptError where a file exists and may not be overwritten.
-    """
-    if folder.exists() and not folder.is_dir():
-        raise NgptError(f"{folder}: is a file; give a folder for the test vector")
-    folder.mkdir(parents=True, exist_ok=True)
+    """Writes the inputs of a model into a folder, and what it makes of them as ``image``; see ``ngpt.io.rawlayers``."""
     names = {item.key: item.value for item in model.metadata_props}["ngpt.inputs"].split(", ")
     arrays = {name: layer for name, layer in example_layers().items() if name in names}
     session = onnxruntime.InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])
     arrays["image"] = session.run(["image"], arrays)[0]
-    listing = {}
-    for name, array in arrays.items():
-        data = np.ascontiguousarray(array, "<f4").tobytes()
-        with atomic_output(folder / f"{name}.f32", overwrite) as temporary:
-            temporary.write_bytes(data)
-        listing[name] = {"shape": list(array.shape), "sha256": hashlib.sha256(data).hexdigest()}
-    with atomic_output(folder / "vector.json", overwrite) as temporary:
-        temporary.write_text(json.dumps(listing, indent=1) + "\n")
+    write_layers(folder, arrays, overwrite)
 
 
 def quiet() -> onnxruntime.SessionOptions:
@@ -45,15 +28,18 @@ def quiet() -> onnxruntime.SessionOptions:
 
 
 def example_layers() -> dict[str, np.ndarray]:
-    """Layers (1, C, height, width) of a noisy picture of a bright disk on a gradient, the same on every machine."""
+    """Layers (1, C, height, width) of a noisy picture, the same on every machine.
+
+    A bright disk on a gradient; a lamp above, which a mirror below shows again, darker; and what renderers get wrong:
+    values that are not finite, in every kind of layer, alone and in a hole of 7x7 pixels, and variances of -1.
+    """
     width, height = SIZE
     rng = np.random.default_rng(7)
     y, x = np.mgrid[:height, :width].astype(np.float64)
     disk = (x - 17) ** 2 + (y - 9) ** 2 < 36
     clean = np.stack([0.2 + 0.02 * x, 0.3 + 0.01 * y, np.full_like(x, 0.25)]) * np.where(disk, 6.0, 1.0)
     deviation = 0.4 * clean
-    others = {"denoised": 1.02 * clean, "denoised_base": 0.99 * clean}
-    layers = others | {"primal": clean * rng.gamma(6.0, 1 / 6.0, clean.shape), "primal_var": deviation**2}
+    layers = {"primal": clean * rng.gamma(6.0, 1 / 6.0, clean.shape), "primal_var": deviation**2}
     for name, axis in (("dx", 2), ("dy", 1)):
         slope = np.diff(clean, axis=axis, append=np.take(clean, [-1], axis))
         layers[name] = slope + np.where(slope, 0.1 * clean, 0.02 * clean) * rng.normal(size=clean.shape)
@@ -64,4 +50,28 @@ def example_layers() -> dict[str, np.ndarray]:
     layers["normal"] = np.stack([np.where(disk, (x - 17) / 8, 0), np.zeros_like(x), np.ones_like(x)])
     layers["normal"] /= np.linalg.norm(layers["normal"], axis=0)
     layers["depth"] = np.where(disk, 2.0, 3 + 0.05 * y)[None]
-    return {name: np.ascontiguousarray(layer[None], np.float32) for name, layer in layers.items()}
+    _light(layers, np.s_[:, 1:4, 4:10], np.s_[:, 17:22, 2:14])
+    others = {"denoised": 1.02 * clean + layers["direct"], "denoised_base": 0.99 * clean + layers["direct"]}
+    _damage(layers)
+    return {name: np.ascontiguousarray(layer[None], np.float32) for name, layer in (others | layers).items()}
+
+
+def _light(layers: dict[str, np.ndarray], lamp: tuple, mirror: tuple) -> None:
+    """A lamp, and a mirror that shows it: behind a mirror, features are those of what it shows."""
+    direct = layers["direct"] = np.zeros_like(layers["primal"])
+    direct[lamp] = np.reshape([60.0, 50.0, 35.0], (3, 1, 1))
+    direct[mirror][:, 1:4, 2:8] = 0.9 * direct[lamp]
+    layers["primal"] += direct
+    # A pixel at the border of a lamp is partly lamp, from sample to sample: its variance is not that of the rest.
+    layers["primal_var"] += (0.3 * direct) ** 2
+    layers["albedo"][mirror], layers["depth"][mirror] = 0.7, 6.0
+    layers["normal"][mirror] = np.reshape([0.0, -1.0, 0.0], (3, 1, 1))
+
+
+def _damage(layers: dict[str, np.ndarray]) -> None:
+    layers["primal"][1, 7, 3] = layers["primal"][:, 2, 10] = np.nan
+    layers["primal"][0, 12, 24], layers["direct"][2, 20, 22] = np.inf, np.nan
+    layers["primal"][:, 13:20, 18:25] = np.nan
+    layers["dx"][0, 9, 11], layers["dy"][:, 5, 20] = np.nan, -np.inf
+    layers["primal_var"][:, 8, 8], layers["dx_var"][:, 4, 25], layers["dy_var"][2, 10, 13] = -1, -1, np.inf
+    layers["albedo"][1, 6, 6], layers["normal"][:, 15, 3], layers["depth"][0, 1, 20] = np.nan, np.nan, np.inf

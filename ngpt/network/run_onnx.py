@@ -16,7 +16,7 @@ import numpy as np
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network.exposure import statistics
-from ngpt.network.inputs import OPTIONAL, WITH_EMISSION
+from ngpt.network.inputs import OPTIONAL_IN_GRAPHS, WITH_EMISSION
 from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers.
@@ -78,9 +78,9 @@ class Network:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
         if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
-        if not set(self.optional) <= set(OPTIONAL) & set(self.inputs):
+        if not set(self.optional) <= set(OPTIONAL_IN_GRAPHS) & set(self.inputs):
             raise NgptError(f"{self.path}: its optional inputs are {', '.join(self.optional)}: export it anew")
-        if self.emission and (self.base or not set(self.inputs) <= set(WITH_EMISSION)):
+        if self.emission and (self.base or not set(self.inputs) <= {*WITH_EMISSION, "direct"}):
             raise NgptError(f"{self.path}: reads emission and {', '.join(self.inputs)}: export it anew")
         own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}

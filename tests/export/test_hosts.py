@@ -6,9 +6,7 @@ onnxruntime-node and onnxruntime-web in a node_modules that NODE_PATH names, or 
 
 import base64
 import json
-import os
 import re
-import shutil
 import subprocess
 import time
 from pathlib import Path
@@ -18,13 +16,15 @@ import OpenEXR
 import pytest
 from browser import Session
 from exr_files import noise, same_bits, window, write_raw
+from hosts import HOSTS, VECTOR, agree, caller, cpp_host, node, node_host, node_modules, read_layers, read_pfm
 
 import ngpt
+from ngpt.io.rawlayers import write_layers
+from ngpt.methods import reconstruct
+from ngpt.stack import GradientStack
 
 ort = pytest.importorskip("onnxruntime")
 
-ROOT = Path(__file__).parents[2]
-HOSTS, VECTOR = ROOT / "export" / "hosts", ROOT / "export" / "vector"
 MODEL = Path(ngpt.__file__).parent / "weights" / "ngpt-fast.onnx"
 LETTERS = {"normal": "XYZ", "depth": "Z"}
 
@@ -32,23 +32,15 @@ LETTERS = {"normal": "XYZ", "depth": "Z"}
 # --- what is expected ------------------------------------------------------------------------------------------------
 
 
-def read_vector(folder) -> dict[str, np.ndarray]:
-    shapes = {name: item["shape"] for name, item in json.loads((folder / "vector.json").read_text()).items()}
-    return {name: np.fromfile(folder / f"{name}.f32", "<f4").reshape(shape) for name, shape in shapes.items()}
-
-
 def write_vector(folder, layers) -> Path:
-    folder.mkdir()
-    for name, layer in layers.items():
-        (folder / f"{name}.f32").write_bytes(layer.astype("<f4").tobytes())
-    (folder / "vector.json").write_text(json.dumps({name: {"shape": layer.shape} for name, layer in layers.items()}))
+    write_layers(folder, layers)
     return folder
 
 
 def repeated(height, width) -> dict[str, np.ndarray]:
     """The vector's layers again and again, sixteen times as bright at the right as at the left."""
     brightness, layers = np.exp2(4 * np.arange(width) / width), {}
-    for name, layer in read_vector(VECTOR).items():
+    for name, layer in read_layers(VECTOR).items():
         if name != "image":
             power = 2 if name.endswith("_var") else 0 if name in ("albedo", "normal", "depth") else 1
             many = np.tile(layer, (1, 1, -(-height // 23), -(-width // 29)))[:, :, :height, :width]
@@ -72,67 +64,27 @@ def wide(tmp_path_factory, python):
     return write_vector(tmp_path_factory.mktemp("wide") / "layers", layers), python(layers)
 
 
-def read_pfm(path) -> np.ndarray:
-    kind, size, scale, pixels = path.read_bytes().split(b"\n", 3)
-    assert (kind, scale) == (b"PF", b"-1.0")
-    width, height = map(int, size.split())
-    return np.frombuffer(pixels, "<f4").reshape(height, width, 3)[::-1].transpose(2, 0, 1)[None]
-
-
-def agree(image, expected):
-    assert image.shape == expected.shape
-    assert np.abs(image - expected).max() <= 1e-4 * np.abs(expected).max()
-
-
-# --- C++ and Node, which are called alike ----------------------------------------------------------------------------
-
-
-def cpp_host(folder) -> list[str]:
-    compiler = shutil.which("g++") or shutil.which("clang++")
-    if compiler is None:
-        pytest.skip("neither g++ nor clang++ is installed")
-    root = Path(os.environ.get("ORT_ROOT", "/usr"))
-    headers = [path for path in (root / "include", root / "include" / "onnxruntime") if path.is_dir()]
-    if not any((path / "onnxruntime_cxx_api.h").exists() for path in headers):
-        pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include; name a release's folder in ORT_ROOT")
-    program, library = folder / "ngpt-host", root / "lib"
-    command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / "host.cpp", "-o", program]
-    command += [flag for path in headers for flag in ("-isystem", path) if path != Path("/usr/include")]
-    command += [f"-L{library}", f"-Wl,-rpath,{library}", "-lonnxruntime"]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
-    assert result.returncode == 0, result.stderr
-    return [str(program)]
-
-
-def node_modules(package, host) -> Path:
-    folders = [*filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep)), HOSTS / host / "node_modules"]
-    found = next((Path(folder) / package for folder in folders if (Path(folder) / package).is_dir()), None)
-    if found is None:
-        pytest.skip(f"{package} is neither in NODE_PATH nor in export/hosts/{host}/node_modules; npm install {package}")
-    return found
-
-
-def node() -> str:
-    return shutil.which("node") or pytest.skip("node is not installed")
-
-
-def node_host(_folder) -> list[str]:
-    node_modules("onnxruntime-node", "node")
-    return [node(), str(HOSTS / "node" / "host.mjs")]
+# --- C++ and Node, which are called alike --------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module", params=[cpp_host, node_host], ids=["cpp", "node"])
 def host(request, tmp_path_factory):
-    command = request.param(tmp_path_factory.mktemp("host"))
-    return lambda *arguments: subprocess.run(
-        [*command, *map(str, arguments)], capture_output=True, text=True, timeout=500
-    )
+    return caller(request.param(tmp_path_factory.mktemp("host")))
+
+
+def test_the_vector_is_what_denoise_makes_of_all_that_goes_wrong():
+    layers = read_layers(VECTOR)
+    image = layers.pop("image")
+    stack = GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in layers.items()})
+    result = reconstruct(stack, "ngpt-fast")
+    agree(image, result.image.transpose(2, 0, 1)[None])
+    assert np.nanmax(layers["direct"]) > 50 and result.repaired == 4 + 49 and result.untrusted > 100
 
 
 def test_a_host_agrees_with_the_vector(host, tmp_path):
     result = host(MODEL, VECTOR, tmp_path / "image.pfm", 0, 2)
     assert re.fullmatch(r"(\d+\.\d ms\n){2}", result.stdout) and not result.stderr, result
-    agree(read_pfm(tmp_path / "image.pfm"), read_vector(VECTOR)["image"])
+    agree(read_pfm(tmp_path / "image.pfm"), read_layers(VECTOR)["image"])
 
 
 def test_tiles_of_a_host_agree_with_the_whole(host, wide, tmp_path):
@@ -141,6 +93,13 @@ def test_tiles_of_a_host_agree_with_the_whole(host, wide, tmp_path):
     result = host(MODEL, folder, tmp_path / "image.pfm", 99)
     assert result.returncode == 0, result.stderr
     agree(read_pfm(tmp_path / "image.pfm"), expected)
+
+
+def test_a_host_needs_no_direct_emission(host, python, tmp_path):
+    layers = {name: layer for name, layer in read_layers(VECTOR).items() if name not in ("image", "direct")}
+    result = host(MODEL, write_vector(tmp_path / "layers", layers), tmp_path / "image.pfm")
+    assert result.returncode == 0, result.stderr
+    agree(read_pfm(tmp_path / "image.pfm"), python(layers | {"direct": np.zeros_like(layers["primal"])}))
 
 
 def test_a_host_says_what_is_wrong(host, tmp_path):
@@ -155,7 +114,7 @@ def test_a_host_says_what_is_wrong(host, tmp_path):
     refused(2, "usage", MODEL, VECTOR, output, 0, "many")
     refused(1, "none.onnx", tmp_path / "none.onnx", VECTOR, output)
     refused(1, "statistics|ngpt.inputs", MODEL.with_suffix(".statistics.onnx"), VECTOR, output)
-    layers = read_vector(VECTOR)
+    layers = read_layers(VECTOR)
     refused(
         1, "albedo", MODEL, write_vector(tmp_path / "a", {n: x for n, x in layers.items() if n != "albedo"}), output
     )
@@ -187,7 +146,7 @@ def tell(capsys, name, host_times, times, image, expected):
         )
 
 
-@pytest.mark.parametrize("path", [*HOSTS.glob("*/*.cpp"), *HOSTS.glob("*/*.mjs"), *HOSTS.glob("*/*.py")], ids=str)
+@pytest.mark.parametrize("path", [*HOSTS.glob("*/*.?pp"), *HOSTS.glob("*/*.mjs"), *HOSTS.glob("*/*.py")], ids=str)
 def test_hosts_are_short(path):
     assert path.read_text().count("\n") < 200
 
@@ -296,7 +255,7 @@ def fake_runtime(tmp_path_factory):
 def test_the_page_is_one_file_that_asks_for_no_other(fake_runtime, tmp_path, capsys):
     from export.hosts.web.build import main
 
-    example = write_stack(tmp_path / "example.exr", read_vector(VECTOR))
+    example = write_stack(tmp_path / "example.exr", read_layers(VECTOR))
     arguments = ["--runtime", str(fake_runtime), "--example", str(example), "-o", str(tmp_path / "page.html")]
     assert main(arguments) == 0
     text = (tmp_path / "page.html").read_text()
@@ -354,31 +313,30 @@ def page(tmp_path_factory):
     from export.hosts.web.build import build
 
     runtime, folder = node_modules("onnxruntime-web", "web"), tmp_path_factory.mktemp("page")
-    example = write_stack(folder / "example.exr", read_vector(VECTOR))
+    example = write_stack(folder / "example.exr", read_layers(VECTOR))
     session = Page(folder / "profile", build(folder / "page.html", runtime, example).as_uri())
     yield session
     session.close()
 
 
 def test_the_page_agrees_with_python(page):
-    layers = read_vector(VECTOR)
+    layers = read_layers(VECTOR)
     assert page.ask("root.dataset.error ?? null") is None
     assert re.fullmatch(r"example.exr: 29x23 in .* s, after .* s of loading", page.ask("$('status').textContent"))
     assert same_bits(page.pixels("stack.layers.primal"), layers["primal"])
     agree(page.pixels("clean"), layers["image"])
 
 
-def test_direct_emission_is_kept_aside(page, tmp_path):
-    layers = read_vector(VECTOR)
-    direct = np.where(layers["depth"] < 2.5, np.float32(40), 0) * np.ones_like(layers["primal"])
-    page.give(write_stack(tmp_path / "lamp.exr", layers | {"primal": layers["primal"] + direct, "direct": direct}))
+def test_the_page_needs_no_direct_emission(page, python, tmp_path):
+    layers = {name: layer for name, layer in read_layers(VECTOR).items() if name not in ("image", "direct")}
+    page.give(write_stack(tmp_path / "lamp.exr", layers))
     assert page.ask("$('status').textContent").startswith("lamp.exr: 29x23")
-    agree(page.pixels("clean"), layers["image"] + direct)
+    agree(page.pixels("clean"), python(layers | {"direct": np.zeros_like(layers["primal"])}))
 
 
 def test_tiles_of_the_page_agree_with_the_whole(page, wide):
     folder, expected = wide
-    page.send(read_vector(folder), 96)
+    page.send(read_layers(folder), 96)
     agree(page.pixels("clean"), expected)
 
 
@@ -407,7 +365,7 @@ def test_keys_mouse_and_exposure(page):
 
 
 def test_the_page_says_what_is_wrong_and_goes_on(page, tmp_path):
-    layers = read_vector(VECTOR)
+    layers = read_layers(VECTOR)
     page.give(write_stack(tmp_path / "plain.exr", {"primal": layers["primal"], "depth": layers["depth"]}))
     message = page.ask("$('problem').textContent")
     assert message.startswith("plain.exr: the network needs the layers dx, dy, albedo, normal, primal_var")
@@ -432,7 +390,7 @@ def test_a_file_may_be_dropped(page):
 
 def test_a_bad_file_does_not_end_the_work_on_a_good_one(page, wide):
     folder, expected = wide
-    page.send(read_vector(folder), 0, "open('bad.exr', new ArrayBuffer(3)).then(() => delete root.dataset.error)")
+    page.send(read_layers(folder), 0, "open('bad.exr', new ArrayBuffer(3)).then(() => delete root.dataset.error)")
     assert page.ask("$('problem').textContent") == "bad.exr: it is not an OpenEXR file"
     agree(page.pixels("clean"), expected)
 

@@ -15,6 +15,7 @@ export class Model {
       return made.metadata[key];
     };
     made.inputs = value("ngpt.inputs").split(", ");
+    made.optional = value("ngpt.optional").split(", ");
     made.alignment = Number(value("ngpt.alignment"));
     made.overlap = Number(value("ngpt.overlap"));
     const create = bytes => ort.InferenceSession.create(bytes, {logSeverityLevel: 3, ...options});
@@ -23,10 +24,16 @@ export class Model {
     return made;
   }
 
-  /** The image (3 channels) of `layers`. `tile` is the side of the tiles, 0 for none; `progress(done, all)` is told. */
+  /**
+   * The image (3 channels) of `layers`; those that the model can do without may be missing. `tile` is the side of the
+   * tiles, 0 for none; `progress(done, all)` is told.
+   */
   async run(layers, width, height, tile = 0, progress = () => {}) {
+    layers = {...layers};
     for (const name of this.inputs) {
-      const length = layers[name]?.length, expected = width * height * (name === "depth" ? 1 : 3);
+      const expected = width * height * (name === "depth" ? 1 : 3);
+      if (!layers[name] && this.optional.includes(name)) layers[name] = new Float32Array(expected);
+      const length = layers[name]?.length;
       if (length === undefined) throw new Error(`the model needs the layer ${name}`);
       if (length !== expected) throw new Error(`${name} has ${length} numbers; ${width}x${height} needs ${expected}`);
     }

@@ -3,8 +3,7 @@
  *
  *     node host.mjs MODEL.onnx FOLDER OUTPUT.pfm [TILE [RUNS]]
  *
- * FOLDER holds NAME.f32, float32 in the order (1, C, height, width), and vector.json with their shapes, as
- * export/vector does. TILE is the side of the tiles, 0 for the whole image at once.
+ * FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. TILE is the side of the tiles, 0 for the whole image at once.
  */
 
 import {readFileSync, writeFileSync} from "node:fs";
@@ -22,10 +21,9 @@ async function main([path, folder, output, tile = "0", runs = "1"]) {
   // In node_modules beside this file, or where NODE_PATH says.
   const ort = createRequire(import.meta.url)("onnxruntime-node");
   const model = await Model.open(ort, readFileSync(path), readFileSync(path.replace(SUFFIX, ".statistics.onnx")));
-  const shapes = JSON.parse(readFileSync(join(folder, "vector.json"), "utf8"));
+  const shapes = JSON.parse(readFileSync(join(folder, "layers.json"), "utf8"));
   const layers = {};
-  for (const name of model.inputs) {
-    if (!(name in shapes)) throw new Error(`${folder}: the model needs the layer ${name}`);
+  for (const name of model.inputs.filter(name => name in shapes)) {
     const bytes = readFileSync(join(folder, `${name}.f32`));
     layers[name] = new Float32Array(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
   }

@@ -51,12 +51,9 @@ async function open(name, contents) {
     if (mine !== turn) return;
     [stack, clean] = [{turn: mine, name, ...read}, null];
     show();
-    // Emission that the camera sees has no noise; it is kept aside.
-    const {direct, ...layers} = read.layers;
-    if (direct) layers.primal = layers.primal.map((value, i) => value - direct[i]);
     $("status").textContent = `Reconstructing ${name}, ${read.width}x${read.height}…`;
     worker ??= startWorker();
-    const {width, height} = read, tile = width * height > MOST ? TILE : 0;
+    const {width, height, layers} = read, tile = width * height > MOST ? TILE : 0;
     (await worker).postMessage({turn: mine, layers, width, height, tile});
   } catch (error) {
     if (mine === turn) complain(`${name}: ${error.message}`);
@@ -65,10 +62,10 @@ async function open(name, contents) {
 
 function answered(data) {
   if (data.turn !== stack.turn) return;
-  const {name, width, height, layers: {direct}} = stack;
+  const {name, width, height} = stack;
   if (data.error) return complain(`${name}: ${data.error}`);
   if (data.all) return void ($("status").textContent = `Reconstructing ${name}: ${data.done} of ${data.all} tiles`);
-  clean = direct ? data.image.map((value, i) => value + direct[i]) : data.image;
+  clean = data.image;
   const loading = data.loading > 1 ? `, after ${(data.loading / 1000).toFixed(1)} s of loading` : "";
   $("status").textContent = `${name}: ${width}x${height} in ${(data.milliseconds / 1000).toFixed(2)} s${loading}`;
   show();

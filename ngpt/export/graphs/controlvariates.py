@@ -4,9 +4,8 @@ import numpy as np
 
 from ngpt.classical.controlvariates import SWEEPS, decay
 from ngpt.classical.variances import FLOOR
-from ngpt.export.builder import FLOAT, Value, channels, op, repeat
+from ngpt.export.builder import Value, channels, op, repeat
 from ngpt.export.graphs import variances
-from ngpt.export.graphs.repair import finite
 
 IMAGE = ("tiles", 3, "height", "width")
 # A variance so large that its weight is 0.
@@ -18,7 +17,7 @@ def wcv(
 ) -> Value:
     """The base (N, 3, H, W) of finite layers.
 
-    ``trusted``   (N, 1, H, W) for dx and dy, 1 where they are
+    ``trusted``   (N, 1, H, W) for dx and dy, true where they are
     ``variance``  of primal, dx and dy, as renderers give them
     ``mean``      what it is relative to, a scalar: the mean variance of the whole image
     """
@@ -27,7 +26,7 @@ def wcv(
     relative = op.Where(noisy, smooth / op.Where(noisy, mean, 1.0) + FLOOR, 1.0)
     v = channels(relative, 0, 1)
     vx, vy = (
-        op.Where(op.Greater(channels(inside, i, i + 1) * known, 0.0), channels(relative, i, i + 1), _NEVER)
+        op.Where(op.And(op.Greater(channels(inside, i, i + 1), 0.0), known), channels(relative, i, i + 1), _NEVER)
         for i, known in ((1, trusted[0]), (2, trusted[1]))
     )
     V = op.Concat(vx, vy, _before(vx, 3, _NEVER), _before(vy, 2, _NEVER), axis=1)
@@ -44,11 +43,6 @@ def wcv(
         return u + change / (op.ReduceSum(A, [1], keepdims=1) + 1.0), True
 
     return primal + repeat(SWEEPS, sweep, primal * 0.0, IMAGE)
-
-
-def trusted(gradient: Value) -> Value:
-    """(N, 1, H, W): 1 where a gradient is finite in all colours, else 0."""
-    return op.ReduceMin(op.Cast(finite(gradient), to=FLOAT), [1], keepdims=1)
 
 
 def _before(x: Value, axis: int, border: float) -> Value:

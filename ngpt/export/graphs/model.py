@@ -1,9 +1,9 @@
 """After ``ngpt.network.model`` (and ``heads``): the whole graph from a renderer's buffers to the image.
 
-    buffers -> clean -> statistics -> normalised -> base -> completed -> encoded -> padded -> [network]
-            -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> image
+    buffers -> repaired -> statistics -> normalised -> base -> completed -> encoded -> padded -> [network]
+            -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> emission -> image
 
-All of it is float32, whatever the network is in.
+All of it is float32, whatever the network is in. Images come and go with the emission that the camera sees directly.
 """
 
 import numpy as np
@@ -13,7 +13,7 @@ from ngpt.export.builder import Graph, Operators, Value, channels, choose, op
 from ngpt.export.graphs import controlvariates, exposure, features
 from ngpt.export.graphs.controlvariates import IMAGE
 from ngpt.export.graphs.padding import Mirror
-from ngpt.export.graphs.repair import clean
+from ngpt.export.graphs.repair import Repaired, clean, repaired
 from ngpt.export.graphs.transfer import signed_exp, signed_log
 from ngpt.network.features import CHANNELS
 from ngpt.network.inputs import DENOISED, LAYERS
@@ -28,23 +28,33 @@ class _OperatorsOfHeads(Operators):
 
 def layers(config: ModelConfig) -> tuple[str, ...]:
     """The inputs of the graph of such a model, in order."""
-    return tuple(name for name in (*LAYERS, *DENOISED) if name in (*config.needs, *config.layers))
+    needed = ("direct", *config.needs, *config.layers)
+    return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *DENOISED) if name in needed)
+
+
+def optional(config: ModelConfig) -> tuple[str, ...]:
+    """Those of the inputs that may be zeros everywhere."""
+    return ("direct", *config.optional)
 
 
 def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto) -> Graph:
     """The graph around a network of that configuration, ``channels`` to ``prediction``."""
     graph = Graph("reconstruction")
     raw = _buffers(graph, layers(config))
-    finite = _finite(raw)
+    data = _repaired(config, raw)
     given = graph.input("statistics", (5,), np.zeros(5))
     is_given = op.Greater(op.ReduceMax(op.Slice(given, [0], [1]), keepdims=0), 0.0)
-    shared = choose(is_given, lambda: op.Identity(given), lambda: _statistics(config, finite), (5,))
-    scale, depth, low, high, mean = (
-        op.ReduceMax(op.Slice(shared, [i], [i + 1]), keepdims=0) for i in range(len(exposure.STATISTICS))
-    )
-    scaled = features.normalised(finite, config.layers, scale, depth)
+    shared = choose(is_given, lambda: op.Identity(given), lambda: _statistics(config, data), (5,))
+    scale, depth, low, high, mean = _numbers(shared)
+    scaled = features.normalised(data.layers, config.layers, scale, depth)
     if config.base:
-        scaled["base"] = _base(graph, raw, finite, scale, mean)
+        made = graph.input("base", ("tiles", 3, "base_height", "base_width"), np.zeros((1, 3, 0, 0)))
+        scaled["base"] = choose(
+            op.Equal(op.Size(made), 0),
+            lambda: _base(data, scale, mean),
+            lambda: (made - data.direct) / scale,
+            IMAGE,
+        )
 
     mirror = Mirror(raw["primal"], alignment)
     completed = features.completed(scaled, config.inputs)
@@ -60,16 +70,28 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
         share = mirror.crop(_share(mirror, scaled["primal_se"], scaled["base"], config.quiet))
         logarithm = base + (logarithm - base) * share
     bounded = op.Min(op.Max(logarithm, signed_log(low / scale)), signed_log(high / scale))
-    graph.output("image", signed_exp(bounded) * scale, IMAGE)
+    image = signed_exp(bounded) * scale
+    graph.output("image", image if config.emission else image + data.direct, IMAGE)
     return graph
 
 
 def statistics(config: ModelConfig) -> Graph:
-    """The graph that tells what the tiles of an image share."""
+    """The graph that tells what the tiles of an image share, and makes what another denoiser is to be given."""
     graph = Graph("statistics_of")
-    used = ("primal", "depth", *(_VARIANCES if config.base else ()))
-    raw = _buffers(graph, tuple(name for name in layers(config) if name in used))
-    graph.output("statistics", _statistics(config, _finite(raw)), (5,))
+    used = {"primal", "direct", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
+    denoised = [name for name in DENOISED if name in config.layers]
+    if denoised:
+        used |= {"albedo", "normal"}
+    data = _repaired(config, _buffers(graph, tuple(name for name in layers(config) if name in used)))
+    shared = _statistics(config, data)
+    graph.output("statistics", shared, (5,))
+    if denoised:
+        graph.output("oidn_primal", data.layers["primal"] + data.direct, IMAGE)
+        graph.output("oidn_albedo", op.Clip(data.layers["albedo"], 0.0, 1.0), IMAGE)
+        graph.output("oidn_normal", op.Identity(data.layers["normal"]), IMAGE)
+    if "denoised_base" in denoised:
+        scale, _, _, _, mean = _numbers(shared)
+        graph.output("oidn_base", _base(data, scale, mean) * scale + data.direct, IMAGE)
     return graph
 
 
@@ -77,27 +99,32 @@ def _buffers(graph: Graph, names: tuple[str, ...]) -> dict[str, Value]:
     return {name: graph.input(name, ("tiles", CHANNELS.get(name, 3), "height", "width")) for name in names}
 
 
-def _finite(raw: dict[str, Value]) -> dict[str, Value]:
-    """The layers with 0 for what is not finite; variances as they are, since it depends on the use what is unknown."""
-    return {name: layer if name in _VARIANCES else clean(layer) for name, layer in raw.items()}
+def _repaired(config: ModelConfig, raw: dict[str, Value]) -> Repaired:
+    """The layers as the network sees them: with emission seen directly if it does, and without otherwise."""
+    data = repaired(raw)
+    if config.emission:
+        data.layers["primal"] = data.layers["primal"] + data.direct
+    for name in DENOISED:
+        if name in data.layers:
+            data.layers[name] = clean(raw[name] - data.direct)
+    return data
 
 
-def _statistics(config: ModelConfig, finite: dict[str, Value]) -> Value:
-    return exposure.statistics(finite, tuple(finite[name] for name in _VARIANCES) if config.base else None)
+def _statistics(config: ModelConfig, data: Repaired) -> Value:
+    variances = tuple(data.layers[name] for name in _VARIANCES) if config.base else None
+    return exposure.statistics(data.layers, variances)
 
 
-def _base(graph: Graph, raw: dict[str, Value], finite: dict[str, Value], scale: Value, mean: Value) -> Value:
-    """The base that the host gives, over the exposure, or else control variates."""
-    given = graph.input("base", ("tiles", 3, "base_height", "base_width"), np.zeros((1, 3, 0, 0)))
-    primal, dx, dy = (finite[name] / scale for name in ("primal", "dx", "dy"))
-    trusted = controlvariates.trusted(raw["dx"]), controlvariates.trusted(raw["dy"])
-    variances = tuple(finite[name] for name in _VARIANCES)
-    return choose(
-        op.Equal(op.Size(given), 0),
-        lambda: controlvariates.wcv(primal, dx, dy, trusted, variances, mean),
-        lambda: given / scale,
-        IMAGE,
-    )
+def _numbers(shared: Value) -> tuple[Value, ...]:
+    """Exposure, largest depth, least and largest radiance, mean variance: scalars."""
+    return tuple(op.ReduceMax(op.Slice(shared, [i], [i + 1]), keepdims=0) for i in range(len(exposure.STATISTICS)))
+
+
+def _base(data: Repaired, scale: Value, mean: Value) -> Value:
+    """Control variates, over the exposure, without direct emission."""
+    primal, dx, dy = (data.layers[name] / scale for name in ("primal", "dx", "dy"))
+    variances = tuple(data.layers[name] for name in _VARIANCES)
+    return controlvariates.wcv(primal, dx, dy, (data.trusted["dx"], data.trusted["dy"]), variances, mean)
 
 
 def _share(mirror: Mirror, noise: Value, base: Value, quiet: float) -> Value:

@@ -1,6 +1,31 @@
-"""After ``ngpt.repair``, without its neighbours: what is not finite counts as 0."""
+"""After ``ngpt.repair``: direct emission taken out, non-finite pixels replaced, differences that cannot be trusted."""
 
-from ngpt.export.builder import Value, op
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngpt.export.builder import END, FLOAT, Value, choose, op
+from ngpt.repair import BLOCK
+
+_IMAGE = ("tiles", 3, "height", "width")
+_UNKNOWN = np.float32(np.nan)
+# Blocks of 8^5 = 32768 pixels hold any image that files may.
+_LEVELS = 5
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """What the rest of a graph works on; (N, C, H, W).
+
+    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances NaN where unknown
+    ``direct``   direct emission, finite, to be added back
+    ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they are
+    """
+
+    layers: dict[str, Value]
+    direct: Value
+    trusted: dict[str, Value]
 
 
 def finite(x: Value) -> Value:
@@ -11,3 +36,62 @@ def finite(x: Value) -> Value:
 def clean(x: Value) -> Value:
     """The values, 0 where they are not finite."""
     return op.Where(finite(x), x, 0.0)
+
+
+def repaired(raw: Mapping[str, Value]) -> Repaired:
+    """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them."""
+    light = raw["primal"] - raw["direct"]
+    good = _everywhere(finite(light), 1)
+    whole = op.Greater(op.ReduceMin(op.Cast(good, to=FLOAT), keepdims=0), 0.5)
+    image = choose(whole, lambda: op.Identity(light), lambda: _filled(light, good), _IMAGE)
+    direct = op.Where(good, raw["direct"], 0.0)
+    layers = {name: clean(layer) for name, layer in raw.items() if name != "direct" and not name.endswith("_var")}
+    layers["primal"] = image
+    # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
+    known = {"primal_var": op.And(good, _everywhere(op.Equal(direct, 0.0), 1))}
+    trusted = {}
+    for name, axis in (("dx", 3), ("dy", 2)):
+        if name in raw:
+            following = op.Pad(op.Slice(op.Cast(good, to=FLOAT), [1], [END], [axis]), [0, 1], 1.0, [axis])
+            both = op.And(good, op.Greater(following, 0.5))
+            trusted[name] = known[f"{name}_var"] = op.And(both, _everywhere(finite(raw[name]), 1))
+            layers[name] = op.Where(trusted[name], layers[name], 0.0)
+    for name, flags in known.items():
+        if name in raw:
+            layers[name] = op.Where(flags, raw[name], _UNKNOWN)
+    return Repaired(layers, direct, trusted)
+
+
+def _everywhere(flags: Value, axis: int) -> Value:
+    """Where ``flags`` hold all along an axis."""
+    return op.Greater(op.ReduceMin(op.Cast(flags, to=FLOAT), [axis], keepdims=1), 0.5)
+
+
+def _filled(light: Value, good: Value) -> Value:
+    """The image with the pixels replaced that are not ``good``; ``ngpt.repair`` says by what."""
+    sums = op.Concat(op.Where(good, light, 0.0), op.Cast(good, to=FLOAT), axis=1)
+    near = op.AveragePool(sums, kernel_shape=[3, 3], pads=[1, 1, 1, 1], count_include_pad=1)
+    levels = [sums, near]
+    pooled = sums
+    for _ in range(_LEVELS):
+        missing = op.Mod(-op.Shape(pooled, start=2, end=4), [BLOCK, BLOCK])
+        pooled = op.Pad(pooled, op.Concat([0, 0], missing, axis=0), 0.0, [2, 3])
+        pooled = op.AveragePool(pooled, kernel_shape=[BLOCK, BLOCK], strides=[BLOCK, BLOCK])
+        levels.append(pooled)
+    result = _mean(levels[-1], 0.0)
+    for finer in reversed(levels[2:-1]):
+        result = _mean(finer, _spread(result, finer))
+    return _mean(sums, _mean(near, _spread(result, sums)))
+
+
+def _mean(sums: Value, otherwise: Value | float) -> Value:
+    """Sums of RGB over counts (N, 4, H, W) as means, ``otherwise`` where nothing was counted."""
+    total, count = op.Slice(sums, [0], [3], [1]), op.Slice(sums, [3], [4], [1])
+    there = op.Greater(count, 0.0)
+    return op.Where(there, total / op.Where(there, count, 1.0), otherwise)
+
+
+def _spread(blocks: Value, like: Value) -> Value:
+    """What each block holds, at all of its pixels."""
+    rows, columns = (op.Range(0, op.Squeeze(op.Shape(like, start=a, end=a + 1)), 1) / BLOCK for a in (2, 3))
+    return op.Gather(op.Gather(blocks, rows, axis=2), columns, axis=3)

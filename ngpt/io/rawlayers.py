@@ -1,0 +1,46 @@
+"""Layers as raw files that any language reads in three lines: what hosts of networks are given and tested on.
+
+A folder holds NAME.f32 for each layer, float32, little-endian, (1, C, height, width) in C order, and ``layers.json``,
+which lists their shapes and SHA-256 sums.
+"""
+
+import hashlib
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+from ngpt.system.files import atomic_output, check_output
+
+LISTING = "layers.json"
+
+
+def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool = False) -> None:
+    """Writes layers (1, C, H, W) into a folder, which is made if there is none; the listing comes last.
+
+    Raises NgptError where the folder cannot be made, and where a file exists and may not be overwritten.
+    """
+    if folder.exists() and not folder.is_dir():
+        raise NgptError(f"{folder}: is a file; give a folder for the layers")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{folder}: cannot be made: {error.strerror}; name another folder") from error
+    for name in (*(f"{layer}.f32" for layer in layers), LISTING):
+        check_output(folder / name, overwrite)
+    listing = {}
+    for name, layer in layers.items():
+        data = np.ascontiguousarray(layer, "<f4").tobytes()
+        with atomic_output(folder / f"{name}.f32", overwrite) as temporary:
+            temporary.write_bytes(data)
+        listing[name] = {"shape": list(layer.shape), "sha256": hashlib.sha256(data).hexdigest()}
+    with atomic_output(folder / LISTING, overwrite) as temporary:
+        temporary.write_text(json.dumps(listing, indent=1) + "\n")
+
+
+def planes(stack: GradientStack) -> dict[str, np.ndarray]:
+    """The layers of a stack, (1, C, H, W), by their names in the contract."""
+    return {name: np.moveaxis(stack[name], -1, 0)[None] for name in stack.names}

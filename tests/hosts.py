@@ -1,0 +1,79 @@
+"""Hosts in other languages, built and run by tests; skips where what they need is not here."""
+
+import json
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+HOSTS = Path(__file__).parents[1] / "export" / "hosts"
+VECTOR = HOSTS.parent / "vector"
+
+
+def read_layers(folder) -> dict[str, np.ndarray]:
+    """The layers (1, C, H, W) that a folder of raw files holds, as ``export/vector`` does."""
+    shapes = {name: item["shape"] for name, item in json.loads((folder / "layers.json").read_text()).items()}
+    return {name: np.fromfile(folder / f"{name}.f32", "<f4").reshape(shape) for name, shape in shapes.items()}
+
+
+def read_pfm(path) -> np.ndarray:
+    """A portable float map as (1, 3, H, W)."""
+    kind, size, scale, pixels = path.read_bytes().split(b"\n", 3)
+    assert (kind, scale) == (b"PF", b"-1.0")
+    width, height = map(int, size.split())
+    return np.frombuffer(pixels, "<f4").reshape(height, width, 3)[::-1].transpose(2, 0, 1)[None]
+
+
+def agree(image, expected):
+    """To 1e-4 of each value, and of the darkest to 1e-6 of the typical one: a lamp is no excuse for what is beside."""
+    assert image.shape == expected.shape
+    assert (np.abs(image - expected) <= 1e-4 * (np.abs(expected) + 1e-2 * np.median(np.abs(expected)))).all()
+
+
+def compiled(source: str, program: Path, *flags: str) -> list[str]:
+    """The command of a C++ host, compiled against ONNX Runtime of the system or of ORT_ROOT."""
+    compiler = shutil.which("g++") or shutil.which("clang++")
+    if compiler is None:
+        pytest.skip("neither g++ nor clang++ is installed")
+    root = Path(os.environ.get("ORT_ROOT", "/usr"))
+    headers = [path for path in (root / "include", root / "include" / "onnxruntime") if path.is_dir()]
+    if not any((path / "onnxruntime_cxx_api.h").exists() for path in headers):
+        pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include; name a release's folder in ORT_ROOT")
+    library = root / "lib"
+    command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / source, "-o", program]
+    command += [flag for path in headers for flag in ("-isystem", path) if path != Path("/usr/include")]
+    command += [f"-L{library}", f"-Wl,-rpath,{library}", "-lonnxruntime", *flags]
+    result = subprocess.run(command, capture_output=True, text=True, timeout=500)
+    assert result.returncode == 0, result.stderr
+    return [str(program)]
+
+
+def cpp_host(folder) -> list[str]:
+    return compiled("host.cpp", folder / "ngpt-host")
+
+
+def node_modules(package, host) -> Path:
+    folders = [*filter(None, os.environ.get("NODE_PATH", "").split(os.pathsep)), HOSTS / host / "node_modules"]
+    found = next((Path(folder) / package for folder in folders if (Path(folder) / package).is_dir()), None)
+    if found is None:
+        pytest.skip(f"{package} is neither in NODE_PATH nor in export/hosts/{host}/node_modules; npm install {package}")
+    return found
+
+
+def node() -> str:
+    return shutil.which("node") or pytest.skip("node is not installed")
+
+
+def node_host(_folder) -> list[str]:
+    node_modules("onnxruntime-node", "node")
+    return [node(), str(HOSTS / "node" / "host.mjs")]
+
+
+def caller(command):
+    """A function that runs a host with arguments of any type."""
+    return lambda *arguments: subprocess.run(
+        [*command, *map(str, arguments)], capture_output=True, text=True, timeout=500
+    )
