@@ -106,6 +106,8 @@ Network::Graph Network::load(const std::string &path, int threads) {
     for (size_t i = 0; i < graph.session.GetOverridableInitializerCount(); i++)
         add(graph.session.GetOverridableInitializerNameAllocated(i, allocator),
             graph.session.GetOverridableInitializerTypeInfo(i));
+    for (size_t i = 0; i < graph.session.GetOutputCount(); i++)
+        graph.outputs.push_back(graph.session.GetOutputNameAllocated(i, allocator).get());
     return graph;
 }
 
@@ -117,6 +119,8 @@ void Network::load_statistics(int threads) {
         for (const std::string &name : statistics_.names)
             if (!input(name))
                 throw Failure(NGPT_BAD_NETWORK, stem + ".statistics.onnx: belongs to another network, it reads " + name);
+        for (const std::string &name : statistics_.outputs)
+            if (name != "statistics") prepared.push_back(name);
     } catch (const std::exception &error) {
         no_statistics_ = error.what();
     }
@@ -161,6 +165,8 @@ const Input *Network::input(const std::string &name) const {
     return nullptr;
 }
 
+bool Network::prepares_with(const std::string &name) const { return holds(statistics_.names, name); }
+
 std::vector<Tile> Network::plan(int64_t width, int64_t height, int64_t memory, bool with_base) const {
     const int64_t overlap = with_base ? overlap_with_base_ : overlap_, most = (memory << 20) / bytes_per_pixel_;
     const std::vector<Cut> down = cuts(height, alignment_, overlap), across = cuts(width, alignment_, overlap);
@@ -189,19 +195,21 @@ std::vector<Tile> Network::plan(int64_t width, int64_t height, int64_t memory, b
     return tiles;
 }
 
-std::vector<float> Network::statistics(const Layers &layers, int64_t width, int64_t height, const Cancelled &cancelled) {
+Images Network::prepare(std::vector<std::string> names, const Layers &layers, int64_t width, int64_t height,
+                        const Cancelled &cancelled) {
     if (!no_statistics_.empty())
-        throw Failure(NGPT_BAD_NETWORK, no_statistics_ + "; tiles need it: put it there, or allow more memory");
-    return run(statistics_, "statistics", 5, layers, width, {0, 0, height, width}, {}, cancelled);
+        throw Failure(NGPT_BAD_NETWORK, no_statistics_ + "; tiles and ngpt_prepare need it: put it there");
+    names.push_back("statistics");
+    return run(statistics_, names, layers, width, {0, 0, height, width}, {}, cancelled);
 }
 
 std::vector<float> Network::run(const Layers &layers, int64_t width, const Window &window,
                                 const std::vector<float> &statistics, const Cancelled &cancelled) {
-    return run(image_, "image", 3 * window.area(), layers, width, window, statistics, cancelled);
+    return std::move(run(image_, {"image"}, layers, width, window, statistics, cancelled).at("image"));
 }
 
-std::vector<float> Network::run(Graph &graph, const char *output, int64_t length, const Layers &layers, int64_t width,
-                                const Window &window, const std::vector<float> &statistics, const Cancelled &cancelled) {
+Images Network::run(Graph &graph, const std::vector<std::string> &outputs, const Layers &layers, int64_t width,
+                    const Window &window, const std::vector<float> &statistics, const Cancelled &cancelled) {
     const auto memory = Ort::MemoryInfo::CreateCpu(OrtArenaAllocator, OrtMemTypeDefault);
     std::vector<std::vector<float>> pixels;
     std::vector<const char *> names;
@@ -223,7 +231,11 @@ std::vector<float> Network::run(Graph &graph, const char *output, int64_t length
     if (!statistics.empty()) pass("statistics", statistics, {int64_t(statistics.size())});
 
     Ort::RunOptions options;
-    const auto run = [&] { return graph.session.Run(options, names.data(), values.data(), values.size(), &output, 1); };
+    std::vector<const char *> made;
+    for (const std::string &name : outputs) made.push_back(name.c_str());
+    const auto run = [&] {
+        return graph.session.Run(options, names.data(), values.data(), values.size(), made.data(), made.size());
+    };
     auto future = std::async(cancelled ? std::launch::async : std::launch::deferred, run);
     bool ended = false;
     while (cancelled && future.wait_for(std::chrono::milliseconds(50)) != std::future_status::ready)
@@ -233,10 +245,15 @@ std::vector<float> Network::run(Graph &graph, const char *output, int64_t length
         throw Failure(NGPT_CANCELLED, "cancelled");
     }
     const std::vector<Ort::Value> result = future.get();
-    const float *data = result[0].GetTensorData<float>();
-    if (int64_t(result[0].GetTensorTypeAndShapeInfo().GetElementCount()) != length)
-        throw Failure(NGPT_BAD_NETWORK, path + ": its " + output + " has another size than is due; export it anew");
-    return {data, data + length};
+    Images images;
+    for (size_t i = 0; i < outputs.size(); i++) {
+        const size_t length = result[i].GetTensorTypeAndShapeInfo().GetElementCount();
+        if (length != (outputs[i] == "statistics" ? 5 : size_t(3 * window.area())))
+            throw Failure(NGPT_BAD_NETWORK, path + ": its " + outputs[i] + " has another size than is due; export it anew");
+        const float *data = result[i].GetTensorData<float>();
+        images[outputs[i]].assign(data, data + length);
+    }
+    return images;
 }
 
 }  // namespace ngpt

@@ -33,6 +33,7 @@ struct Tile {
 };
 
 using Layers = std::map<std::string, View>;
+using Images = std::map<std::string, std::vector<float>>;  // three channels, one after the other; row by row
 // Asked now and then during a run; true ends it. May be empty.
 using Cancelled = std::function<bool()>;
 
@@ -40,27 +41,32 @@ class Network {
 public:
     const std::string path;
     std::vector<Input> inputs;
+    std::vector<std::string> prepared;  // the images that `prepare` can make
     std::map<std::string, std::string> metadata;
 
     Network(const std::string &path, int threads);
 
     const Input *input(const std::string &name) const;  // nullptr if it reads no such layer
 
+    // Whether `prepare` reads that layer.
+    bool prepares_with(const std::string &name) const;
+
     // The least work within `memory` MiB; the same tiles as in ngpt/network/run_onnx.py.
     std::vector<Tile> plan(int64_t width, int64_t height, int64_t memory, bool with_base) const;
 
-    // The five numbers that the tiles of an image share.
-    std::vector<float> statistics(const Layers &layers, int64_t width, int64_t height, const Cancelled &cancelled);
+    // "statistics", the five numbers that the tiles of an image share, and those of `prepared` that are named.
+    Images prepare(std::vector<std::string> names, const Layers &layers, int64_t width, int64_t height,
+                   const Cancelled &cancelled);
 
-    // The image of a window, channel by channel. Without statistics those of the window are taken.
+    // The image of a window. Without statistics those of the window are taken.
     std::vector<float> run(const Layers &layers, int64_t width, const Window &window,
                            const std::vector<float> &statistics, const Cancelled &cancelled);
 
 private:
-    // A graph with the names of its inputs; those at the end, from `must` on, have values.
+    // A graph with the names of its inputs, of which those from `must` on have values.
     struct Graph {
         Ort::Session session{nullptr};
-        std::vector<std::string> names;
+        std::vector<std::string> names, outputs;
         std::vector<std::vector<int64_t>> shapes;
         size_t must = 0;
     };
@@ -75,8 +81,8 @@ private:
     const std::string &value(const std::string &key) const;
     int64_t number(const std::string &key, int64_t least, int64_t most) const;
     void list_inputs();
-    std::vector<float> run(Graph &graph, const char *output, int64_t length, const Layers &layers, int64_t width,
-                           const Window &window, const std::vector<float> &statistics, const Cancelled &cancelled);
+    Images run(Graph &graph, const std::vector<std::string> &outputs, const Layers &layers, int64_t width,
+               const Window &window, const std::vector<float> &statistics, const Cancelled &cancelled);
 };
 
 // On one line, of 400 characters at most.

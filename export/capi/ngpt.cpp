@@ -1,10 +1,12 @@
 // The C functions: checks of what they are given, and exceptions as messages.
 #include "network.hpp"
 
+#include <algorithm>
 #include <cstdio>
 #include <exception>
 #include <memory>
 #include <new>
+#include <utility>
 
 using namespace ngpt;
 
@@ -14,8 +16,9 @@ struct ngpt_network {
 
 struct ngpt_job {
     std::shared_ptr<Network> network;
-    Layers layers;
-    View output{};
+    Layers layers, outputs;
+    std::vector<float> statistics;  // those of `ngpt_prepare`, for the next run of an image of that size
+    int width = 0, height = 0;
     char message[512] = "";
 };
 
@@ -57,12 +60,63 @@ template <typename Action> ngpt_status guarded(ngpt_job *job, Action action) {
 
 [[noreturn]] void refuse(const std::string &message) { throw Failure(NGPT_BAD_ARGUMENT, message); }
 
-void check(const std::string &name, const View &view, int least) {
-    if (view.format != NGPT_FLOAT && view.format != NGPT_HALF)
-        refuse(name + ": the format is " + std::to_string(int(view.format)) + "; it must be NGPT_FLOAT or NGPT_HALF");
-    if (view.channels < least)
-        refuse(name + ": has " + std::to_string(view.channels) + " channels; it must have " + std::to_string(least));
+std::string joined(const std::vector<std::string> &names) {
+    std::string text;
+    for (const std::string &name : names) text += (text.empty() ? "" : ", ") + name;
+    return text;
 }
+
+// Notes a view under one of the names that are known, or forgets it where there are no pixels.
+template <typename Channels>
+void set(Layers &views, const char *name, const char *verb, const std::vector<std::string> &known, const View &view,
+         Channels channels) {
+    if (!name) refuse("the name is NULL; the network " + std::string(verb) + " " + joined(known));
+    const std::string key = name;
+    if (std::find(known.begin(), known.end(), key) == known.end())
+        refuse("the network " + std::string(verb) + " no '" + key.substr(0, 40) + "'; it " + verb + " " + joined(known));
+    if (!view.pixels) {
+        views.erase(key);
+        return;
+    }
+    if (view.format != NGPT_FLOAT && view.format != NGPT_HALF)
+        refuse(key + ": the format is " + std::to_string(int(view.format)) + "; it must be NGPT_FLOAT or NGPT_HALF");
+    if (view.channels < channels())
+        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " + std::to_string(channels()));
+    views[key] = view;
+}
+
+void check_size(int width, int height) {
+    if (width < 1 || height < 1 || width > LARGEST || height > LARGEST)
+        refuse("the image has " + std::to_string(width) + "x" + std::to_string(height) + " pixels; sides must be 1 to " +
+               std::to_string(LARGEST));
+}
+
+void check_layers(const Network &network, const Layers &layers, bool preparing) {
+    std::vector<std::string> missing;
+    for (const Input &one : network.inputs)
+        if (one.required && !layers.count(one.name) && !(preparing && !network.prepares_with(one.name)))
+            missing.push_back(one.name);
+    if (!missing.empty())
+        throw Failure(NGPT_MISSING_LAYER, "the network needs the layers " + joined(missing) + ", which are not set");
+}
+
+// The caller's function, asked with the part that is done.
+class Progress {
+public:
+    Progress(ngpt_progress function, void *user) : function_(function), user_(user) {}
+    Cancelled cancelled() const {
+        return function_ ? Cancelled([this] { return function_(user_, done_) != 0; }) : nullptr;
+    }
+    void advance(double fraction) {
+        done_ = fraction;
+        if (function_ && function_(user_, done_)) throw Failure(NGPT_CANCELLED, "cancelled");
+    }
+
+private:
+    ngpt_progress function_;
+    void *user_;
+    double done_ = 0;
+};
 
 const Input *input_at(const ngpt_network *network, int index) {
     return index >= 0 && index < ngpt_layer_count(network) ? &network->shared->inputs[index] : nullptr;
@@ -125,70 +179,70 @@ const char *ngpt_message(const ngpt_job *job) { return job ? job->message : "the
 ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void *pixels, ngpt_format format, int channels,
                            ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride) {
     return guarded(job, [&] {
-        if (!name) refuse("the name of the layer is NULL");
-        const Input *input = job->network->input(name);
-        if (!input) {
-            std::string known;
-            for (const Input &one : job->network->inputs) known += (known.empty() ? "" : ", ") + one.name;
-            refuse("the network reads no layer '" + std::string(name).substr(0, 40) + "'; it reads " + known);
-        }
-        // `read` gets the same structure as `write`, and only reads.
+        std::vector<std::string> known;
+        for (const Input &one : job->network->inputs) known.push_back(one.name);
+        // `read` and `write` have one structure; this one is for `read`.
         const View view{const_cast<void *>(pixels), format, channels, channel_stride, pixel_stride, row_stride};
-        if (!pixels) {
-            job->layers.erase(name);
-        } else {
-            check(name, view, input->channels);
-            job->layers[name] = view;
-        }
+        set(job->layers, name, "reads", known, view, [&] { return job->network->input(name)->channels; });
     });
 }
 
-ngpt_status ngpt_set_output(ngpt_job *job, void *pixels, ngpt_format format, int channels, ptrdiff_t channel_stride,
-                            ptrdiff_t pixel_stride, ptrdiff_t row_stride) {
+ngpt_status ngpt_set_output(ngpt_job *job, const char *name, void *pixels, ngpt_format format, int channels,
+                            ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride) {
     return guarded(job, [&] {
+        std::vector<std::string> known = job->network->prepared;
+        known.insert(known.begin(), "image");
         const View view{pixels, format, channels, channel_stride, pixel_stride, row_stride};
-        if (pixels) check("the output", view, 3);
-        job->output = view;
+        set(job->outputs, name, "makes", known, view, [] { return 3; });
+    });
+}
+
+ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress progress, void *user) {
+    return guarded(job, [&] {
+        const Layers layers = job->layers, outputs = job->outputs;
+        Network &network = *job->network;
+        check_size(width, height);
+        check_layers(network, layers, true);
+        std::vector<std::string> names;
+        for (const std::string &name : network.prepared)
+            if (outputs.count(name)) names.push_back(name);
+        Progress asked(progress, user);
+        asked.advance(0);
+        Images images = network.prepare(names, layers, width, height, asked.cancelled());
+        asked.advance(1);
+        for (const std::string &name : names) write(outputs.at(name), width, height, images[name].data());
+        job->statistics = std::move(images["statistics"]);
+        job->width = width, job->height = height;
     });
 }
 
 ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user) {
     return guarded(job, [&] {
         // Copies, in case that the progress function sets others.
-        const Layers layers = job->layers;
-        const View output = job->output;
+        const Layers layers = job->layers, outputs = job->outputs;
         Network &network = *job->network;
-        if (width < 1 || height < 1 || width > LARGEST || height > LARGEST)
-            refuse("the image has " + std::to_string(width) + "x" + std::to_string(height) + " pixels; sides must be 1 to " +
-                   std::to_string(LARGEST));
+        check_size(width, height);
         if (memory < 0) refuse("the memory is " + std::to_string(memory) + " MiB; it must be 0 or more");
-        std::string missing;
-        for (const Input &one : network.inputs)
-            if (one.required && !layers.count(one.name)) missing += (missing.empty() ? "" : ", ") + one.name;
-        if (!missing.empty()) throw Failure(NGPT_MISSING_LAYER, "the network needs the layers " + missing + ": set them");
-        if (!output.pixels) throw Failure(NGPT_MISSING_LAYER, "the output is not set");
+        check_layers(network, layers, false);
+        if (!outputs.count("image")) throw Failure(NGPT_MISSING_LAYER, "the output 'image' is not set");
 
         const auto tiles = network.plan(width, height, memory ? memory : DEFAULT_MEMORY, layers.count("base"));
-        double done = 0;
-        Cancelled cancelled;
-        if (progress) cancelled = [&] { return progress(user, done) != 0; };
-        const auto advance = [&](double fraction) {
-            done = fraction;
-            if (cancelled && cancelled()) throw Failure(NGPT_CANCELLED, "cancelled");
-        };
-        advance(0);
-        std::vector<float> image(size_t(3) * width * height), shared;
-        if (tiles.size() > 1) shared = network.statistics(layers, width, height, cancelled);
+        Progress asked(progress, user);
+        asked.advance(0);
+        std::vector<float> image(size_t(3) * width * height), shared = std::exchange(job->statistics, {});
+        if (job->width != width || job->height != height) shared.clear();
+        if (tiles.size() > 1 && shared.empty())
+            shared = network.prepare({}, layers, width, height, asked.cancelled()).at("statistics");
         for (size_t i = 0; i < tiles.size(); i++) {
             const auto &[inner, outer] = tiles[i];
-            const std::vector<float> part = network.run(layers, width, outer, shared, cancelled);
+            const std::vector<float> part = network.run(layers, width, outer, shared, asked.cancelled());
             for (int64_t c = 0; c < 3; c++)
                 for (int64_t y = inner.top; y < inner.top + inner.height; y++) {
                     const float *from = &part[(c * outer.height + y - outer.top) * outer.width + inner.left - outer.left];
                     std::copy(from, from + inner.width, &image[(c * height + y) * width + inner.left]);
                 }
-            advance(double(i + 1) / double(tiles.size()));
+            asked.advance(double(i + 1) / double(tiles.size()));
         }
-        write(output, width, height, image.data());
+        write(outputs.at("image"), width, height, image.data());
     });
 }

@@ -3,14 +3,14 @@
  *     network = ngpt_open("ngpt-fast.onnx", 0, message, sizeof message);     once
  *     job = ngpt_job_new(network);                                           one for each thread
  *     ngpt_set_layer(job, "primal", pixels, NGPT_FLOAT, 3, 0, 0, 0);         for each layer it reads
- *     ngpt_set_output(job, image, NGPT_FLOAT, 3, 0, 0, 0);
+ *     ngpt_set_output(job, "image", image, NGPT_FLOAT, 3, 0, 0, 0);
  *     if (ngpt_run(job, width, height, 0, NULL, NULL) != NGPT_OK) puts(ngpt_message(job));
  *
  * What the layers mean, their signs and units: export/CONTRACT.md. A worked example: docs/c-library.md.
  *
  * Threads: any number may use one network at once. A job belongs to one thread at a time.
  * Handles: NULL is allowed for all of them; what a function then returns says that it could do nothing.
- * Text: UTF-8, paths too. Texts that are returned live as long as their handle, messages until the job's next call.
+ * Text: paths are UTF-8. Texts that are returned live as long as their handle, messages until the job's next call.
  * Nothing here throws, ends the process, prints, or keeps state outside its handles.
  */
 #ifndef NGPT_H
@@ -100,22 +100,29 @@ NGPT_API ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void 
                                     int channels, ptrdiff_t channel_stride, ptrdiff_t pixel_stride,
                                     ptrdiff_t row_stride);
 
-/* Says where the image goes, with three channels or more, of which the first three are written. It is written at the
- * end of a run that succeeds, and only then; so it may lie where a layer is. */
-NGPT_API ngpt_status ngpt_set_output(ngpt_job *job, void *pixels, ngpt_format format, int channels,
+/* Says where an image goes that the network makes: "image", or one of those of `ngpt_prepare`. It has three channels or
+ * more, of which the first three are written. It is written at the end of a run that succeeds, and only then; so it may
+ * lie where a layer is. */
+NGPT_API ngpt_status ngpt_set_output(ngpt_job *job, const char *name, void *pixels, ngpt_format format, int channels,
                                      ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride);
 
 /* Called about twenty times a second by the thread in `ngpt_run` with the part that is done, 0 to 1. Anything but 0
  * cancels the run. It must not throw, and not free the job. */
 typedef int (*ngpt_progress)(void *user, double fraction);
 
-/* Makes the image, in tiles if need be, which share the statistics of the whole image.
+/* Makes "image", in tiles if need be, which share the statistics of the whole image.
  *
  * width, height  1 to 65536
  * memory         MiB that the network may use beside the layers, 0 for 2048. Smaller tiles take longer, and give the
  *                same image to 1e-5.
  * progress       may be NULL; `user` is passed to it */
 NGPT_API ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user);
+
+/* Only for networks that correct another denoiser, which read "denoised": makes what that is to be given, those of
+ * "oidn_primal", "oidn_albedo", "oidn_normal" and "oidn_base" that are set as outputs. Call it, then the denoiser, then
+ * set "denoised" (and "denoised_base", and oidn_base as "base"), and call `ngpt_run`, which takes over the statistics.
+ * It works on the whole image at once. */
+NGPT_API ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress progress, void *user);
 
 #ifdef __cplusplus
 }
