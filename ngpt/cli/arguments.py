@@ -12,6 +12,9 @@ from ngpt.system import configs
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
 RESULT_SUFFIX = "_denoised"
 
+# Layers that many renderers write into files of their own.
+FILES = ("albedo", "normal", "depth")
+
 
 def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
@@ -33,6 +36,16 @@ def add_untrusted(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="files of strangers: decode them in a process of its own, so that none can crash this one",
     )
+
+
+def add_files(parser: argparse.ArgumentParser) -> None:
+    for layer in FILES:
+        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
+
+
+def given_files(args: argparse.Namespace) -> dict[str, str]:
+    """The files that the options of ``add_files`` name, by layer."""
+    return {layer: file for layer in FILES if (file := getattr(args, layer))}
 
 
 def add_layers(parser: argparse.ArgumentParser) -> None:

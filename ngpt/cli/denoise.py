@@ -6,7 +6,17 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import RESULT_SUFFIX, add_force, add_json, add_layers, add_untrusted, print_json, stack_files
+from ngpt.cli.arguments import (
+    RESULT_SUFFIX,
+    add_files,
+    add_force,
+    add_json,
+    add_layers,
+    add_untrusted,
+    given_files,
+    print_json,
+    stack_files,
+)
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
@@ -15,9 +25,6 @@ from ngpt.network.run_onnx import MEMORY
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.version import __version__
-
-# Layers that many renderers write into files of their own.
-FILES = ("albedo", "normal", "depth")
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -39,8 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
-    for layer in FILES:
-        parser.add_argument(f"--{layer}", metavar="FILE", help=f"{layer} of the one stack, from a file of its own")
+    add_files(parser)
     add_layers(parser)
     add_untrusted(parser)
     add_force(parser)
@@ -48,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    files = {layer: file for layer in FILES if (file := getattr(args, layer))}
+    files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
         raise NgptError(

@@ -15,11 +15,13 @@ from ngpt.classical.leastsquares import robust_mean
 from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
 from ngpt.export.graphs import controlvariates, exposure, features, padding, transfer, variances
 from ngpt.export.graphs.model import _OperatorsOfHeads
-from ngpt.export.graphs.repair import clean
+from ngpt.export.graphs.repair import clean, repaired
 from ngpt.network import features as torch_features
 from ngpt.network import padding as torch_padding
 from ngpt.network import transfer as torch_transfer
 from ngpt.network.heads import Direct, Kernels, Mixture, Residual
+from ngpt.repair import repair as numpy_repair
+from ngpt.stack import GradientStack
 
 
 def planes(layer):
@@ -55,6 +57,49 @@ def test_clean_keeps_what_is_finite():
     assert np.array_equal(evaluate(clean, x), np.float32([0, 0, 0, 0, 3e38, -2]))
 
 
+def damaged(height, width):
+    """Layers with a lamp and with values that are not finite, alone and in holes."""
+    layers, rng = full_layers(height, width), np.random.default_rng(height)
+    layers["direct"] = np.zeros_like(layers["primal"])
+    layers["direct"][:2, : width // 2] = 30
+    layers["primal"] += layers["direct"]
+    for layer in layers.values():
+        layer[rng.random(layer.shape) < 0.03] = rng.choice(np.float32([np.nan, np.inf, -np.inf]))
+    layers["primal"][height // 4 : -2, width // 3 : -1] = np.nan
+    layers["primal"][0, 0] = layers["direct"][0, 0] = 1  # so that there is something to repair from
+    return layers
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (24, 31), (90, 75)])
+def test_repair_is_that_of_numpy(size):
+    layers = damaged(*size)
+    data = numpy_repair(GradientStack.from_arrays(**layers))
+    expected = {"primal": data.image, "dx": data.dx, "dy": data.dy, **data.features, **data.known_variances()}
+
+    def graph(*values):
+        ours = repaired(dict(zip(layers, values, strict=True)))
+        return (ours.direct, *(ours.layers[name] for name in expected))
+
+    direct, *others = evaluate(graph, *(planes(layer) for layer in layers.values()))
+    assert np.array_equal(direct, planes(data.direct))
+    for (name, theirs), ours in zip(expected.items(), others, strict=True):
+        theirs = planes(theirs)
+        if name.startswith("d") and name != "depth":  # the last column and row, where there are no differences
+            last = np.s_[..., :-1] if name.startswith("dx") else np.s_[..., :-1, :]
+            ours, theirs = ours[last], theirs[last]
+        if name.endswith("_var"):  # what is not known is so in any colour
+            ours, theirs = (np.where(np.isfinite(v).all(1, keepdims=True), v, -1) for v in (ours, theirs))
+        assert np.allclose(ours, theirs, rtol=1e-5, atol=1e-6), name
+
+
+def test_an_image_without_any_good_pixel_becomes_black():
+    nothing = np.full((1, 3, 20, 17), np.nan, np.float32)
+    image = evaluate(
+        lambda primal, direct: repaired({"primal": primal, "direct": direct}).layers["primal"], nothing, 0 * nothing
+    )
+    assert image.shape == nothing.shape and not image.any()
+
+
 @pytest.mark.parametrize("values", [[0.0], [1, 2, 3], [1] * 500 + [1e12], [1e30, 1e30, 0], [0] * 300 + [5]])
 def test_the_robust_mean(values):
     values = np.float32(values)
@@ -72,7 +117,8 @@ def test_control_variates_are_those_of_numpy(size):
     def graph(*values):
         given = dict(zip(names, values, strict=True))
         noise = tuple(given[name] for name in names[3:])
-        trusted = controlvariates.trusted(given["dx"]), controlvariates.trusted(given["dy"])
+        everywhere = op.GreaterOrEqual(op.ReduceMin(given["primal"], [1], keepdims=1), -1e30)
+        trusted = everywhere, everywhere
         mean = variances.robust_mean(*variances.smoothed(given["primal"], *noise))
         return controlvariates.wcv(given["primal"], given["dx"], given["dy"], trusted, noise, mean)
 
