@@ -4,6 +4,8 @@ import json
 import os
 import shutil
 import subprocess
+import sys
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +14,39 @@ import pytest
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
 LIBRARY = HOSTS.parent / "capi"
 VECTOR = HOSTS.parent / "vector"
+
+# mitsuba-oidn has OIDN's library in it, with the same functions in a namespace, and without headers: those that the
+# host calls, so that it and ngpt run on one library. The library has no threads but those of its Python package, so
+# that the host, as a shared library, runs in a Python process.
+_OIDN = """
+#include <cstddef>
+namespace mitsuba_oidn {
+enum OIDNDeviceType { OIDN_DEVICE_TYPE_CPU = 1 };
+enum OIDNFormat { OIDN_FORMAT_FLOAT3 = 3 };
+enum OIDNError { OIDN_ERROR_NONE = 0 };
+typedef struct OIDNDeviceImpl *OIDNDevice;
+typedef struct OIDNFilterImpl *OIDNFilter;
+OIDNDevice oidnNewDevice(OIDNDeviceType type);
+void oidnCommitDevice(OIDNDevice device);
+void oidnReleaseDevice(OIDNDevice device);
+OIDNError oidnGetDeviceError(OIDNDevice device, const char **message);
+OIDNFilter oidnNewFilter(OIDNDevice device, const char *type);
+void oidnSetSharedFilterImage(OIDNFilter filter, const char *name, void *data, OIDNFormat format, size_t width,
+                              size_t height, size_t byteOffset, size_t pixelByteStride, size_t rowByteStride);
+void oidnSetFilterBool(OIDNFilter filter, const char *name, bool value);
+void oidnCommitFilter(OIDNFilter filter);
+void oidnExecuteFilter(OIDNFilter filter);
+void oidnReleaseFilter(OIDNFilter filter);
+}
+using namespace mitsuba_oidn;
+"""
+
+_IN_PYTHON = """
+import ctypes, sys
+import mitsuba_oidn  # gives the library its threads
+words = [word.encode() for word in sys.argv[1:]]
+sys.exit(ctypes.CDLL(sys.argv[1]).main(len(words), (ctypes.c_char_p * len(words))(*words)))
+"""
 
 
 def read_layers(folder) -> dict[str, np.ndarray]:
@@ -79,3 +114,16 @@ def caller(command):
     return lambda *arguments: subprocess.run(
         [*command, *map(str, arguments)], capture_output=True, text=True, timeout=500
     )
+
+
+def oidn_host(folder) -> list[str]:
+    spec = find_spec("mitsuba_oidn")
+    if spec is None or spec.origin is None:
+        pytest.skip("mitsuba-oidn, which has the library of OIDN in it, is not installed")
+    library = Path(spec.origin).parent / "libmitsuba_oidn.so"
+    if not library.exists():
+        pytest.skip(f"{library} is not there: only Linux has it under that name")
+    (folder / "OpenImageDenoise").mkdir()
+    (folder / "OpenImageDenoise" / "oidn.h").write_text(_OIDN)
+    flags = ["-shared", "-fPIC", f"-I{folder}", str(library), f"-Wl,-rpath,{library.parent}"]
+    return [sys.executable, "-c", _IN_PYTHON, *compiled("oidn_host.cpp", folder / "ngpt-oidn-host.so", *flags)]

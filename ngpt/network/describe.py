@@ -38,9 +38,7 @@ def _onnx(path: Path) -> dict[str, Any]:
     metadata = network.session.get_modelmeta().custom_metadata_map
     training = parse_json(metadata.get("ngpt.training", "{}"), f"{path}: its record of the training")
     claims = f"method '{metadata.get('ngpt.method', '')}', written by ngpt {metadata.get('ngpt.version', '?')}"
-    # Emission seen directly is for the graph around the network.
-    layers = tuple(name for name in network.inputs if name != "direct")
-    names = (*layers, "base") if network.base else layers
+    names = (*network.inputs, "base") if network.base else network.inputs
     return (
         _whose(path, claims)
         | _reads(names, network.base, network.optional, "ONNX Runtime")

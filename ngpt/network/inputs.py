@@ -1,7 +1,6 @@
 """What a network may read, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
 
     primal, dx, dy, albedo, normal, depth      layers of the stack
-    direct                                     zeros: emission seen directly is taken out already (ONNX graphs read it)
     primal_var, dx_var, dy_var                 variances of its layers, NaN where not known (ONNX graphs read these)
     primal_se, dx_se, dy_se                    standard errors, their roots, 0 where not known (PyTorch reads these)
     base                                       a classical reconstruction of ``ngpt.classical.bases``
@@ -40,9 +39,6 @@ MADE = ("base", *DENOISED)
 OPTIONAL = {"albedo": 3, "normal": 3, "depth": 1}
 WITH_EMISSION = ("primal", *OPTIONAL)
 
-# Those that its ONNX graph may do without: in it is what repairs, which ``gather`` has had done already.
-OPTIONAL_IN_GRAPHS = OPTIONAL | {"direct": 3}
-
 
 def needs(names: Collection[str], base: str, optional: Collection[str] = ()) -> tuple[str, ...]:
     """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
@@ -71,13 +67,13 @@ def gather(
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
     ``reader``    what the message says needs the layers that lack
-    ``optional``  those of ``OPTIONAL_IN_GRAPHS`` that are zeros where the stack lacks them
+    ``optional``  those of ``OPTIONAL`` that are zeros where the stack lacks them
     ``emission``  whether the primal includes emission seen directly; its results then are for ``without_emission``
 
     Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
     """
     primal = data.image + data.direct if emission else data.image
-    held = {name: np.zeros((*primal.shape[:2], OPTIONAL_IN_GRAPHS[name]), np.float32) for name in optional}
+    held = {name: np.zeros((*primal.shape[:2], OPTIONAL[name]), np.float32) for name in optional}
     held |= {"primal": primal, **data.features, **data.known_variances()}
     if data.dx is not None:
         held |= {"dx": data.dx, "dy": data.dy}

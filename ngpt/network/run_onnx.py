@@ -16,7 +16,7 @@ import numpy as np
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network.exposure import statistics
-from ngpt.network.inputs import OPTIONAL_IN_GRAPHS, WITH_EMISSION
+from ngpt.network.inputs import OPTIONAL, WITH_EMISSION
 from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers.
@@ -57,18 +57,22 @@ class Network:
         self.session = self._session(self.path)
         metadata = self.session.get_modelmeta().custom_metadata_map
         try:
-            self.inputs = tuple(metadata["ngpt.inputs"].split(", "))
+            names = metadata["ngpt.inputs"].split(", ")
             self.alignment = int(metadata["ngpt.alignment"])
             self.base = metadata["ngpt.base"]
             self.overlap = int(metadata["ngpt.overlap with base" if self.base else "ngpt.overlap"])
             self.bytes = int(metadata["ngpt.bytes per pixel"])
             # Files of earlier versions have neither.
-            self.optional = tuple(filter(None, metadata.get("ngpt.optional", "").split(", ")))
+            optional = tuple(filter(None, metadata.get("ngpt.optional", "").split(", ")))
             self.emission = metadata.get("ngpt.emission") == "true"
         except (KeyError, ValueError) as error:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
             ) from error
+        # Direct emission is taken out, and pixels are repaired, before layers come here: the graph, which does so for
+        # other hosts, is told that there is none. Graphs of earlier versions do not ask.
+        self.asks_for_direct = "direct" in names
+        self.inputs, self.optional = (tuple(n for n in listed if n != "direct") for listed in (names, optional))
         self._check()
 
     def _check(self) -> None:
@@ -78,11 +82,12 @@ class Network:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
         if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
-        if not set(self.optional) <= set(OPTIONAL_IN_GRAPHS) & set(self.inputs):
+        if not set(self.optional) <= set(OPTIONAL) & set(self.inputs):
             raise NgptError(f"{self.path}: its optional inputs are {', '.join(self.optional)}: export it anew")
-        if self.emission and (self.base or not set(self.inputs) <= {*WITH_EMISSION, "direct"}):
+        if self.emission and (self.base or not set(self.inputs) <= set(WITH_EMISSION)):
             raise NgptError(f"{self.path}: reads emission and {', '.join(self.inputs)}: export it anew")
         own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
+        own |= {"direct"} if self.asks_for_direct else set()
         graph = {given.name for given in self.session.get_inputs()}
         # Those that a host may leave out have a value in the graph.
         optional = {given.name for given in self.session.get_overridable_initializers()}
@@ -156,6 +161,8 @@ class Network:
             group = tiles[first : first + batch]
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
+            if self.asks_for_direct:
+                feed["direct"] = np.zeros_like(feed["primal"])
             results = self._run(self.session, feed | {"statistics": shared})
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]

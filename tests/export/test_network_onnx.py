@@ -97,6 +97,7 @@ def weights(tmp_path_factory):
 def noisy(height, width, scale=1.0, seed=0):
     """All layers of a stack, (1, C, H, W)."""
     layers = full_layers(height, width, scale, seed)
+    layers["direct"] = np.zeros_like(layers["primal"])
     return {name: np.ascontiguousarray(layer.transpose(2, 0, 1)[None]) for name, layer in layers.items()}
 
 
@@ -346,7 +347,7 @@ def test_metadata_tell_all_and_nothing_of_this_machine():
     file = WEIGHTS / "ngpt-fast.onnx"
     model = onnx.load(file)
     tell = {item.key: item.value for item in model.metadata_props}
-    assert tell["ngpt.inputs"].split(", ")[:3] == ["primal", "dx", "dy"]
+    assert tell["ngpt.inputs"].split(", ")[:4] == ["primal", "direct", "dx", "dy"]
     assert json.loads(tell["ngpt.training"])["step"] > 0
     assert str(Path.cwd()).encode() not in file.read_bytes() and b"site-packages" not in file.read_bytes()
     assert not any(initializer.external_data for initializer in model.graph.initializer)

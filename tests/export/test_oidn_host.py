@@ -1,18 +1,13 @@
 """The C++ host that calls Open Image Denoise gives the pixels of ``ngpt denoise`` with the networks that correct it.
 
-It is written for OIDN's public header. The library that the Python package mitsuba-oidn has in it is OIDN's, with the
-same functions in a namespace and without headers: those that the host calls are declared here, so that both sides run
-on one library. It needs the threads that its Python package gives it, so that the host runs in a Python process. Needs
-a C++ compiler and ONNX Runtime's headers, too (docs/hosts.md).
+Needs mitsuba-oidn, which has OIDN's library in it, a C++ compiler and ONNX Runtime's headers (docs/hosts.md).
 """
 
-import sys
-from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hosts import agree, caller, compiled, read_pfm
+from hosts import agree, caller, oidn_host, read_pfm
 
 import ngpt
 from ngpt.export.vector import example_layers
@@ -22,50 +17,10 @@ from ngpt.stack import GradientStack
 
 WEIGHTS = Path(ngpt.__file__).parent / "weights"
 
-HEADER = """
-#include <cstddef>
-namespace mitsuba_oidn {
-enum OIDNDeviceType { OIDN_DEVICE_TYPE_CPU = 1 };
-enum OIDNFormat { OIDN_FORMAT_FLOAT3 = 3 };
-enum OIDNError { OIDN_ERROR_NONE = 0 };
-typedef struct OIDNDeviceImpl *OIDNDevice;
-typedef struct OIDNFilterImpl *OIDNFilter;
-OIDNDevice oidnNewDevice(OIDNDeviceType type);
-void oidnCommitDevice(OIDNDevice device);
-void oidnReleaseDevice(OIDNDevice device);
-OIDNError oidnGetDeviceError(OIDNDevice device, const char **message);
-OIDNFilter oidnNewFilter(OIDNDevice device, const char *type);
-void oidnSetSharedFilterImage(OIDNFilter filter, const char *name, void *data, OIDNFormat format, size_t width,
-                              size_t height, size_t byteOffset, size_t pixelByteStride, size_t rowByteStride);
-void oidnSetFilterBool(OIDNFilter filter, const char *name, bool value);
-void oidnCommitFilter(OIDNFilter filter);
-void oidnExecuteFilter(OIDNFilter filter);
-void oidnReleaseFilter(OIDNFilter filter);
-}
-using namespace mitsuba_oidn;
-"""
-
-RUNNER = """
-import ctypes, sys
-import mitsuba_oidn  # gives the library its threads
-words = [word.encode() for word in sys.argv[1:]]
-sys.exit(ctypes.CDLL(sys.argv[1]).main(len(words), (ctypes.c_char_p * len(words))(*words)))
-"""
-
 
 @pytest.fixture(scope="module")
 def host(tmp_path_factory):
-    spec = find_spec("mitsuba_oidn")
-    if spec is None or spec.origin is None:
-        pytest.skip("mitsuba-oidn, which has the library of OIDN in it, is not installed")
-    library = Path(spec.origin).parent / "libmitsuba_oidn.so"
-    if not library.exists():
-        pytest.skip(f"{library} is not there: only Linux has it under that name")
-    folder = tmp_path_factory.mktemp("oidn")
-    (folder / "OpenImageDenoise").mkdir()
-    (folder / "OpenImageDenoise" / "oidn.h").write_text(HEADER)
-    flags = ["-shared", "-fPIC", f"-I{folder}", str(library), f"-Wl,-rpath,{library.parent}"]
-    return caller([sys.executable, "-c", RUNNER, *compiled("oidn_host.cpp", folder / "ngpt-oidn-host.so", *flags)])
+    return caller(oidn_host(tmp_path_factory.mktemp("oidn")))
 
 
 @pytest.fixture(scope="module")
