@@ -1,7 +1,9 @@
 """The C library as a package: its header, its symbols, find_package, the program of the docs, and no leak."""
 
+import os
 import re
 import subprocess
+import sys
 
 import pytest
 from capi import COLOUR, FAST, HEADER, SOURCE, Network, command, example, install, result, those, tool
@@ -112,12 +114,19 @@ def test_the_program_of_the_docs(renderer_project, program):
     assert outcome.returncode == 1 and outcome.stderr == "none.onnx: cannot be read, or is empty\n"
 
 
+def test_python_as_the_docs_show(prefix):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
+    environment = os.environ | {"LD_LIBRARY_PATH": str(prefix / "lib")}
+    outcome = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
+    assert outcome.stdout == f"{ngpt.__version__}\n", outcome.stderr
+
+
 def test_versions_that_do_not_fit_are_not_found(prefix, tmp_path):
     (tmp_path / "CMakeLists.txt").write_text(PROJECT.replace("VERSION REQUIRED", "99.0 REQUIRED"))
     (tmp_path / "renderer.c").write_text("")
     arguments = [tool("cmake"), "-S", tmp_path, "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
     outcome = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
-    assert outcome.returncode and "version: 0.1.0" in outcome.stderr
+    assert outcome.returncode and f"version: {ngpt.__version__}" in outcome.stderr
 
 
 def resident() -> int:
