@@ -89,6 +89,8 @@ Network::Graph Network::load(const std::string &path, int threads) {
     Ort::SessionOptions options;
     options.SetLogSeverityLevel(ORT_LOGGING_LEVEL_FATAL);
     options.SetIntraOpNumThreads(threads);
+    // ONNX Runtime 1.21 gives the nodes it makes here one name, since ours have none, and then refuses the model.
+    options.AddConfigEntry("optimization.disable_specified_optimizers", "GatherSliceToSplitFusion");
     Graph graph;
     try {
         graph.session = Ort::Session(environment_, data.data(), data.size(), options);
