@@ -3,6 +3,11 @@
 stack = ngpt.read("stack.exr")                 # GradientStack
 image = ngpt.denoise(stack, method="l1")       # (H, W, 3) float32
 ngpt.write("out.exr", image, like=stack)
+
+image = ngpt.denoise(noisy, albedo=albedo, normal=normal)       # arrays, tensors, bitmaps; the same kind comes back
+denoiser = ngpt.Denoiser(size, albedo=True, normals=True)       # called as mi.OptixDenoiser is
+
+help(ngpt.denoise) lists the methods, what they need, and their options.
 """
 
 from importlib import import_module
@@ -11,11 +16,11 @@ from typing import TYPE_CHECKING
 from ngpt.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from ngpt.denoiser import Denoiser
+    from ngpt.denoiser import Denoiser, denoise
     from ngpt.errors import NgptError
     from ngpt.io.exr import read, read_image, write
     from ngpt.merging import merge
-    from ngpt.methods import METHODS, Result, denoise, reconstruct
+    from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.stack import GradientStack
 
 __all__ = [
@@ -34,9 +39,10 @@ __all__ = [
 
 # Imported when they are asked for. So the commands are at work, and handle what interrupts them, before NumPy and SciPy
 # have been loaded, which comes with this package otherwise.
-_HOMES = {"Denoiser": "denoiser", "GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
+_HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
+_HOMES |= dict.fromkeys(("Denoiser", "denoise"), "denoiser")
 _HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
-_HOMES |= dict.fromkeys(("METHODS", "Result", "denoise", "reconstruct"), "methods")
+_HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 
 def __getattr__(name: str) -> object:
@@ -44,3 +50,7 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module 'ngpt' has no attribute '{name}'")
     value = globals()[name] = getattr(import_module(f"ngpt.{_HOMES[name]}"), name)
     return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

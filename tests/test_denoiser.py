@@ -1,5 +1,11 @@
 """ngpt.Denoiser, called as Mitsuba's are."""
 
+import ast
+import inspect
+from importlib.util import find_spec
+from pathlib import Path
+from typing import get_overloads
+
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
@@ -11,8 +17,19 @@ from ngpt.errors import NgptError
 @pytest.fixture
 def arrays():
     layers = full_layers(18, 26)
-    layers["noisy"], layers["normals"] = layers.pop("primal"), layers.pop("normal")
+    layers["noisy"] = layers.pop("primal")
+    # As a sensor of Mitsuba sees them: +x left, +z forward.
+    layers["normals"] = layers.pop("normal") * np.array([-1, 1, -1], np.float32)
     return layers
+
+
+@pytest.fixture
+def bitmap(renderer, arrays):
+    """What Mitsuba's films give: one image of many channels, named in the header of the file."""
+    alpha = np.linspace(0, 1, 18 * 26, dtype=np.float32).reshape(18, 26, 1)
+    pixels = np.concatenate([arrays["noisy"], alpha, arrays["albedo"], arrays["normals"]], axis=-1)
+    names = [*"RGBA", *(f"albedo.{c}" for c in "RGB"), *(f"sh_normal.{c}" for c in "XYZ")]
+    return renderer.Bitmap(np.float32(pixels), channel_names=names)
 
 
 def call(denoiser, arrays):
@@ -78,6 +95,130 @@ def test_normals_in_world_space(arrays, size):
     assert not np.allclose(call(denoiser, world), turned, rtol=1e-3)
 
 
+def stub():
+    """The signatures of ``mi.OptixDenoiser`` in the stub file of the installed Mitsuba: "" -> its two forms."""
+    place = find_spec("mitsuba")
+    if place is None or place.origin is None:
+        pytest.skip("Mitsuba is not installed")
+    tree = ast.parse(Path(place.origin).with_name("__init__.pyi").read_text())
+    (theirs,) = [node for node in tree.body if isinstance(node, ast.ClassDef) and node.name == "OptixDenoiser"]
+    found: dict[str, list] = {}
+    for node in theirs.body:
+        if isinstance(node, ast.FunctionDef):
+            names, defaults = (
+                [argument.arg for argument in node.args.args],
+                [ast.unparse(d) for d in node.args.defaults],
+            )
+            found.setdefault(node.name, []).append((names, defaults))
+    return found
+
+
+def signature(function):
+    parameters = [p for p in inspect.signature(function).parameters.values() if p.kind == p.POSITIONAL_OR_KEYWORD]
+    return [p.name for p in parameters], [repr(p.default) for p in parameters if p.default is not p.empty]
+
+
+def test_the_signatures_are_those_of_mitsuba():
+    """Names, order and defaults; where its stub leaves a default open, an empty tensor, ours is None."""
+    theirs = stub()
+    constructor, calls = theirs["__init__"][0], theirs["__call__"]
+    assert signature(ngpt.Denoiser.__init__) == constructor
+    tensors, channels = (([*names], [d.replace("...", "None") for d in defaults]) for names, defaults in calls)
+    assert [signature(form) for form in get_overloads(ngpt.Denoiser.__call__)] == [tensors, channels]
+    # What runs is neither of the two: every argument of both must find its place in it, by position and by name.
+    accepted = inspect.signature(ngpt.Denoiser.__call__)
+    for names, _ in calls:
+        accepted.bind(*names)
+        accepted.bind(None, **dict.fromkeys(names[1:]))
+
+
+def test_code_written_for_mitsuba_runs(renderer, arrays):
+    """By position, with the transform that its documentation shows, normals in world space, and empty tensors."""
+    mi = renderer
+    world = mi.ScalarTransform4f().look_at(origin=[3, 2, 5], target=[0, 1, 0], up=[0, 1, 0])
+    turn = np.array(world.matrix)[:3, :3]
+    in_world = (arrays["normals"] @ turn.T).astype(np.float32)
+    noisy, albedo, normals = (mi.TensorXf(array) for array in (arrays["noisy"], arrays["albedo"], in_world))
+    denoiser = ngpt.Denoiser([26, 18], True, True, False, False)
+    for to_sensor in (world.inverse(), mi.Transform4f(world).inverse()):
+        result = denoiser(noisy, albedo, normals, to_sensor, mi.TensorXf(), mi.TensorXf())
+        expected = ngpt.denoise(
+            full_stack(18, 26)["primal"], albedo=arrays["albedo"], normal=full_stack(18, 26)["normal"]
+        )
+        assert np.allclose(result.numpy(), expected, rtol=1e-3, atol=1e-5)
+
+
+def test_bitmaps_of_many_channels(renderer, arrays, bitmap):
+    mi = renderer
+    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
+    result = denoiser(bitmap, albedo_ch="albedo", normals_ch="sh_normal", to_sensor=mi.ScalarTransform4f())
+    assert isinstance(result, mi.Bitmap) and result.pixel_format() == mi.Bitmap.PixelFormat.RGBA
+    expected = denoiser(arrays["noisy"], arrays["albedo"], arrays["normals"])
+    assert np.array_equal(np.array(result)[..., :3], expected)
+    assert np.array_equal(np.array(result)[..., 3], np.array(bitmap)[..., 3])
+    by_position = denoiser(bitmap, "albedo", "sh_normal", None, "", "", "<root>")
+    assert np.array_equal(np.array(by_position), np.array(result))
+    # Another layer as the image, and an array beside a bitmap.
+    albedo = ngpt.Denoiser((26, 18), method="primal")(bitmap, noisy_ch="albedo")
+    assert np.array_equal(np.array(albedo), arrays["albedo"])
+    with pytest.raises(NgptError, match="the bitmap has no layer 'nn'; it has: <root>, albedo, sh_normal"):
+        denoiser(bitmap, "albedo", "nn")
+
+
+def test_normals_of_mitsuba_become_those_of_a_stack(renderer, monkeypatch):
+    """The code of its documentation on a scene, and the normals that our own renderer gives for it."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+    from ngpt.methods import METHODS, Method
+
+    mi = renderer
+    monkeypatch.setitem(METHODS, "normal", Method("", ("primal",), lambda data: data.features["normal"], {}))
+    scene = load_scene("diffuse", (24, 16))
+    aov = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,normals:sh_normal", "image": {"type": "path"}})
+    sensor = scene.sensors()[0]
+    mi.render(scene, integrator=aov, spp=16)
+    to_sensor = sensor.world_transform().inverse()
+    denoiser = ngpt.Denoiser(sensor.film().crop_size(), albedo=True, normals=True, method="normal")
+    seen = denoiser(sensor.film().bitmap(), albedo_ch="albedo", normals_ch="normals", to_sensor=to_sensor)
+    error = np.abs(np.array(seen)[..., :3] - render_stack(scene, 16, 0)["normal"]).mean(axis=(0, 1))
+    assert (error < 0.05).all()
+
+
+def test_plain_bitmaps(renderer, arrays):
+    image = renderer.Bitmap(arrays["noisy"])
+    result = ngpt.Denoiser((26, 18))(image)
+    assert np.array_equal(np.array(result), ngpt.Denoiser((26, 18))(arrays["noisy"]))
+    with pytest.raises(NgptError, match="the bitmap has no layer 'albedo'; it has: <root>"):
+        ngpt.Denoiser((26, 18), albedo=True)(image, "albedo")
+
+
+def test_alpha_is_denoised_where_that_is_asked_for(arrays, rng):
+    coverage = np.float32(np.mgrid[0:18, 0:26][1] > 12)[..., None]
+    alpha = np.float32(coverage + rng.normal(0, 0.1, coverage.shape))
+    noisy = np.concatenate([arrays["noisy"], alpha], axis=-1)
+    result = ngpt.Denoiser((26, 18), denoise_alpha=True)(noisy)
+    assert np.array_equal(result[..., :3], ngpt.Denoiser((26, 18))(arrays["noisy"]))
+    assert np.abs(result[..., 3:] - coverage).mean() < 0.7 * np.abs(alpha - coverage).mean()
+    assert alpha.min() <= result[..., 3].min() and result[..., 3].max() <= alpha.max()
+
+
+def test_earlier_frames_are_refused_in_words(arrays):
+    with pytest.raises(NgptError, match="leave temporal=False, and denoise frame by frame"):
+        ngpt.Denoiser((26, 18), temporal=True)
+    for name in ("flow", "previous_denoised"):
+        with pytest.raises(NgptError, match=f"{name} is given, but temporal denoising is not there yet"):
+            ngpt.Denoiser((26, 18))(arrays["noisy"], **{name: arrays["noisy"]})
+
+
+def test_transforms_may_scale_and_not_flatten(arrays):
+    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
+    arguments = [arrays[name] for name in ("noisy", "albedo", "normals")]
+    assert np.allclose(denoiser(*arguments, 7 * np.eye(3)), denoiser(*arguments), rtol=1e-4)
+    for flat in (np.diag([1, 1, 0]), np.full((3, 3), np.nan)):
+        with pytest.raises(NgptError, match="to_sensor has determinant"):
+            denoiser(*arguments, flat)
+
+
 def test_bad_calls(arrays):
     with pytest.raises(NgptError, match=r"albedo is given, but was not announced: Denoiser\(size, albedo=True\)"):
         call(ngpt.Denoiser((26, 18), normals=True), arrays)
@@ -87,3 +228,9 @@ def test_bad_calls(arrays):
         ngpt.Denoiser((18, 26))(arrays["noisy"])
     with pytest.raises(NgptError, match=r"dx has shape \(17, 26, 3\)"):
         ngpt.Denoiser((26, 18))(arrays["noisy"], dx=arrays["dx"][1:], dy=arrays["dy"])
+    with pytest.raises(NgptError, match=r"no layer is called 'dz'; there are: .*dx"):
+        ngpt.Denoiser((26, 18))(arrays["noisy"], dz=arrays["dx"])
+    with pytest.raises(NgptError, match="method 'l2' has no option 'alhpa'; did you mean 'alpha'"):
+        ngpt.Denoiser((26, 18), method="l2", alhpa=0.1)
+    with pytest.raises(NgptError, match=r"Denoiser: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):
+        ngpt.Denoiser((26, 18), method="l2")(arrays["noisy"])

@@ -110,6 +110,17 @@ def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):
     assert made["image"].shape == stack["primal"].shape
 
 
+def test_the_examples_of_python_run(tmp_path, monkeypatch):
+    """Arrays and files; that of Mitsuba is in tests/test_denoiser.py."""
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
+    made: dict = {}
+    exec(blocks[0], made)
+    assert made["clean"].shape == made["noisy"].shape
+    exec(blocks[2], made)
+    assert made["stack"]["primal"].shape == made["noisy"].shape
+
+
 def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
     import ngpt
     from ngpt.methods import METHODS, Method

@@ -16,7 +16,7 @@ ROOT = Path(__file__).parents[1]
 FLOORS = """
 ngpt.errors ngpt.version
 ngpt.system
-ngpt.layers ngpt.testing
+ngpt.arrays ngpt.layers ngpt.testing
 ngpt.stack
 ngpt.repair ngpt.io
 ngpt.merging

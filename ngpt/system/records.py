@@ -100,7 +100,7 @@ def from_table(kind: type[T], values: Any, where: str) -> T:
         try:
             read[name] = _converted(value, hints[name], f"{where}: [{name}]")
         except _OtherType:
-            wanted = f"{_described(hints[name])}{_example(known[name].default)}"
+            wanted = f"{described(hints[name])}{_example(known[name].default)}"
             raise NgptError(f"{where}: {name} = {_shown(value)}: must be {wanted}") from None
     for name, field in known.items():
         if name not in read and field.default is MISSING and field.default_factory is MISSING:
@@ -142,7 +142,7 @@ def _converted(value: Any, hint: Any, where: str) -> Any:
 _NAMES = {int: "whole number", float: "number", str: "string", dict: "table", list: "list"}
 
 
-def _described(hint: Any, many: bool = False) -> str:
+def described(hint: Any, many: bool = False) -> str:
     """What an annotation asks for, in the words of those who write a TOML file."""
     kind, kinds = get_origin(hint) or hint, get_args(hint)
     if kind is bool:
@@ -150,8 +150,8 @@ def _described(hint: Any, many: bool = False) -> str:
     name = {tuple: "list"}.get(kind) or _NAMES.get(kind, "table")
     text = f"{name}s" if many else f"a {name}"
     if kind is tuple:
-        return f"{text} of {'' if kinds[-1] is ... else f'{len(kinds)} '}{_described(kinds[0], many=True)}"
-    return f"{text} of {_described(kinds[1], many=True)}" if kind is dict and kinds and kinds[1] is not Any else text
+        return f"{text} of {'' if kinds[-1] is ... else f'{len(kinds)} '}{described(kinds[0], many=True)}"
+    return f"{text} of {described(kinds[1], many=True)}" if kind is dict and kinds and kinds[1] is not Any else text
 
 
 def _example(default: Any) -> str:

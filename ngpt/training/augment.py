@@ -34,7 +34,7 @@ class Augmentation:
                     often normal alone is. For networks that can do without them (``ModelConfig.optional``)
     ``quieter``     factors of noise, log-uniform between these, one for each crop: shows its best input once more, with
                     so much less noise (``quieter``). Networks learn from it what to make of more samples than anyone
-                    renders for training. () for none
+                    renders for training. [] for none
     """
 
     geometry: bool = True

@@ -34,6 +34,8 @@ class DataSettings:
 class OptimizerSettings:
     """Adam and its schedule (``ngpt.training.schedule``); defaults are NGPT's.
 
+    ``learning_rate``  the largest of the schedule
+    ``betas``      decays of Adam's two moments
     ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
     ``warmup``, ``flat``  steps until the learning rate is reached, and until which it stays ("paper")
     ``half_life``  steps in which it then halves ("paper")
@@ -57,6 +59,7 @@ class RunSettings:
 
     ``steps``, ``batch``  length of the run, and examples per step over all processes
     ``precision``  of the network's body: "float32" or "bfloat16"
+    ``seed``       of everything random: weights, order, augmentation, transforms of the loss
     ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
     ``log``, ``save``, ``validate``  every so many steps
     ``views``      validation inputs looked at each time, spread over all of them
@@ -75,7 +78,10 @@ class RunSettings:
 
 @dataclass(frozen=True)
 class Settings:
-    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``; ``initial`` names weights to start from."""
+    """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``.
+
+    ``initial``  a file of weights to start from, with the same [model]; "" starts from chance
+    """
 
     model: ModelConfig
     data: DataSettings = field(default_factory=DataSettings)

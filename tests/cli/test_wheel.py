@@ -103,7 +103,7 @@ def test_it_makes_data_trains_evaluates_and_exports(renderer, wheel, tmp_path):
     run(programs / "pip", "install", "-q", "-c", ROOT / "constraints.txt", f"{wheel}[train]")
     ngpt = programs / "ngpt"
     run(ngpt, "dataset", "--config", "data-tiny", "--out", "data")
-    few = ["--set", "data.crop=32", "--set", "run.steps=4", "--set", "run.batch=2"]
+    few = ["--set", "run.steps=4", "--set", "run.batch=2"]
     run(ngpt, "train", "--config", "tiny", "--out", "run", *few)
     run(ngpt, "export", "--weights", "run/weights.safetensors", "-o", "mine.onnx")
     (work / "tiny.toml").write_text(

@@ -19,6 +19,7 @@ from exr_files import noise, same_bits, window, write_raw
 from hosts import HOSTS, VECTOR, agree, caller, cpp_host, node, node_host, node_modules, read_layers, read_pfm
 
 import ngpt
+from ngpt.cli import main
 from ngpt.io.rawlayers import write_layers
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
@@ -407,3 +408,12 @@ def test_the_page_at_640x360(page, python, tmp_path, capsys):
         expected = python(layers)
         times.append(1000 * (time.perf_counter() - start))
     tell(capsys, "page", page_times, times, page.pixels("clean"), expected)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["diffuse", "glossy", "environment", "lens"])
+def test_the_page_on_the_stacks_of_the_demo(page, renderer, scene, tmp_path):
+    stack = tmp_path / "stack.exr"
+    assert main(["render", scene, "--spp", "16", "--size", "240x160", "-o", str(stack), "--quiet"]) == 0
+    page.give(stack)
+    agree(page.pixels("clean"), reconstruct(ngpt.read(stack), "ngpt-fast").image.transpose(2, 0, 1)[None])

@@ -140,7 +140,7 @@ def test_the_denoiser_takes_any_arrays(layers, method, announced):
     noisy, normals = layers.pop("primal"), layers.pop("normal", None)
     height, width = noisy.shape[:2]
     try:
-        denoiser = ngpt.Denoiser((width, height), announced, announced, method)
+        denoiser = ngpt.Denoiser((width, height), announced, announced, method=method)
         with warnings.catch_warnings():
             warnings.simplefilter("error")
             result = denoiser(noisy, normals=normals, to_sensor=np.eye(4), **layers)
@@ -148,6 +148,24 @@ def test_the_denoiser_takes_any_arrays(layers, method, announced):
         named(error)
     else:
         assert result.shape == noisy.shape and np.isfinite(result).all()
+
+
+@QUICK
+@given(layers=stacks(), method=st.sampled_from(["auto", "l2", "wcv"]))
+def test_denoise_takes_any_arrays(layers, method):
+    image = layers.pop("primal")
+    if "alpha" in layers and layers["alpha"].dtype == image.dtype:
+        image = np.concatenate([image, layers["alpha"]], axis=-1)
+    layers.pop("alpha", None)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")
+            result = ngpt.denoise(image, method, **layers)
+    except NgptError as error:
+        named(error)
+    else:
+        assert result.shape == image.shape and np.isfinite(result[..., :3]).all()
+        assert result.dtype == image.dtype and np.array_equal(result[..., 3:], image[..., 3:], equal_nan=True)
 
 
 @pytest.mark.slow
@@ -186,8 +204,8 @@ def test_a_converged_image_of_any_range_keeps_its_range(method):
 @pytest.mark.parametrize(
     ("call", "message"),
     [
-        (lambda a: ngpt.Denoiser("large"), "size is 'large'; it must be"),
-        (lambda a: ngpt.Denoiser((1, 2, 3)), r"size is \(1, 2, 3\)"),
+        (lambda a: ngpt.Denoiser("large"), "input_size is 'large'; it must be"),
+        (lambda a: ngpt.Denoiser((1, 2, 3)), r"input_size is \(1, 2, 3\)"),
         (lambda a: ngpt.Denoiser((4, 3))(a.astype(complex)), "layer 'primal' is of type complex128"),
         (lambda a: ngpt.Denoiser((4, 3))(a.astype(object)), "layer 'primal' is of type object"),
         (lambda a: ngpt.Denoiser((4, 3))(a * 1e39), "12 values|36 values that float32 cannot hold"),

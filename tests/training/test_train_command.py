@@ -1,17 +1,23 @@
 """train.py and the configurations that come with it."""
 
+import re
 import runpy
+import tomllib
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from full_stack import full_stack
 
 import ngpt
 from ngpt.network.model import Reconstructor, parameters
-from ngpt.training.cost import cost
-from ngpt.training.settings import read_settings
+from ngpt.training.loss import make_loss
+from ngpt.training.parameters import TABLES, configuration_row, entries, parameter_tables, purpose
+from ngpt.training.settings import from_dict, read_settings
 
 CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
+TRAINING = Path("docs/training.md")
 
 
 @pytest.fixture
@@ -28,10 +34,40 @@ def train(capsys):
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda path: path.stem)
 def test_configurations_are_whole(path):
-    settings = read_settings(path)
-    assert "parameters" in cost(settings)
-    # Each opens with what it is.
-    assert path.read_text().startswith("# ")
+    """And the page of training has their row: what they are for, in their own words, and what they cost."""
+    assert path.read_text().startswith("# ") and purpose(path.read_text())
+    assert configuration_row(path.stem) in TRAINING.read_text()
+
+
+def test_the_page_of_training_holds_all_configurations_and_no_other():
+    rows = re.findall(r"^\| `([\w-]+)` \|.*\| *[\d,]+ \| *\d+ \|$", TRAINING.read_text(), re.M)
+    assert sorted(rows) == sorted(path.stem for path in CONFIGS)
+
+
+def test_the_page_of_training_holds_the_parameters_of_the_code():
+    """Name, kind, default and meaning of each, as ``python -m ngpt.training.parameters`` prints them."""
+    assert parameter_tables() in TRAINING.read_text(), "run python -m ngpt.training.parameters"
+
+
+@pytest.mark.parametrize("table", TABLES)
+def test_every_parameter_has_a_meaning_and_every_meaning_a_parameter(table):
+    told = [name for names, meaning in entries(TABLES[table]) for name in names if meaning]
+    own = {field.name for field in fields(TABLES[table])} - (set(TABLES) if table == "" else set())
+    assert sorted(told) == sorted(own)
+
+
+def test_defaults_of_the_page_are_what_an_empty_configuration_gives():
+    """Read as TOML, they are the settings of a run that sets nothing else."""
+    model = "model = {network = 'dense', channels = [4], units = [1], inputs = ['primal']}"
+    values = tomllib.loads(model)
+    for keys, defaults in re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|[^|]*\| (`.*?`) \|", parameter_tables(), re.M):
+        for key, default in zip(re.findall(r"`(.+?)`", keys), re.findall(r"`(.+?)`", defaults), strict=True):
+            *table, name = key.split(".")
+            holder = values.setdefault(table[0], {}) if table else values
+            holder[name] = tomllib.loads(f"value = {default}")["value"]
+    told, plain = from_dict(values, "the page"), from_dict(tomllib.loads(model), "empty")
+    assert make_loss(told.loss).settings == make_loss(plain.loss).settings
+    assert replace(told, loss={}) == replace(plain, loss={})
 
 
 def test_sizes():
@@ -127,3 +163,19 @@ def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_
     status, output, errors = train("--config", "configs/tiny.toml", "--out", str(tmp_path / "run"), *arguments)
     assert status == 0, errors
     assert "finished at step 3" in output
+
+
+def test_the_smallest_set_trains_the_smallest_network_as_the_page_says(renderer, tmp_path, monkeypatch, capsys):
+    """The first commands of docs/training.md, in a folder of their own."""
+    from ngpt.cli import main
+
+    commands = re.findall(r"^ {4}ngpt (.*?)(?: {2,}#.*)?$", TRAINING.read_text(), re.M)[:3]
+    assert [command.split()[0] for command in commands] == ["dataset", "train", "denoise"]
+    assert "--config data-tiny" in commands[0] and commands[1] == "train --config tiny --out run --set run.steps=2"
+    monkeypatch.chdir(tmp_path)
+    for command in commands[:2]:
+        assert main(command.split()) == 0, capsys.readouterr().err
+    output = capsys.readouterr().out
+    assert "finished at step 2" in output and "relMSE" in output
+    ngpt.write("stack.exr", full_stack(18, 26))
+    assert main(commands[2].split()) == 0, capsys.readouterr().err

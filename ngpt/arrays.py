@@ -1,0 +1,109 @@
+"""Images of NumPy, PyTorch, Dr.Jit and others, and Mitsuba's bitmaps: as NumPy arrays, and results as what came in.
+
+No library is imported here: arrays are known by what they can do.
+"""
+
+from collections.abc import Collection
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+
+
+def is_bitmap(value: Any) -> bool:
+    """Whether it is an ``mi.Bitmap``."""
+    return hasattr(value, "pixel_format") and hasattr(value, "component_format")
+
+
+def to_numpy(value: Any, name: str = "the array") -> np.ndarray:
+    """Arrays of any library, from any device, as NumPy's; shared where that is possible.
+
+    Raises NgptError, which begins with ``name``, for what NumPy cannot read, and for bitmaps that are not linear.
+    """
+    if isinstance(value, np.ndarray):
+        return value
+    if is_bitmap(value) and value.srgb_gamma():
+        raise NgptError(f"{name} is a bitmap with the curve of displays; pass bitmap.convert(srgb_gamma=False)")
+    try:
+        if hasattr(value, "detach"):  # PyTorch
+            value = value.detach().cpu()
+            return (value.float() if str(value.dtype) == "torch.bfloat16" else value).numpy()
+        if hasattr(value, "numpy"):  # Dr.Jit
+            return value.numpy()
+        array = np.asarray(value)
+        if array.dtype == object and hasattr(value, "__dlpack__"):
+            array = np.from_dlpack(value)
+    except (TypeError, ValueError, BufferError, RuntimeError) as error:
+        told = " ".join(str(error).split())
+        raise NgptError(f"{name} is a {type(value).__name__} that NumPy cannot read: {told}; pass an array") from error
+    return array.astype(np.float32) if array.dtype.name == "bfloat16" else array
+
+
+def like(image: np.ndarray, example: Any) -> Any:
+    """The image (H, W, C) as whatever ``example`` is: its library, device and type of numbers.
+
+    A bitmap of many channels gives one of as many as the image has: RGB or RGBA. What is of no library gives NumPy's.
+    """
+    if isinstance(example, np.ndarray):
+        return _of_type(image, example.dtype) if example.dtype.kind == "f" else image
+    if is_bitmap(example):
+        kinds = type(example.pixel_format())
+        kind = kinds.RGB if image.shape[2] == 3 else kinds.RGBA
+        pixels = _of_type(image, np.asarray(example).dtype)
+        return type(example)(np.ascontiguousarray(pixels), pixel_format=kind)
+    if hasattr(example, "new_tensor"):  # PyTorch
+        half = str(example.dtype) == "torch.float16"
+        return example.new_tensor(_of_type(image, np.dtype(np.float16)) if half else image)
+    if hasattr(example, "__array_namespace__"):
+        return example.__array_namespace__().asarray(image, dtype=example.dtype)
+    if type(example).__module__.startswith("drjit"):
+        return type(example)(np.ascontiguousarray(image, np.float32))
+    return image
+
+
+def _of_type(image: np.ndarray, dtype: np.dtype) -> np.ndarray:
+    """Half floats end at 65504: what a method adds beyond that stays finite."""
+    limits = np.finfo(dtype)
+    return (np.clip(image, limits.min, limits.max) if dtype.itemsize == 2 else image).astype(dtype)
+
+
+def layer(
+    where: str, name: str, value: Any, channels: Collection[int], size: tuple[int, int] | None = None
+) -> np.ndarray:
+    """``value`` as a NumPy array (height, width, C), C one of ``channels``, of any floating point type.
+
+    ``size``  (height, width) that it must have; None for any
+
+    Raises NgptError for other shapes, images without pixels and integers; the message begins with ``where``.
+    """
+    array = to_numpy(value, f"{where}: {name}")
+    array = array[..., None] if array.ndim == 2 and 1 in channels else array
+    fits = array.ndim == 3 and array.shape[2] in channels and (size is None or array.shape[:2] == size)
+    if not fits:
+        rows, columns = size or ("height", "width")
+        wanted = " or ".join(f"({rows}, {columns}, {n})" for n in channels)
+        remedy = _remedy(name, value, array.shape, channels)
+        raise NgptError(f"{where}: {name} has shape {tuple(array.shape)}; it must be {wanted}{remedy}")
+    if array.size == 0:
+        raise NgptError(f"{where}: {name} is {array.shape[1]}x{array.shape[0]}; it has no pixels to work on")
+    if array.dtype.kind in "iu":
+        raise NgptError(
+            f"{where}: {name} is of type {array.dtype}: integers hold what displays show; pass scene-linear floats"
+        )
+    return array
+
+
+def _remedy(name: str, value: Any, shape: tuple[int, ...], channels: Collection[int]) -> str:
+    """What to pass instead, where that is clear: "" or the end of a sentence."""
+    if len(shape) == 3 and shape[0] in channels and shape[2] not in channels:
+        turn = "permute" if hasattr(value, "permute") else "transpose"
+        return f"; channels come first there: pass {name}.{turn}(1, 2, 0)"
+    if len(shape) == 4:
+        return f"; pass the images of a batch one by one: {name}[0]"
+    if len(shape) == 3 and shape[2] > max(channels):
+        return f"; pass {name}[..., :{max(channels)}]"
+    if 3 in channels and (len(shape) == 2 or shape[2:] == (1,)):
+        grey = name if len(shape) == 3 else f"{name}[..., None]"
+        return f"; an image of one channel is {grey}.repeat(3, axis=-1)"
+    return ""

@@ -1,0 +1,253 @@
+"""ngpt.denoise on arrays of any library: the same kind comes back; what does not fit is said with its remedy."""
+
+import numpy as np
+import pytest
+from full_stack import full_layers, full_stack
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS
+
+
+@pytest.fixture
+def layers():
+    return full_layers(18, 26)
+
+
+@pytest.fixture
+def features(layers):
+    return {name: layers[name] for name in ("albedo", "normal")}
+
+
+def with_alpha(image):
+    alpha = np.linspace(0, 1, image.shape[0] * image.shape[1], dtype=image.dtype)
+    return np.concatenate([image, alpha.reshape(*image.shape[:2], 1)], axis=-1)
+
+
+def test_a_stack_is_what_it_was(layers):
+    stack = full_stack(18, 26)
+    expected = ngpt.reconstruct(stack).image
+    assert np.array_equal(ngpt.denoise(stack), expected)
+    # The same layers as arrays; and those beside a stack that holds the others.
+    assert np.array_equal(ngpt.denoise(layers.pop("primal"), **layers), expected)
+    part = ngpt.GradientStack({"primal": stack["primal"]})
+    assert np.array_equal(ngpt.denoise(part, **layers), expected)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32", "float64", ">f4"])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_numpy(layers, features, dtype, channels):
+    image = with_alpha(layers["primal"]).astype(dtype)[..., :channels]
+    before = image.copy()
+    result = ngpt.denoise(image, **features)
+    assert isinstance(result, np.ndarray) and result.dtype == image.dtype and result.shape == image.shape
+    assert np.array_equal(result[..., 3:], image[..., 3:]) and np.array_equal(image, before)
+    expected = ngpt.denoise(ngpt.GradientStack({"primal": image[..., :3], **features}))
+    assert np.array_equal(result[..., :3], expected.astype(dtype))
+    assert not np.array_equal(result, image)
+
+
+@pytest.mark.parametrize("dtype", ["float16", "bfloat16", "float32", "float64"])
+def test_torch(layers, features, dtype):
+    torch = pytest.importorskip("torch")
+    image = torch.tensor(with_alpha(layers["primal"]), requires_grad=True).to(getattr(torch, dtype))
+    result = ngpt.denoise(image, **{name: torch.tensor(feature) for name, feature in features.items()})
+    assert isinstance(result, torch.Tensor) and result.dtype == image.dtype and result.shape == image.shape
+    assert result.device == image.device and torch.equal(result[..., 3], image[..., 3])
+    expected = ngpt.denoise(image.detach().float().numpy(), **features)
+    assert torch.equal(result, torch.tensor(expected).to(image.dtype))
+
+
+def test_halves_stay_finite(layers, monkeypatch):
+    """Where a method goes beyond what they hold."""
+    from ngpt.methods import Method
+
+    monkeypatch.setitem(METHODS, "more", Method("", ("primal",), lambda data: 4 * data.image, {}))
+    image = np.full((2, 3, 3), 60000, np.float16)
+    assert (ngpt.denoise(image, "more") == 65504).all()
+    torch = pytest.importorskip("torch")
+    assert (ngpt.denoise(torch.tensor(image), "more") == 65504).all()
+
+
+def test_torch_on_a_graphics_card(layers, features):
+    torch = pytest.importorskip("torch")
+    if not torch.cuda.is_available():
+        pytest.skip("no GPU for PyTorch")
+    image = torch.tensor(layers["primal"], device="cuda")
+    result = ngpt.denoise(image, **features)
+    assert result.device == image.device
+    assert np.array_equal(result.cpu().numpy(), ngpt.denoise(layers["primal"], **features))
+
+
+def test_dr_jit(renderer, layers, features):
+    import drjit as dr
+
+    mi = renderer
+    image = with_alpha(layers["primal"])
+    expected = ngpt.denoise(image, **features)
+    for tensor in (mi.TensorXf, dr.llvm.TensorXf, dr.llvm.ad.TensorXf16, dr.llvm.TensorXf64):
+        result = ngpt.denoise(tensor(image), **{name: mi.TensorXf(feature) for name, feature in features.items()})
+        assert type(result) is tensor and result.shape == image.shape
+        assert np.allclose(result.numpy(), expected, rtol=0.02, atol=0.01)
+    tensor = mi.TensorXf(layers["primal"])
+    assert np.array_equal(ngpt.denoise(tensor, "l2", dx=layers["dx"], dy=layers["dy"], alpha=0.1).numpy(), l2(layers))
+
+
+def l2(layers):
+    stack = ngpt.GradientStack({name: layers[name] for name in ("primal", "dx", "dy")})
+    return ngpt.reconstruct(stack, "l2", alpha=0.1).image
+
+
+@pytest.mark.parametrize("dtype", ["float16", "float32"])
+@pytest.mark.parametrize("channels", [3, 4])
+def test_bitmaps(renderer, layers, features, dtype, channels):
+    mi = renderer
+    pixels = with_alpha(layers["primal"]).astype(dtype)[..., :channels]
+    image = mi.Bitmap(np.ascontiguousarray(pixels))
+    result = ngpt.denoise(image, **{name: mi.Bitmap(feature) for name, feature in features.items()})
+    assert isinstance(result, mi.Bitmap)
+    assert result.pixel_format() == image.pixel_format() and result.component_format() == image.component_format()
+    assert np.array_equal(np.array(result), ngpt.denoise(pixels, **features))
+    shown = image.convert(component_format=mi.Struct.Type.UInt8, srgb_gamma=True)
+    with pytest.raises(NgptError, match=r"denoise: image is a bitmap with the curve of displays; .*srgb_gamma=False"):
+        ngpt.denoise(shown)
+
+
+def test_bitmaps_of_many_channels_are_read_as_files_are(renderer, layers, features, tmp_path):
+    """By names that Mitsuba's film writes, and those of other renderers."""
+    mi = renderer
+    pixels = np.concatenate([with_alpha(layers["primal"]), layers["albedo"], layers["normal"]], axis=-1)
+    names = [*"RGBA", *(f"albedo.{c}" for c in "RGB"), *(f"sh_normal.{c}" for c in "XYZ")]
+    bitmap = mi.Bitmap(np.float32(pixels), channel_names=names)
+    result = ngpt.denoise(bitmap)
+    assert result.pixel_format() == mi.Bitmap.PixelFormat.RGBA
+    assert np.array_equal(np.array(result), ngpt.denoise(with_alpha(layers["primal"]), **features))
+    bitmap.write(str(tmp_path / "mitsuba.exr"))
+    from_file = ngpt.denoise(ngpt.read(tmp_path / "mitsuba.exr"))
+    assert np.allclose(np.array(result)[..., :3], from_file, rtol=1e-3)
+    # What is passed beside it counts.
+    other = ngpt.denoise(bitmap, albedo=np.ones_like(layers["albedo"]))
+    assert not np.array_equal(np.array(other), np.array(result))
+
+
+class OfALibrary:
+    """An array as JAX's are: read through DLPack or ``__array__``, and made by the functions of its namespace."""
+
+    def __init__(self, array):
+        self.array = np.array(array)
+        self.shape, self.dtype = self.array.shape, self.array.dtype
+
+    def __array__(self, dtype=None, copy=None):
+        return np.asarray(self.array, dtype)
+
+    def __array_namespace__(self):
+        class Namespace:
+            @staticmethod
+            def asarray(array, dtype):
+                return OfALibrary(array.astype(dtype))
+
+        return Namespace
+
+
+class OnlyDLPack:
+    def __init__(self, array):
+        self.array = np.array(array)
+
+    def __dlpack__(self, **options):
+        return self.array.__dlpack__(**options)
+
+    def __dlpack_device__(self):
+        return self.array.__dlpack_device__()
+
+
+def test_arrays_of_other_libraries(layers, features):
+    expected = ngpt.denoise(layers["primal"], **features)
+    result = ngpt.denoise(OfALibrary(layers["primal"]), **{name: OfALibrary(a) for name, a in features.items()})
+    assert isinstance(result, OfALibrary) and np.array_equal(result.array, expected)
+    # Of no library that can make arrays: NumPy's come back.
+    for image in (OnlyDLPack(layers["primal"]), layers["primal"].tolist()):
+        assert np.allclose(ngpt.denoise(image, **features), expected, rtol=1e-5)
+
+
+def test_shapes_are_refused_with_a_remedy(layers):
+    image = layers["primal"]
+    for bad, said in (
+        (image.transpose(2, 0, 1), "shape (3, 18, 26); it must be (height, width, 3) or (height, width, 4); channels "
+         "come first there: pass image.transpose(1, 2, 0)"),
+        (image[None], "one by one: image[0]"),
+        (image[..., 0], "an image of one channel is image[..., None].repeat(3, axis=-1)"),
+        (image[..., :1], "an image of one channel is image.repeat(3, axis=-1)"),
+        (image[..., [0, 1, 2, 0, 1]], "pass image[..., :4]"),
+        (image[:0], "image is 26x0; it has no pixels"),
+        (image[..., :2], "(18, 26, 2); it must be"),
+        (None, "image has shape ()"),
+    ):  # fmt: skip
+        with pytest.raises(NgptError) as error:
+            ngpt.denoise(bad)
+        assert said in str(error.value) and "\n" not in str(error.value)
+    # Each remedy is one.
+    assert ngpt.denoise(image.transpose(2, 0, 1).transpose(1, 2, 0)).shape == image.shape
+    assert ngpt.denoise(image[..., 0][..., None].repeat(3, axis=-1)).shape == image.shape
+    with pytest.raises(NgptError, match=r"albedo has shape \(17, 26, 3\); it must be \(18, 26, 3\)"):
+        ngpt.denoise(image, albedo=image[1:])
+    with pytest.raises(NgptError, match=r"albedo has shape \(18, 26, 4\); .*pass albedo\[..., :3\]"):
+        ngpt.denoise(image, albedo=with_alpha(image))
+    torch = pytest.importorskip("torch")
+    with pytest.raises(NgptError, match=r"pass image.permute\(1, 2, 0\)"):
+        ngpt.denoise(torch.zeros(3, 18, 26))
+
+
+def test_kinds_of_numbers_are_refused_with_a_remedy(layers):
+    image = layers["primal"]
+    for dtype in ("uint8", "uint16", "int32"):
+        with pytest.raises(NgptError, match=f"image is of type {dtype}: integers hold what displays show; pass"):
+            ngpt.denoise((image * 50).astype(dtype))
+    with pytest.raises(NgptError, match="of type complex64"):
+        ngpt.denoise(image.astype("complex64"))
+    with pytest.raises(NgptError, match=r"image is the name of a file; pass ngpt.read\('stack.exr'\)"):
+        ngpt.denoise("stack.exr")
+    torch = pytest.importorskip("torch")
+    with pytest.raises(NgptError, match="image is of type uint8"):
+        ngpt.denoise(torch.zeros(18, 26, 3, dtype=torch.uint8))
+    with pytest.raises(NgptError, match=r"image is a Tensor that NumPy cannot read: .*; pass an array"):
+        ngpt.denoise(torch.zeros(18, 26, 3, device="meta"))
+    with pytest.raises(NgptError, match="values that float32 cannot hold"):
+        ngpt.denoise(torch.full((18, 26, 3), 1e39, dtype=torch.float64))
+
+
+def test_names_are_refused_with_the_one_that_was_meant(layers):
+    image = layers["primal"]
+    for wrong, meant in (("normals", "normal"), ("albdo", "albedo"), ("wieghts", "weights")):
+        with pytest.raises(NgptError, match=f"has no option '{wrong}'; did you mean '{meant}'"):
+            ngpt.denoise(image, **{wrong: image})
+    with pytest.raises(NgptError, match="method 'l2' has no option 'weights'; options: alpha; layers: "):
+        ngpt.denoise(image, "l2", weights="mine.onnx")
+    with pytest.raises(NgptError, match="unknown method 'l3'; choose one of: auto, primal"):
+        ngpt.denoise(image, "l3")
+    with pytest.raises(NgptError, match=r"denoise: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):
+        ngpt.denoise(image, "l2")
+
+
+def test_help_names_methods_and_options():
+    """Of the registry, so that nothing has to be kept in step."""
+    import pydoc
+
+    for thing in (ngpt, ngpt.denoise, ngpt.Denoiser):
+        text = pydoc.plain(pydoc.render_doc(thing))
+        for name, method in METHODS.items():
+            assert f"{name} " in text and method.summary in text
+            assert all(f"{option}={default!r}" in text for option, default in method.options.items())
+    assert set(ngpt.__all__) <= set(dir(ngpt))
+
+
+def test_what_the_package_brings_in_at_once_is_next_to_nothing():
+    """The rest comes with the first name that is asked for."""
+    import subprocess
+    import sys
+
+    code = "import sys; import ngpt; print(*sorted(m for m in sys.modules if m.startswith(('ngpt', 'numpy'))))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.split() == ["ngpt", "ngpt.version"]
+    code = "import sys, ngpt; help(ngpt); print(*{'torch', 'mitsuba', 'drjit', 'onnx', 'skimage'} & set(sys.modules))"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert "ngpt-fast" in out and out.splitlines()[-1] == ""
