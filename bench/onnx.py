@@ -93,6 +93,7 @@ def bench_size(stack: GradientStack, half: Path | None, repeats: int) -> dict:
     layers |= dict(zip(("primal_var", "dx_var", "dy_var"), data.variances, strict=True))
     base = METHODS["wcv"].run(data)
     feed = {name: planes(layer)[None] for name, layer in layers.items()}
+    feed["direct"] = np.zeros_like(feed["primal"])
     calls = {
         "ngpt-fast": lambda: reconstruct(stack, "ngpt-fast"),
         "repair": lambda: repair(stack),

@@ -4,8 +4,8 @@ A new method is one more entry in ``METHODS``; the command line, the reports and
 """
 
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Container
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import nfor, nlm, oidn
 from ngpt.errors import NgptError
 from ngpt.network.identity import Identity, identify
+from ngpt.network.inputs import ESTIMATED
 from ngpt.network.run import OPTIONS, Shipped
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
@@ -29,6 +30,8 @@ class Method:
     ``options``  the options it takes, with their defaults
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
     ``uses``     layers that it takes where the stack has them
+    ``estimates``  layers that it estimates from the others where the stack lacks them
+    ``variant``  the method that it is with other options, "" for a method of its own
     """
 
     summary: str
@@ -37,6 +40,8 @@ class Method:
     options: dict[str, Any]
     missing: Callable[[], str] = lambda: ""
     uses: tuple[str, ...] = ()
+    estimates: tuple[str, ...] = ()
+    variant: str = ""
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class Result:
     ``untrusted``  differences that were left out because they, or a pixel of theirs, were not finite
     ``weights``    the file of the network that ran, None for methods without one
     ``options``    those that are not the method's defaults, weights left out
+    ``estimated``  layers that the stack lacks and the method estimated
     """
 
     image: np.ndarray
@@ -59,6 +65,7 @@ class Result:
     untrusted: int
     weights: Identity | None = None
     options: dict[str, Any] = field(default_factory=dict)
+    estimated: tuple[str, ...] = ()
 
     @property
     def attributes(self) -> dict[str, Any]:
@@ -68,6 +75,8 @@ class Result:
             made["ngpt:weights"] = str(self.weights)
         if self.options:
             made["ngpt:options"] = ", ".join(f"{name}={value}" for name, value in self.options.items())
+        if self.estimated:
+            made["ngpt:estimated"] = ", ".join(self.estimated)
         return made
 
 
@@ -91,14 +100,19 @@ def _network(
     needs: tuple[str, ...],
     also_missing: Callable[[], str] = lambda: "",
     uses: tuple[str, ...] = (),
+    estimates: tuple[str, ...] = (),
 ) -> Method:
     network = Shipped(name, also_missing)
-    return Method(summary, needs, network.run, OPTIONS, network.missing, uses)
+    return Method(summary, needs, network.run, OPTIONS, network.missing, uses, estimates)
+
+
+def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method:
+    """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
+    return replace(entry, summary=summary, options=entry.options | options, variant=method)
 
 
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
-_VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 METHODS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
@@ -107,12 +121,15 @@ METHODS = {
     "cv": _classical("cv", "uniform control variates: close to l2, unbiased"),
     "wcv": _classical("wcv", "control variates weighted by variance: the best of these"),
     "wl2": _classical("wl2", "least squares weighted by variance"),
-    "ngpt-fast": _network("ngpt-fast", "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES, *_VARIANCES)),
+    "ngpt-fast": _network(
+        "ngpt-fast", "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES), estimates=ESTIMATED
+    ),
     "ngpt-combine": _network(
         "ngpt-combine",
         "OIDN's images and the gradients, weighed and corrected by a small network",
-        (*_GRADIENTS, *_FEATURES, *_VARIANCES),
+        (*_GRADIENTS, *_FEATURES),
         oidn.missing,
+        estimates=ESTIMATED,
     ),
     "ngpt-primal": _network(
         "ngpt-primal",
@@ -145,21 +162,37 @@ METHODS = {
         ("albedo", "normal"),
     ),
 }
+METHODS |= {
+    "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", METHODS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+    "oidn-fast": _variant(
+        "oidn",
+        METHODS["oidn"],
+        "OIDN's quickest network, with the features as they are",
+        auxiliary="clean",
+        quality="fast",
+    ),
+}
 
 
-def choose(stack: GradientStack) -> str:
-    """The method that ``auto`` stands for: the best of those that the stack's layers and this machine's packages allow.
+# The best first, by the errors that docs/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
+# OIDN's mean error it leaves 0.79 to 0.94 times in rooms, but up to 1.16 times elsewhere, and single scenes more.
+ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor", "ngpt-colour")
 
-    Geometric means of the trimmed relMSE over thirteen scenes at 4, 16, 64 and 256 spp, in thousandths, of
-    docs/RESULTS.md: ngpt-combine, which needs OIDN, 12.5, 6.0, 2.9, 1.7; ngpt-fast 19.1, 8.1, 3.7, 2.0; wcv 42.8,
-    14.9, 5.4, 2.4; l1 61.5, 18.8, 6.1, 2.5. Beyond, the networks go over to wcv. ngpt-primal, for stacks without
-    gradients, has 12.0, 6.2, 3.6, 2.2 at the same time. OIDN, which denoises any image, has 12.9, 6.3, 3.5, 2.1; nfor,
-    which needs features and a variance and no package, 29.8, 11.7, 4.8, 2.2. ngpt-colour, which needs neither, leaves
-    more (docs/ngpt-colour.md). The identity is left for a machine without ONNX Runtime.
+
+def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) -> str:
+    """The method that ``auto`` stands for: the best of those that the layers and this machine's packages allow.
+
+    ``layers``  a stack, or names of its layers
+    ``usable``  whether a method can be used, by its name; None asks this machine
+
+    The errors behind ``ORDER`` are in docs/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is better
+    than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are better
+    on diffuse scenes. The identity is left for a machine without ONNX Runtime.
     """
-    for name in ("ngpt-combine", "ngpt-fast", "wcv", "l1", "ngpt-primal", "oidn", "nfor", "ngpt-colour"):
-        entry = METHODS[name]
-        if all(layer in stack for layer in entry.needs) and not entry.missing():
+    usable = usable or (lambda name: not METHODS[name].missing())
+    for name in ORDER:
+        if all(layer in layers for layer in METHODS[name].needs) and usable(name):
             return name
     return "primal"
 
@@ -184,9 +217,11 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         # Where and in how much memory concerns only some of those it may stand for.
         idle = {"device", "memory"} - entry.options.keys()
         options = {option: value for option, value in options.items() if option not in idle}
-    for option in options:
+    for option, value in options.items():
         if option not in entry.options:
             raise NgptError(f"method '{name}' has no option '{option}'; it has: {', '.join(entry.options) or 'none'}")
+        if isinstance(entry.options[option], int) and not isinstance(value, int):
+            raise NgptError(f"method '{name}': {option} is {value!r}; it must be a whole number")
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.
@@ -212,6 +247,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         data.gradients,
         weights,
         {key: value for key, value in options.items() if key != "weights" and value != entry.options[key]},
+        () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
 
 

@@ -9,9 +9,10 @@ from numpy.typing import ArrayLike
 
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
+from ngpt.report.notebook import stack_html
 
 
-@dataclass(eq=False)
+@dataclass(eq=False, repr=False)
 class GradientStack:
     """The layers of one rendering, scene-linear, row 0 on top.
 
@@ -64,6 +65,18 @@ class GradientStack:
 
     def __contains__(self, name: object) -> bool:
         return name in self.layers
+
+    def __repr__(self) -> str:
+        return f"<{self._title}: {', '.join(self.names)}>"
+
+    def _repr_html_(self) -> str:
+        """What a notebook shows: a small picture of the primal and a table of all layers."""
+        return stack_html(self._title, {name: self.layers[name] for name in self.names})
+
+    @property
+    def _title(self) -> str:
+        samples = f", {self.attributes['ngpt:spp']} spp" if "ngpt:spp" in self.attributes else ""
+        return f"GradientStack {self.path}, {self.width}x{self.height}{samples}"
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Returns layer ``name``; raises NgptError if the stack does not hold it."""

@@ -73,10 +73,19 @@ class Session:
 
     def view(self):
         self.settle()
-        return dict(parse_qsl(self.ask("location.hash.slice(1)")))
+        return dict(parse_qsl(self.ask("location.hash.slice(1)"), keep_blank_values=True))
 
     def mouse(self, kind, x, y):
         self.call("Input.dispatchMouseEvent", type=kind, x=x, y=y, button="left", buttons=1, clickCount=1)
+
+    def hover(self, x, y):
+        self.call("Input.dispatchMouseEvent", type="mouseMoved", x=x, y=y)
+
+    def resize(self, width, height):
+        """The size of the window, in pixels; returns when the page has taken it up."""
+        self.call("Emulation.setDeviceMetricsOverride", width=width, height=height, deviceScaleFactor=1, mobile=False)
+        self.ask("new Promise(done => requestAnimationFrame(() => requestAnimationFrame(done)))")
+        self.settle()
 
     def key(self, key):
         for kind in ("keyDown", "keyUp"):

@@ -69,6 +69,16 @@ def agree(image, expected):
     assert (np.abs(image - expected) <= 1e-4 * (np.abs(expected) + 1e-2 * np.median(np.abs(expected)))).all()
 
 
+def agree_but_for_rounding_in_oidn(image, expected):
+    """Of networks that read OIDN's image of the base: 1e-4 on average, 2e-2 at worst, relative as in ``agree``.
+
+    On CPUs with bfloat16 OIDN rounds to it: of bases that differ in their last bit it makes images that differ by
+    2^-8 in some values. No host has the base of NumPy to the last bit.
+    """
+    error = np.abs(image - expected) / (np.abs(expected) + 1e-2 * np.median(np.abs(expected)))
+    assert error.mean() <= 1e-4 and error.max() <= 2e-2, (error.mean(), error.max())
+
+
 def compiled(source: str, program: Path, *flags: str) -> list[str]:
     """The command of a C++ host, compiled with libngpt against ONNX Runtime of the system or of ORT_ROOT."""
     compiler = shutil.which("g++") or shutil.which("clang++")

@@ -29,9 +29,10 @@ FEATURES = ("albedo", "normal", "depth")
         ((), "oidn", "ngpt-colour"),
         (("albedo",), "oidn", "ngpt-colour"),
         (("albedo", "normal"), "oidn", "ngpt-colour"),
-        ((*FEATURES, "primal_var"), "ngpt-primal", "nfor"),
-        (("dx", "dy"), "l1", "l1"),
-        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "wcv", "wcv"),
+        ((*FEATURES, "primal_var"), "oidn", "nfor"),
+        (("dx", "dy"), "oidn", "l1"),
+        (("dx", "dy", "primal_var", "dx_var", "dy_var"), "oidn", "wcv"),
+        ((*FEATURES, "dx", "dy"), "ngpt-combine", "ngpt-fast"),
         ((*FEATURES, "dx", "dy", "primal_var", "dx_var", "dy_var"), "ngpt-combine", "ngpt-fast"),
     ],
 )

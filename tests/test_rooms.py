@@ -16,7 +16,8 @@ ROOT = Path(__file__).parents[1]
 FLOORS = """
 ngpt.errors ngpt.version
 ngpt.system
-ngpt.arrays ngpt.layers ngpt.testing
+ngpt.report.display ngpt.report.png
+ngpt.arrays ngpt.layers ngpt.testing ngpt.report.notebook
 ngpt.stack
 ngpt.repair ngpt.io
 ngpt.merging

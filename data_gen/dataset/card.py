@@ -57,7 +57,7 @@ def card(data: Dataset, told: dict) -> str:
         f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each; "
         f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
         "",
-        f"References: gpt at {config['reference_spp']} samples per pixel, reconstructed by "
+        f"References: {config.get('sampler', 'gpt')} at {config['reference_spp']} samples per pixel, reconstructed by "
         f"{config['reference_method']}. Seed {config['seed']}.",
         "",
         "![Pairs of the noisiest input and the reference](contact.png)",

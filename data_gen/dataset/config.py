@@ -6,6 +6,7 @@ from dataclasses import asdict, dataclass, field
 from glob import glob
 from pathlib import Path
 
+from data_gen.samplers import find
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.records import from_table, read_toml
@@ -29,6 +30,7 @@ class Config:
     size: int = 128
     inputs: int = 4
     spp: tuple[int, int] = (2, 64)
+    sampler: str = "gpt"
     roll: float = 20.0
     lens: float = 0.005
     crops_per_shard: int = 4
@@ -49,6 +51,11 @@ class Config:
         ):
             if bad:
                 raise NgptError(f"data configuration: {text}")
+        if not find(self.sampler).gradients and "dx" in METHODS[self.reference_method].needs:
+            raise NgptError(
+                f"data configuration: reference_method '{self.reference_method}' needs gradients, and sampler "
+                f"'{self.sampler}' renders none; use 'oidn', or 'primal' with many samples"
+            )
 
     def plan(self) -> list[Job]:
         """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""

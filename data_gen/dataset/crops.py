@@ -107,15 +107,15 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
         seconds = {"camera": time.perf_counter() - clock}
         seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + 1)]
         clock = time.perf_counter()
-        stacks = [render_stack(around.scene, counts[0], seeds[0])]
+        stacks = [render_stack(around.scene, counts[0], seeds[0], config.sampler)]
         if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
         raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
-    stacks += [render_stack(around.scene, *pair) for pair in zip(counts[1:], seeds[1:-1], strict=True)]
+    stacks += [render_stack(around.scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-1], strict=True)]
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    converged = render_stack(around.scene, config.reference_spp, seeds[-1])
+    converged = render_stack(around.scene, config.reference_spp, seeds[-1], config.sampler)
     reference = denoise(converged, method=config.reference_method)
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
@@ -139,9 +139,11 @@ def finite(stack: GradientStack) -> tuple[GradientStack, int]:
     that is all noise: its own square.
     """
     whole = repair(stack)
-    layers = {"primal": whole.image + whole.direct, "direct": whole.direct, "dx": whole.dx, "dy": whole.dy}
+    layers = {"primal": whole.image + whole.direct, "direct": whole.direct}
+    if whole.dx is not None:
+        layers |= {"dx": whole.dx, "dy": whole.dy}
     bad = whole.pixels + whole.gradients
-    for name in ("primal", "dx", "dy"):
+    for name in [name for name in layers if name != "direct"]:
         variance = stack[f"{name}_var"]
         unknown = ~np.isfinite(variance)
         bad += int(unknown.any(axis=-1).sum())

@@ -33,6 +33,7 @@ VERBS = {
     "info": Verb("say what a file holds, or what a scene requires"),
     "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
+    "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
     "advise": Verb("say which method and how many samples to use, for a time or an error"),
     "dataset": Verb("make a training set, or continue one", "train", _CONTINUES),
     "train": Verb("train a network, or continue a run", "train", _CONTINUES),

@@ -11,15 +11,16 @@ import numpy as np
 from ngpt.cli.arguments import add_force, positive, size
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
-from ngpt.measure.metrics import METRICS, compare
+from ngpt.measure.metrics import METRICS
+from ngpt.measure.shown import available, judge
 from ngpt.methods import METHODS, reconstruct
-from ngpt.report.page import Entry, Scene, median, write_report
+from ngpt.report.content import Entry, Scene, median
+from ngpt.report.page import oversize, write_report
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.version import __version__
 
-TABLE_METRICS = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR")
 LAYER_VIEWS = ("dx", "dy", "albedo", "normal", "depth")
 
 
@@ -71,6 +72,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     }
     write_report(report, "ngpt demo", scenes, command=command, footer=footer, overwrite=args.force)
     print_table(scenes)
+    if large := oversize(report):
+        console.say(f"{large} (--scene, --size)")
     console.say(f"report: {report} (open it in a browser), {time.perf_counter() - start:.0f} s in all")
     return 0
 
@@ -80,7 +83,8 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *METHODS)}
+    methods = {method: entry for method, entry in METHODS.items() if not entry.variant}
+    targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
     with console.progress(f"{name}: stack", "spp") as progress:
         stack = render_stack(scene, args.spp, progress=progress)
@@ -90,7 +94,7 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     write(targets["stack"], stack, overwrite=args.force)
     write(targets["ref"], reference, overwrite=args.force)
     entries = []
-    for method, entry in METHODS.items():
+    for method, entry in methods.items():
         if lack := entry.missing():
             console.say(f"{name}: without {method}: {lack}")
         elif all(layer in stack for layer in entry.needs):
@@ -100,15 +104,15 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
         f"reference {args.reference_spp} spp of Mitsuba's own integrator"
     )
     layers = {layer: stack[layer] for layer in LAYER_VIEWS if layer in stack}
-    rising = [metric for metric in TABLE_METRICS if METRICS[metric].better == "higher"]
+    rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
     return Scene(name, caption, reference, entries, layers, rising)
 
 
 def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target: Path, force: bool) -> Entry:
     result = reconstruct(stack, method)
     write(target, result.image, like=stack, overwrite=force, attributes=result.attributes)
-    metrics = compare(result.image, reference)
-    return Entry(method, result.image, result.seconds, {name: metrics[name] for name in TABLE_METRICS})
+    metrics, maps = judge(available(stack.height, stack.width)[0], result.image, reference)
+    return Entry(method, result.image, result.seconds, metrics, maps)
 
 
 def print_table(scenes: list[Scene]) -> None:

@@ -13,6 +13,7 @@ from ngpt.cli.arguments import (
     add_json,
     add_layers,
     add_untrusted,
+    assignment,
     given_files,
     print_json,
     stack_files,
@@ -25,6 +26,11 @@ from ngpt.network.run_onnx import MEMORY
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.version import __version__
+
+# The options of methods that are numbers; they may be "auto" as well.
+NUMBERS = {
+    name for method in METHODS.values() for name, value in method.options.items() if isinstance(value, int | float)
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -44,6 +50,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
+    )
+    parser.add_argument(
+        "-O",
+        "--option",
+        action="append",
+        default=[],
+        type=assignment,
+        metavar="NAME=VALUE",
+        help=f"an option of the method; may be repeated. With their defaults: {_options()}",
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
@@ -66,6 +81,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
+    options |= {name: number(text) if name in NUMBERS else text for name, text in args.option}
     reports = []
     for i, (source, target) in enumerate(pairs, 1):
         try:
@@ -95,6 +111,7 @@ def denoise_file(
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
         "options": result.options,
+        "estimated": list(result.estimated),
         "version": __version__,
         "seconds": result.seconds,
         "width": stack.width,
@@ -111,6 +128,27 @@ def denoise_file(
 def alpha(text: str) -> float | str:
     """A number, or ``auto``."""
     return text if text == "auto" else float(text)
+
+
+def number(text: str) -> int | float | str:
+    """A number where it is one; the method says what else it takes."""
+    for kind in (int, float):
+        try:
+            return kind(text)
+        except ValueError:
+            continue
+    return text
+
+
+def _options() -> str:
+    """The options of methods that have no argument of their own: "oidn: auxiliary=prefiltered, quality=high"."""
+    own = {"alpha", "weights", "device", "memory"}
+    found = {
+        name: ", ".join(f"{option}={value}" for option, value in method.options.items() if option not in own)
+        for name, method in METHODS.items()
+        if not method.variant
+    }
+    return "; ".join(f"{name}: {options}" for name, options in found.items() if options)
 
 
 def describe(report: dict) -> str:

@@ -28,12 +28,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.evaluation.run import evaluate
     from ngpt.measure.advice import make_table
     from ngpt.report.evaluation import write_evaluation_report
+    from ngpt.report.page import oversize
     from ngpt.system.writing import write_json
 
     config = read_config(path)
     config = replace(config, scenes=(*config.scenes, *args.scenes))
     results = evaluate(config, args.out, console, args.command, args.cache)
-    write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
+    page = write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
+    if large := oversize(page):
+        console.say(large)
     if args.advice:
         write_json(args.advice, make_table(results))
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]

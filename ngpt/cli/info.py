@@ -10,6 +10,7 @@ from ngpt.errors import NgptError
 from ngpt.io.aliases import format_aliases, propose
 from ngpt.io.exr import pass_through, read
 from ngpt.layers import LAYERS
+from ngpt.measure.gains import Gain, gains
 from ngpt.merging import DIAGNOSTICS
 from ngpt.methods import METHODS, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
@@ -141,12 +142,18 @@ def stack(stack: GradientStack) -> dict:
             if not method.missing() and all(layer in stack for layer in method.needs)
         ],
         "auto": choose(stack),
+        "auto with more": {", ".join(gain.add): bought(gain) for gain in gains(stack)},
         "attributes": {name: _plain(value) for name, value in sorted(stack.attributes.items())},
     }
-    for name in ("diagnostics", "proposed"):
+    for name in ("diagnostics", "proposed", "auto with more"):
         if not report[name]:
             del report[name]
     return report
+
+
+def bought(gain: Gain) -> dict:
+    """What `auto` would take with more layers, and how much of its error it would leave, as measured by samples."""
+    return {"auto": gain.method, "times the error at": {f"{n} spp": round(x, 2) for n, x in gain.error.items()}}
 
 
 def show(report: dict, as_json: bool) -> None:
@@ -170,6 +177,8 @@ def show(report: dict, as_json: bool) -> None:
 
 
 def _number(value: object) -> str:
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_number(item)}" for key, item in value.items())
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

@@ -11,6 +11,7 @@ from ngpt.errors import NgptError
 from ngpt.repair import Repaired
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
+QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
 
 
 def missing() -> str:
@@ -32,10 +33,9 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
         raise NgptError(f"method 'oidn': auxiliary '{auxiliary}': choose one of: {', '.join(AUXILIARY)}")
     import mitsuba_oidn
 
-    qualities = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
-    if quality not in qualities:
-        raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(qualities)}")
-    level = getattr(mitsuba_oidn.Quality, qualities[quality])
+    if quality not in QUALITIES:
+        raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(QUALITIES)}")
+    level = getattr(mitsuba_oidn.Quality, QUALITIES[quality])
     features = {}
     if auxiliary == "prefiltered":
         features = prefiltered(data.features)
@@ -50,7 +50,10 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
 
 
 def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself."""
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself.
+
+    Whether they are noisy is not asked: no cheap answer was right (docs/lab/LOG.md). Who knows says "clean".
+    """
     require_oidn()
     return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
 

@@ -40,7 +40,7 @@ _STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWin
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
 # Attributes that say what made a result; those of the stack are others, and stay.
-MADE_BY = ("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:reconstructSeconds")
+MADE_BY = ("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds")
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
 

@@ -125,7 +125,7 @@ METRICS = {
     "SSIM": Metric(
         "structural similarity of x / (1 + x), Gaussian window of sigma 1.5, mean over channels",
         "higher",
-        perceptual.ssim,
+        lambda image, reference: perceptual.ssim(image, reference)[0],
         whole=True,
         missing=partial(perceptual.lack, "SSIM", "skimage", "scikit-image"),
     ),

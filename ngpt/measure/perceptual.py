@@ -22,11 +22,12 @@ def lack(name: str, module: str, package: str, extra: str = "peers") -> str:
     return "" if find_spec(module) else f"{name} needs {package}: pip install 'ngpt-recon[{extra}]'"
 
 
-def ssim(image: np.ndarray, reference: np.ndarray) -> float:
-    """Structural similarity of x' = x / (1 + x), in [-1, 1], 1 for equal images [Wang et al. 2004].
+def ssim(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
+    """Structural similarity of x' = x / (1 + x), in [-1, 1], 1 for equal images, and its map (H, W) [Wang et al. 2004].
 
     mean of (2 μx μr + C1)(2 σxr + C2) / ((μx² + μr² + C1)(σx² + σr² + C2)) over pixels and channels, moments under a
-    Gaussian of σ = 1.5 pixels, C1 = 0.01², C2 = 0.03². Raises NgptError for images under 11 pixels.
+    Gaussian of σ = 1.5 pixels, C1 = 0.01², C2 = 0.03². The mean leaves out 5 pixels at each border. Raises NgptError
+    for images under 11 pixels.
     """
     check_size(image, reference)
     if min(image.shape[:2]) < 11:
@@ -35,7 +36,8 @@ def ssim(image: np.ndarray, reference: np.ndarray) -> float:
 
     x, r = (reinhard(np.asarray(i, np.float64)) for i in (image, reference))
     options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False}
-    return float(structural_similarity(x, r, data_range=1.0, channel_axis=-1, **options))
+    mean, similarity = structural_similarity(x, r, data_range=1.0, channel_axis=-1, full=True, **options)
+    return float(mean), similarity.mean(axis=-1)
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:

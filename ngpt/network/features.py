@@ -66,6 +66,9 @@ CHANNELS = {
 # What differences to an image, and relative noise, are enlarged by; what is added to depth before division.
 ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 
+# The least albedo that radiance is divided by.
+DARKEST = 0.05
+
 # What is computed of other layers: of which, beside ``compared``.
 SOURCES = {
     **{f"{name}_change": (name,) for name in ("primal", "base", "denoised_base")},
@@ -114,6 +117,11 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
     image = layers[SOURCES[name][1]]
     last = image.narrow(axis, image.shape[axis] - 1, 1)
     return (layers[name[:2]] - torch.diff(image, dim=axis, append=last)) / (1 + other.abs())
+
+
+def reflectance(albedo: Tensor) -> Tensor:
+    """What radiance (N, 3, H, W) may be divided by: albedo, at least ``DARKEST``; 1 where it is 0, or not known."""
+    return torch.where(albedo.amax(1, keepdim=True) > 0, albedo.clamp(min=DARKEST), torch.ones_like(albedo))
 
 
 def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:

@@ -5,6 +5,8 @@
     Mixture    a weight for each of several images, and a correction of the logarithm of their mean
     Kernels    weights for the k x k pixels around, in all of the images: their mean, nothing added [Bako et al. 2017,
                "Kernel-predicting convolutional networks", section 4.2; for several images Vogels et al. 2018]
+    Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
+               "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 
 Each has the number of channels it asks of the network, the computation in PyTorch, and the same as an ONNX graph.
 """
@@ -13,10 +15,15 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
 from torch import Tensor
+from torch.nn.functional import avg_pool2d, interpolate, pad
 
 from ngpt.network.transfer import signed_log
+
+# Of ``Pyramid``: what no pixel is trusted less; the logarithm of how much pixels beyond the border are.
+LEAST_TRUST, NEVER = 1e-4, -1e9
 
 
 @dataclass(frozen=True)
@@ -25,16 +32,29 @@ class Head(ABC):
 
     ``start``    the images it reads, in order; names of ``ngpt.network.features.IMAGES``
     ``outputs``  channels of the prediction
-    ``radius``   how far around a pixel it reads the images
+    ``reads``    the layers that ``forward`` is given: the images, and what else the head reads
+    ``radius``   how far around a pixel it reads them beyond the size of the prediction
+    ``reach``    how far around a pixel its result depends on images and prediction
     ``neutral``  whether a prediction of 0 is a sensible image, so that training begins there
+    ``normalise``  whether the features that the prediction is made of are divided by their root mean square, in each
+                 pixel: softmax holds nothing back, so that features and logits would grow until nothing is learnt
     """
 
     start: tuple[str, ...] = ()
     neutral: ClassVar[bool] = True
+    normalise: ClassVar[bool] = False
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return self.start
 
     @property
     def radius(self) -> int:
         return 0
+
+    @property
+    def reach(self) -> int:
+        return self.radius
 
     @property
     @abstractmethod
@@ -44,7 +64,7 @@ class Head(ABC):
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
         """The signed log of the image, (N, 3, H, W) float32.
 
-        ``prediction`` (N, outputs, H, W) float32. ``images`` are those of ``start``, with ``radius`` more pixels on
+        ``prediction`` (N, outputs, H, W) float32. ``images`` are those it ``reads``, with ``radius`` more pixels on
         every side: (N, 3, H + 2 radius, W + 2 radius), scene-linear, over the exposure.
         """
 
@@ -136,15 +156,136 @@ class Kernels(Head):
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
         weights = op.Softmax(prediction, axis=1)
         mean = 0.0
-        for tap, (i, y, x) in enumerate(self._taps):
-            # Ends count from the end, as the size is not known here; the last pixel's is beyond any.
-            ends = [n - 2 * self.radius if n < 2 * self.radius else 2**62 for n in (y, x)]
-            mean = op.Slice(weights, [tap], [tap + 1], [1]) * op.Slice(images[i], [y, x], ends, [2, 3]) + mean
+        pixels = [shifted for image in images for shifted in _shifted(op, image, self.size)]
+        for tap, shifted in enumerate(pixels):
+            mean = op.Slice(weights, [tap], [tap + 1], [1]) * shifted + mean
         return op.signed_log(mean)
 
 
-def head_of(start: tuple[str, ...], kernel: int) -> Head:
-    """The head of a network that starts from these images, by kernels of that size or (0) pixel by pixel."""
+@dataclass(frozen=True)
+class Pyramid(Head):
+    """Kernels of ``size`` x ``size`` pixels at ``scales`` resolutions of one image, each half as fine as the last.
+
+    With w the trust in each pixel of the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
+
+        I_s(p) = sum of k_s(p, q) w_s(q) D_s(q) / sum of k_s(p, q) w_s(q)       q in the kernel around p
+        o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
+
+    o_0 is the result. A pixel that a rare bright path has hit is trusted by nobody, at no resolution [in the manner of
+    Gharbi et al. 2019, "Sample-based Monte Carlo denoising using a kernel-splatting network"]. Trust is over 1 + D to
+    begin with, so that such pixels do not rule what is learnt. The prediction of k_s
+    and a_s is averaged over the pixels of the resolution.
+
+    ``demodulate``  the same kernels average the image over the reflectance, too, which is multiplied again afterwards;
+                    a weight in each pixel blends both. What of the image is texture is not averaged then
+    """
+
+    normalise = True
+
+    size: int = 5
+    scales: int = 4
+    demodulate: bool = False
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (*self.start, "reflectance") if self.demodulate else self.start
+
+    @property
+    def reach(self) -> int:
+        # The kernel, the pixels that are averaged, and those that bilinear interpolation reads, at the coarsest scale.
+        return sum((self.size // 2 + 2) << scale for scale in range(self.scales))
+
+    @property
+    def outputs(self) -> int:
+        # Trust; for each scale a kernel and a share, of which the coarsest is the blend with the demodulated image.
+        return 1 + self.scales * (self.size**2 + 1)
+
+    def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
+        image = torch.cat([images[0], images[0] / images[1]], 1) if self.demodulate else images[0]
+        weight = (torch.sigmoid(prediction[:, :1]) + LEAST_TRUST) / (1 + images[0].abs().mean(1, keepdim=True))
+        rest, taps = prediction[:, 1:], self.size**2
+        filtered, shares = [], []
+        for scale in range(self.scales):
+            if scale:
+                light, weight = avg_pool2d(image * weight, 2), avg_pool2d(weight, 2)
+                image, rest = light / weight, avg_pool2d(rest[:, taps + 1 :], 2)
+            filtered.append(self._filtered(rest[:, :taps], image, weight))
+            shares.append(torch.sigmoid(rest[:, taps : taps + 1]))
+        result = filtered.pop()
+        for fine, share in zip(reversed(filtered), reversed(shares[:-1]), strict=True):
+            change = result - avg_pool2d(fine, 2)
+            result = fine + share * interpolate(change, scale_factor=2.0, mode="bilinear", align_corners=False)
+        if self.demodulate:
+            blend = torch.sigmoid(prediction[:, -1:])
+            raw, light = result[:, :3], result[:, 3:] * images[1]
+            result = raw + blend * (light - raw)
+        return signed_log(result)
+
+    def _filtered(self, logits: Tensor, image: Tensor, weight: Tensor) -> Tensor:
+        """The means of an image (N, C, H, W) by kernels exp ``logits`` times the weights of its pixels."""
+        height, width = image.shape[-2:]
+        border = 4 * (self.size // 2,)
+        image, trust = pad(image, border), pad(torch.log(weight), border, value=NEVER)
+        places = [(y, x) for y in range(self.size) for x in range(self.size)]
+        kernels = torch.softmax(
+            logits + torch.cat([trust[..., y : y + height, x : x + width] for y, x in places], 1), 1
+        )
+        total = torch.zeros_like(image[..., :height, :width])
+        for tap, (y, x) in enumerate(places):
+            total = total + kernels[:, tap : tap + 1] * image[..., y : y + height, x : x + width]
+        return total
+
+    def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
+        def part(x: Any, first: int, last: int) -> Any:
+            return op.Slice(x, [first], [last], [1])
+
+        def halved(x: Any) -> Any:
+            return op.AveragePool(x, kernel_shape=[2, 2], strides=[2, 2])
+
+        image = op.Concat(images[0], images[0] / images[1], axis=1) if self.demodulate else images[0]
+        bright = op.ReduceMean(abs(images[0]), [1], keepdims=1) + 1.0
+        weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / bright
+        rest, taps, border = part(prediction, 1, self.outputs), self.size**2, [self.size // 2] * 4
+        filtered, shares = [], []
+        for scale in range(self.scales):
+            if scale:
+                light, weight = halved(image * weight), halved(weight)
+                image, rest = light / weight, halved(part(rest, taps + 1, self.outputs))
+            trust = _shifted(op, op.Pad(op.Log(weight), border, NEVER, [2, 3]), self.size)
+            kernels = op.Softmax(part(rest, 0, taps) + op.Concat(*trust, axis=1), axis=1)
+            total = 0.0
+            for tap, pixels in enumerate(_shifted(op, op.Pad(image, border, 0.0, [2, 3]), self.size)):
+                total = part(kernels, tap, tap + 1) * pixels + total
+            filtered.append(total)
+            shares.append(op.Sigmoid(part(rest, taps, taps + 1)))
+        result = filtered.pop()
+        doubled = np.array([1, 1, 2, 2], np.float32)
+        for fine, share in zip(reversed(filtered), reversed(shares[:-1]), strict=True):
+            change = result - halved(fine)
+            result = fine + share * op.Resize(
+                change, None, doubled, mode="linear", coordinate_transformation_mode="half_pixel"
+            )
+        if self.demodulate:
+            blend = op.Sigmoid(part(prediction, self.outputs - 1, self.outputs))
+            raw, light = part(result, 0, 3), part(result, 3, 6) * images[1]
+            result = raw + blend * (light - raw)
+        return op.signed_log(result)
+
+
+def _shifted(op: Any, image: Any, size: int) -> list[Any]:
+    """Nodes of the image (N, C, H + size - 1, W + size - 1) as each tap of a kernel sees it, (N, C, H, W), by rows."""
+    # Ends count from the end, as the size is not known here; the last pixel's is beyond any.
+    ends = [n - size + 1 if n < size - 1 else 2**62 for n in range(size)]
+    return [op.Slice(image, [y, x], [ends[y], ends[x]], [2, 3]) for y in range(size) for x in range(size)]
+
+
+def head_of(start: tuple[str, ...], kernel: int, scales: int = 1, demodulate: bool = False) -> Head:
+    """The head of a network that starts from these images, by kernels of that size or (0) pixel by pixel.
+
+    ``scales`` and ``demodulate`` are those of ``Pyramid``.
+    """
+    if scales > 1:
+        return Pyramid(start, kernel, scales, demodulate)
     if kernel:
         return Kernels(start, kernel)
     if not start:

@@ -18,12 +18,14 @@ kernel].
 
 from collections.abc import Collection
 from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
-from ngpt.classical.bases import BASES
+from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.denoisers.oidn import oidn, prefiltered
 from ngpt.errors import NgptError
+from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
 
 # The layers of a stack that networks know, in the order in which they are listed.
@@ -34,6 +36,9 @@ DENOISED = ("denoised", "denoised_base")
 
 # The inputs that are no layers of a stack, but made of them.
 MADE = ("base", *DENOISED)
+
+# Estimated where a stack with gradients lacks them.
+ESTIMATED = ("primal_var", "dx_var", "dy_var")
 
 # The inputs that a network may do without, and their channels; what a network may read that sees emission, too.
 OPTIONAL = {"albedo": 3, "normal": 3, "depth": 1}
@@ -63,26 +68,34 @@ def gather(
     reader: str = "the network's settings",
     optional: Collection[str] = (),
     emission: bool = False,
+    estimate: bool = False,
 ) -> dict:
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
     ``reader``    what the message says needs the layers that lack
     ``optional``  those of ``OPTIONAL`` that are zeros where the stack lacks them
     ``emission``  whether the primal includes emission seen directly; its results then are for ``without_emission``
+    ``estimate``  whether variances that a stack with gradients lacks are estimated, see ``ngpt.network.estimates``
 
     Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
     """
+    wanted = needs(names, base, optional)
+    by_oidn = Oidn(data)
+    if estimate and data.dx is not None and set(ESTIMATED) & set(wanted) - data.known_variances().keys():
+        # OIDN's image is the better guide, but is there only for networks that read it anyway.
+        guide = by_oidn.of_primal if set(DENOISED) & set(names) else CLASSICAL["l1"](data)
+        data = with_variances(data, guide)
     primal = data.image + data.direct if emission else data.image
     held = {name: np.zeros((*primal.shape[:2], OPTIONAL[name]), np.float32) for name in optional}
     held |= {"primal": primal, **data.features, **data.known_variances()}
     if data.dx is not None:
         held |= {"dx": data.dx, "dy": data.dy}
-    if lacking := [name for name in needs(names, base, optional) if name not in held]:
+    if lacking := [name for name in wanted if name not in held]:
         raise NgptError(f"{reader} need layers {', '.join(lacking)}, which the stack lacks")
     made = {name: _standard_error(held[_layer(name)]) for name in names if name.endswith("_se")}
     if {"base", "denoised_base"} & set(names):
         made["base"] = base_image(data, base)
-    arrays = held | made | denoised(data, made.get("base"), names)
+    arrays = held | made | denoised(by_oidn, made.get("base"), names)
     return {name: arrays[name] for name in names}
 
 
@@ -98,21 +111,36 @@ def base_image(data: Repaired, base: str) -> np.ndarray:
         return BASES[base](data).astype(np.float32, copy=False)
 
 
-def denoised(data: Repaired, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
+class Oidn:
+    """OIDN's images of one frame: its features are prefiltered once, however many images are denoised by them."""
+
+    def __init__(self, data: Repaired):
+        self._data = data
+
+    @cached_property
+    def of_primal(self) -> np.ndarray:
+        """(H, W, 3) float32 without direct emission."""
+        return self.of(self._data.image)
+
+    def of(self, image: np.ndarray) -> np.ndarray:
+        """The same of another image without direct emission; raises NgptError where OIDN is not installed."""
+        return oidn(replace(self._prefiltered, image=np.ascontiguousarray(image, np.float32)), "clean", "high")
+
+    @cached_property
+    def _prefiltered(self) -> Repaired:
+        # Most of the time goes here.
+        return replace(self._data, features=self._data.features | prefiltered(self._data.features))
+
+
+def denoised(by_oidn: Oidn, base: np.ndarray | None, names: Collection[str]) -> dict[str, np.ndarray]:
     """Those of ``DENOISED`` that are among ``names`` and have a source: (H, W, 3) without direct emission.
 
     Raises NgptError where OIDN is not installed.
     """
-    sources = dict(zip(DENOISED, (data.image, base), strict=True))
-    if not sources.keys() & set(names):
-        return {}
-    # Once for both images: this is most of the time.
-    data = replace(data, features=data.features | prefiltered(data.features))
-    return {
-        name: oidn(replace(data, image=np.ascontiguousarray(image, np.float32)), "clean", "high")
-        for name, image in sources.items()
-        if name in names and image is not None
-    }
+    images = {"denoised": by_oidn.of_primal} if "denoised" in names else {}
+    if "denoised_base" in names and base is not None:
+        images["denoised_base"] = by_oidn.of(base)
+    return images
 
 
 def _layer(name: str) -> str:

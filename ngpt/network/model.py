@@ -43,6 +43,8 @@ class ModelConfig:
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
                   ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel
+    ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of one image only
+    ``demodulate``  whether these average the image over the albedo, too; needs the input albedo, and ``scales``
     ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
     ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
     """
@@ -55,6 +57,8 @@ class ModelConfig:
     start: tuple[str, ...] = ()
     quiet: float = 0.0
     kernel: int = 0
+    scales: int = 1
+    demodulate: bool = False
     optional: tuple[str, ...] = ()
     emission: bool = False
 
@@ -106,6 +110,12 @@ class ModelConfig:
             raise NgptError(f"kernel = {self.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
         if self.kernel and not self.start:
             raise NgptError(f"kernel = {self.kernel}: there is no image to average; give a base, or start")
+        if type(self.scales) is not int or not 1 <= self.scales <= levels:
+            raise NgptError(f"scales = {self.scales!r}: must be from 1 to the {levels} levels of the network")
+        if self.scales > 1 and (len(self.start) != 1 or self.kernel < 3 or self.quiet):
+            raise NgptError(f"scales = {self.scales}: kernels of 3 pixels or more of one image, without quiet")
+        if type(self.demodulate) is not bool or (self.demodulate and (self.scales < 2 or "albedo" not in self.inputs)):
+            raise NgptError(f"demodulate = {self.demodulate!r}: true or false; needs scales and the input albedo")
         if not isinstance(self.quiet, int | float) or isinstance(self.quiet, bool) or not 0 <= self.quiet < math.inf:
             raise NgptError(f"quiet = {self.quiet!r}: must be a finite relative standard error, 0 for none")
         if self.quiet and not {"base", "primal_se"} <= set(self.layers):
@@ -117,7 +127,7 @@ class ModelConfig:
     @property
     def head(self) -> Head:
         """What makes an image of the network's prediction."""
-        return head_of(self.start, self.kernel)
+        return head_of(self.start, self.kernel, self.scales, self.demodulate)
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -151,10 +161,11 @@ class Reconstructor(nn.Module):
         super().__init__()
         self.config = config
         channels, head = features.channels(config.inputs), config.head
+        last: dict[str, Any] = {"outputs": head.outputs, "zero": head.neutral, "normalise": head.normalise}
         self.network = (
-            DenseUNet(channels, config.channels, config.units, head.outputs, zero=head.neutral)
+            DenseUNet(channels, config.channels, config.units, **last)
             if config.network == "dense"
-            else PlainUNet(channels, config.channels, head.outputs, zero=head.neutral)
+            else PlainUNet(channels, config.channels, **last)
         )
 
     @property
@@ -165,7 +176,10 @@ class Reconstructor(nn.Module):
     @property
     def radius(self) -> int:
         """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
-        return max(self.network.radius, self.config.head.radius, WINDOW // 2 if self.config.quiet else 0)
+        head = self.config.head
+        # Kernels alone move pixels; a pyramid moves what the network says of them, too.
+        own = self.network.radius + head.reach if self.config.scales > 1 else max(self.network.radius, head.reach)
+        return max(own, WINDOW // 2 if self.config.quiet else 0)
 
     def forward(self, layers: Mapping[str, Tensor]) -> Tensor:
         height, width = layers["primal"].shape[-2:]
@@ -182,7 +196,10 @@ class Reconstructor(nn.Module):
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
         prediction = self.network(x).float()
         head = self.config.head
-        result = head.forward(prediction, [padding.extended(scaled[name], head.radius) for name in head.start])
+        images = dict(scaled)
+        if "reflectance" in head.reads:
+            images["reflectance"] = features.reflectance(scaled["albedo"])
+        result = head.forward(prediction, [padding.extended(images[name], head.radius) for name in head.reads])
         if not self.config.quiet:
             return result
         base = signed_log(scaled["base"])

@@ -52,7 +52,8 @@ class Shipped:
             network = run_onnx.Network(path, device)
             # NumPy makes the base several times faster than the graph would.
             names = (*network.inputs, "base") if network.base else network.inputs
-            layers = inputs.gather(data, names, network.base, f"weights {path}", network.optional, network.emission)
+            reader = f"weights {path}"
+            layers = inputs.gather(data, names, network.base, reader, network.optional, network.emission, estimate=True)
             return inputs.without_emission(network.reconstruct(layers, memory=memory), data, network.emission)
         if find_spec("torch") is None or find_spec("safetensors") is None:
             raise NgptError(f"weights {path}: to run them needs PyTorch: pip install 'ngpt-recon[train]'")

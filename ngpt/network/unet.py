@@ -68,11 +68,12 @@ class LastConvolution(nn.Module):
 
     It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions of which 0 is a sensible
     one, such as corrections: it starts there, and its weights are not normalised, since what is to be small should not
-    need a direction first.
+    need a direction first. ``normalise``: what it reads is divided by its root mean square in each pixel.
     """
 
-    def __init__(self, inputs: int, outputs: int, zero: bool):
+    def __init__(self, inputs: int, outputs: int, zero: bool, normalise: bool = False):
         super().__init__()
+        self.normalise = normalise
         self.convolution: nn.Module
         if zero:
             self.convolution = nn.Conv2d(inputs, outputs, 1)
@@ -83,7 +84,10 @@ class LastConvolution(nn.Module):
 
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
-            return self.convolution(x.float())
+            x = x.float()
+            if self.normalise:
+                x = x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-8)
+            return self.convolution(x)
 
 
 class Unit(nn.Module):
@@ -110,12 +114,18 @@ class DenseUNet(nn.Module):
     """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
 
     ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` is that of ``LastConvolution``, ``radius`` that of the receptive
-    field.
+    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius``
+    that of the receptive field.
     """
 
     def __init__(
-        self, inputs: int, growth: tuple[int, ...], units: tuple[int, ...], outputs: int = 3, zero: bool = False
+        self,
+        inputs: int,
+        growth: tuple[int, ...],
+        units: tuple[int, ...],
+        outputs: int = 3,
+        zero: bool = False,
+        normalise: bool = False,
     ):
         super().__init__()
         levels = len(growth)
@@ -137,7 +147,7 @@ class DenseUNet(nn.Module):
                 dense[level] += 2 * g
             self.up.insert(0, nn.ModuleList(Unit(dense[level] + i * g, g) for i in range(n)))
             dense[level] += n * g
-        self.head = LastConvolution(dense[0], outputs, zero)
+        self.head = LastConvolution(dense[0], outputs, zero, normalise)
 
     def forward(self, x: Tensor) -> Tensor:
         lists = []
@@ -162,7 +172,9 @@ class PlainUNet(nn.Module):
     (N, inputs, H, W) to (N, outputs, H, W), as ``DenseUNet``, with the same building stones.
     """
 
-    def __init__(self, inputs: int, widths: tuple[int, ...], outputs: int = 3, zero: bool = False):
+    def __init__(
+        self, inputs: int, widths: tuple[int, ...], outputs: int = 3, zero: bool = False, normalise: bool = False
+    ):
         super().__init__()
         self.alignment = 2 ** (len(widths) - 1)
         self.radius = radius([4] * (len(widths) - 1) + [2])
@@ -176,7 +188,7 @@ class PlainUNet(nn.Module):
                 self.unpool.append(Convolution(widths[level + 1], width, "unpool"))
                 self.up.append(nn.Sequential(Convolution(2 * width, width, "3x3"), Convolution(width, width, "3x3")))
             channels = width
-        self.head = LastConvolution(widths[0], outputs, zero)
+        self.head = LastConvolution(widths[0], outputs, zero, normalise)
 
     def forward(self, x: Tensor) -> Tensor:
         skips = []

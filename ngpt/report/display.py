@@ -4,6 +4,8 @@ Nothing here is for measuring: display clamps and rounds. Every function takes s
 (H, W, 3) uint8 in sRGB. A NaN is magenta wherever it turns up, so that it cannot be mistaken for a colour.
 """
 
+import math
+
 import numpy as np
 
 from ngpt.errors import NgptError
@@ -64,6 +66,36 @@ def signed_map(gradient: np.ndarray) -> np.ndarray:
     if scale == 0.0:  # a layer that is zero nearly everywhere still has its peak
         scale = magnitude.max(initial=0.0) or 1.0
     return coloured(0.5 + 0.5 * value / scale, sign_table())
+
+
+def layer_view(name: str, layer: np.ndarray) -> np.ndarray:
+    """A layer of a stack, (H, W), (H, W, 1) or (H, W, 3), as (H, W, 3) uint8: each kind in a way of its own.
+
+    Gradients as :func:`signed_map`, normals as colours, depth up to its 99th percentile, light and variances at
+    automatic exposure, all else as it is.
+    """
+    layer = np.atleast_3d(np.asarray(layer, dtype=np.float64))
+    layer = np.broadcast_to(layer, (*layer.shape[:2], 3))
+    if name in ("dx", "dy"):
+        return signed_map(layer)
+    if name == "normal":
+        colour = np.rint(127.5 * (np.clip(np.nan_to_num(layer), -1.0, 1.0) + 1.0)).astype(np.uint8)
+        return np.where(np.isnan(layer).any(axis=2, keepdims=True), np.array(MAGENTA, np.uint8), colour)
+    if name == "depth":
+        finite = layer[np.isfinite(layer)]
+        layer = layer / ((np.percentile(finite, 99.0) if finite.size else 0.0) or 1.0)
+    elif name in ("primal", "direct") or name.endswith("_var"):
+        return to_srgb8(layer, auto_exposure(layer))
+    return to_srgb8(layer)
+
+
+def thumbnail(picture: np.ndarray, width: int) -> np.ndarray:
+    """Averages blocks of (H, W, 3) uint8 until the picture is at most ``width`` wide."""
+    factor = math.ceil(picture.shape[1] / width)
+    sides = [math.ceil(side / factor) for side in picture.shape[:2]]
+    rest = [side * factor - old for side, old in zip(sides, picture.shape, strict=False)]
+    padded = np.pad(picture, ((0, rest[0]), (0, rest[1]), (0, 0)), mode="edge").astype(np.float64)
+    return np.rint(padded.reshape(sides[0], factor, sides[1], factor, 3).mean(axis=(1, 3))).astype(np.uint8)
 
 
 def heat_table() -> np.ndarray:

@@ -8,7 +8,8 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_image
-from ngpt.report.page import Entry, Overview, Scene, write_report
+from ngpt.report.content import Entry, Overview, Scene
+from ngpt.report.page import write_report
 
 FORMAT = 2
 ROOM = (

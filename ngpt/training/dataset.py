@@ -21,7 +21,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
-from ngpt.training.shards import INPUTS, TENSORS, Shard
+from ngpt.training.shards import GRADIENTS, INPUTS, Shard, tensor_names
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
@@ -48,10 +48,11 @@ class Crop:
         return len(self.spp)
 
     def stack(self, k: int) -> GradientStack:
-        """Input ``k``, with all layers of a rendered stack; every value is finite."""
+        """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite."""
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
-        layers = {name: self.shard.input(name, self.index, k) for name in INPUTS}
+        names = [name for name in self.shard.names if name in INPUTS | GRADIENTS]
+        layers = {name: self.shard.input(name, self.index, k) for name in names}
         layers["primal"] = layers.pop("indirect") + layers["direct"]
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
@@ -168,19 +169,20 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     shard, crops = Shard(path), entry["crops"]
     if not crops:
         return shard
-    missing = [name for name in TENSORS if name not in shard.names]
+    names = tensor_names(gradients=not GRADIENTS.keys().isdisjoint(shard.names))
+    missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
     shape = shard.shape("indirect")
     if len(shape) != 5 or 0 in shape or any(len(crop["spp"]) != shape[1] for crop in crops):
         raise NgptError(f"{path}: tensor 'indirect' is {shape}, and its crops have {len(crops[0]['spp'])} inputs")
     inputs, height, width = shape[1:4]
-    for name in TENSORS:
+    for name in names:
         expected: tuple[int, ...] = (len(crops), height, width, 3)
         if name == "spp":
             expected = (len(crops), inputs)
-        elif name in INPUTS:
-            expected = (len(crops), inputs, height, width, INPUTS[name])
+        elif name in INPUTS | GRADIENTS:
+            expected = (len(crops), inputs, height, width, (INPUTS | GRADIENTS)[name])
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):

@@ -3,8 +3,9 @@
 Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
 
     indirect, direct            primal - direct and direct: kept apart, or half floats would lose what a lamp outshines
-    dx, dy, albedo, normal, depth
-    primal_se, dx_se, dy_se     standard errors: variances of small numbers would underflow in half floats
+    albedo, normal, depth
+    primal_se                   standard errors: variances of small numbers would underflow in half floats
+    dx, dy, dx_se, dy_se        all or none: inputs of a sampler without gradients have none
     reference_indirect, reference_direct    (N, H, W, 3)
     spp                         (N, K) samples per pixel, int32
 
@@ -28,10 +29,9 @@ from ngpt.system.files import atomic_output
 from ngpt.system.records import check, parse_json
 
 # Tensors of the inputs and their channels.
-INPUTS = {"indirect": 3, "direct": 3, "dx": 3, "dy": 3, "albedo": 3, "normal": 3, "depth": 1}
-INPUTS |= {"primal_se": 3, "dx_se": 3, "dy_se": 3}
+GRADIENTS = {"dx": 3, "dy": 3, "dx_se": 3, "dy_se": 3}
+INPUTS = {"indirect": 3, "direct": 3, "albedo": 3, "normal": 3, "depth": 1, "primal_se": 3}
 REFERENCES = ("reference_indirect", "reference_direct")
-TENSORS = (*INPUTS, *REFERENCES, "spp")
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -48,16 +48,21 @@ class CropData:
 
     def tensors(self) -> dict[str, np.ndarray]:
         inputs = [_input_tensors(stack) for stack in self.stacks]
-        tensors = {name: np.stack([i[name] for i in inputs]) for name in INPUTS}
+        tensors = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
         tensors["reference_indirect"] = self.reference - self.reference_direct
         tensors["reference_direct"] = self.reference_direct
         tensors["spp"] = np.array(self.spp, np.int32)
         return tensors
 
 
+def tensor_names(gradients: bool) -> tuple[str, ...]:
+    """The tensors of a shard whose inputs have gradients, or have none."""
+    return (*INPUTS, *(GRADIENTS if gradients else ()), *REFERENCES, "spp")
+
+
 def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
     tensors = {"indirect": stack["primal"] - stack["direct"]}
-    for name in INPUTS:
+    for name in (*INPUTS, *(GRADIENTS if "dx" in stack else ())):
         if name.endswith("_se"):
             tensors[name] = np.sqrt(stack[name.removesuffix("_se") + "_var"])
         elif name != "indirect":
@@ -87,7 +92,7 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     from safetensors.numpy import save
 
     each = [crop.tensors() for crop in crops]
-    tensors = {name: smallest_float(np.stack([t[name] for t in each])) for name in TENSORS} if each else {}
+    tensors = {name: smallest_float(np.stack([t[name] for t in each])) for name in each[0]} if each else {}
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")

@@ -24,7 +24,7 @@ pytest.importorskip("mitsuba")
 from data_gen.dataset import crops, jobs
 from data_gen.dataset.config import Config, Files, read_config
 from data_gen.scenes.procedural.scenes import make_scene
-from ngpt.training.shards import write_shard
+from ngpt.training.shards import Shard, write_shard
 
 ROOT = Path(__file__).parents[2]
 TINY = replace(read_config(ROOT / "configs" / "data-tiny.toml"))
@@ -53,6 +53,8 @@ def test_configurations_can_be_read():
     [
         ("spp = [1, 4]\nscenes = 1", "at least 2"),
         ("scenes = 0", "no scenes"),
+        ("scenes = 1\nsampler = 'gtp'", "unknown sampler 'gtp'"),
+        ("scenes = 1\nsampler = 'primal'", "reference_method 'wcv' needs gradients, and sampler 'primal' renders none"),
         ("scene = 3", "unknown key 'scene'; there are: seed, size"),
         ("seed = ", "cannot be read"),
         ("spp = 3", r"spp = 3: must be a list of 2 whole numbers, like \[2, 64\]"),
@@ -241,6 +243,16 @@ def test_tiny(renderer, tmp_path):
             for name in one.stack(k).names:
                 np.testing.assert_array_equal(one.stack(k)[name], other.stack(k)[name])
     assert (tmp_path / "a" / "README.md").exists() and (tmp_path / "a" / "contact.png").exists()
+
+
+def test_crops_of_a_sampler_without_gradients(renderer, tmp_path):
+    config = Config(
+        size=16, inputs=2, spp=(2, 4), sampler="primal", scenes=1, crops=1, reference_spp=8, reference_method="primal"
+    )
+    (tmp_path / "shards").mkdir()
+    crops.make_shard(config, config.plan()[0], str(tmp_path), "llvm_ad_rgb")
+    shard = Shard(tmp_path / config.plan()[0].file)
+    assert shard.shape("primal_se") == (1, 2, 16, 16, 3) and "dx" not in shard.names
 
 
 @pytest.mark.slow

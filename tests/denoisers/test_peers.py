@@ -150,11 +150,12 @@ def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
     """As `--method oidn` has them, though the features are filtered once for both."""
     data = repair(full_stack(40, 50))
     base = 0.9 * data.image
-    images = inputs.denoised(data, base, inputs.DENOISED)
+    images = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
     for name, image in (("denoised", data.image), ("denoised_base", base)):
         expected = oidn.oidn(replace(data, image=image), "prefiltered", "high")
         assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
-    assert inputs.denoised(data, base, ("primal",)) == {} == inputs.denoised(data, None, ("denoised_base",))
+    by_oidn = inputs.Oidn(data)
+    assert inputs.denoised(by_oidn, base, ("primal",)) == {} == inputs.denoised(by_oidn, None, ("denoised_base",))
 
 
 @pytest.mark.parametrize("layers", [(), ("albedo",), ("normal",), ("albedo", "normal")])

@@ -65,6 +65,18 @@ CONFIGS = {
         optional=("albedo", "normal"),
         emission=True,
     ),
+    "by a pyramid of kernels": ModelConfig(
+        *("dense", (4, 6, 6), (1, 1, 1), ("primal", "albedo", "normal")),
+        start=("primal",),
+        kernel=3,
+        scales=3,
+        demodulate=True,
+        optional=("albedo", "normal"),
+        emission=True,
+    ),
+    "by a pyramid, colour alone": ModelConfig(
+        "dense", (4, 6), (1, 1), ("primal",), start=("primal",), kernel=5, scales=2, emission=True
+    ),
     "primal alone": ModelConfig("plain", (4, 4, 4, 4, 4), (), ("primal",)),
 }
 
@@ -135,7 +147,7 @@ def other_denoiser(monkeypatch):
 
     def images(layers):
         data = repair(stack_of(layers))
-        made = inputs.denoised(data, reconstruct(stack_of(layers), "wcv").image, inputs.DENOISED)
+        made = inputs.denoised(inputs.Oidn(data), reconstruct(stack_of(layers), "wcv").image, inputs.DENOISED)
         return {name: np.ascontiguousarray(image.transpose(2, 0, 1)[None]) for name, image in made.items()}
 
     return images

@@ -5,7 +5,7 @@ import torch
 from torch.nn.functional import avg_pool2d
 
 from ngpt.errors import NgptError
-from ngpt.network.heads import Direct, Kernels, Mixture, Residual, head_of
+from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual, head_of
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.run_torch import reconstruct
 from ngpt.network.transfer import signed_exp, signed_log
@@ -113,6 +113,120 @@ def test_kernels_learn_to_average_within_edges(tmp_path):
     again, _ = load_weights(tmp_path / "w.safetensors")
     with torch.no_grad():
         assert again.config == model.config and torch.equal(again(layers), model(layers))
+
+
+def pyramid(demodulate=False, size=3, scales=3):
+    return Pyramid(("primal",), size, scales, demodulate)
+
+
+def everywhere(head, trust=0.0, share=0.0, blend=0.0, size=(16, 24)):
+    """A prediction of flat kernels with the same trust, shares and blend in every pixel."""
+    prediction = torch.zeros(1, head.outputs, *size)
+    taps = head.size**2
+    for scale in range(head.scales - 1):
+        prediction[:, 1 + scale * (taps + 1) + taps] = share
+    prediction[:, 0], prediction[:, -1] = trust, blend
+    return prediction
+
+
+@pytest.mark.parametrize("trust", [-50.0, 0.0, 50.0])
+def test_a_pyramid_leaves_a_plain_image_as_it_is(trust):
+    """To the border, beyond which there is nothing to average."""
+    image = torch.full((1, 3, 16, 24), 7.0)
+    head = pyramid()
+    assert torch.allclose(of_kernels(everywhere(head, trust), [image], head), image, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("scales", "least", "most"), [(2, 0.6, 0.8), (4, 0.3, 0.65)])
+def test_coarse_pixels_replace_what_fine_ones_average_to(scales, least, most):
+    """Shares of 0 leave the mean over the finest kernel; with 1 its low frequencies come from the coarsest."""
+    torch.manual_seed(0)
+    head = pyramid(scales=scales)
+    image = torch.rand(1, 3, 32, 32)
+    fine = of_kernels(everywhere(head, share=-50, size=(32, 32)), [image], head)
+    # Trust is over 1 + brightness.
+    weight = 1 / (1 + image.mean(1, keepdim=True))
+    inside = avg_pool2d(image * weight, 3, 1) / avg_pool2d(weight, 3, 1)
+    assert torch.allclose(fine[..., 1:-1, 1:-1], inside, rtol=1e-4)
+    coarse = of_kernels(everywhere(head, share=50, size=(32, 32)), [image], head)
+    assert least < coarse.std() / fine.std() < most
+
+
+def test_a_pixel_that_is_not_trusted_lights_no_other():
+    head = pyramid(size=5)
+    image = torch.ones(1, 3, 16, 24)
+    image[..., 8, 9] = 1e6
+    prediction = everywhere(head, trust=50, share=0)
+    prediction[:, 0, 8, 9] = -50
+    assert (of_kernels(prediction, [image], head) - 1).abs().max() < 2e-3
+    prediction[:, 0, 8, 9] = 50
+    assert of_kernels(prediction, [image], head).max() > 1.01
+
+
+def test_texture_of_the_albedo_is_not_averaged():
+    torch.manual_seed(0)
+    head = pyramid(demodulate=True)
+    albedo = 0.05 + 0.9 * torch.rand(1, 3, 16, 24)
+    image = 3 * albedo
+    assert head.reads == ("primal", "reflectance")
+    kept = of_kernels(everywhere(head, blend=50), [image, albedo], head)
+    lost = of_kernels(everywhere(head, blend=-50), [image, albedo], head)
+    assert torch.allclose(kept, image, rtol=1e-4) and (lost - image).abs().mean() > 0.3
+
+
+@pytest.mark.parametrize("demodulate", [False, True])
+def test_tiles_of_a_pyramid_do_not_show(demodulate):
+    torch.manual_seed(0)
+    model = Reconstructor(of_a_pyramid(demodulate)).eval()
+    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.5)
+    layers = {name: torch.rand(1, 3, 60, 150) for name in model.config.inputs}
+    with torch.no_grad():
+        assert torch.allclose(reconstruct(model, layers, tile=96), model(layers), rtol=1e-5, atol=1e-6)
+
+
+def of_a_pyramid(demodulate=True, **changes):
+    config = {"inputs": ("primal", "albedo"), "start": ("primal",), "kernel": 3, "scales": 3, **changes}
+    return ModelConfig("plain", (6, 6, 6), (), demodulate=demodulate, **config)
+
+
+def test_a_pyramid_learns(tmp_path):
+    """Noise on a wall whose paint changes in each pixel: far below what averages without the albedo reach."""
+    torch.manual_seed(0)
+    model = Reconstructor(of_a_pyramid())
+    albedo = 0.05 + 0.9 * torch.rand(1, 3, 32, 32)
+    clean = albedo * 4
+    layers = {"primal": clean * (1 + 0.6 * torch.randn(clean.shape)).clamp(min=0.1), "albedo": albedo}
+
+    def loss():
+        return (signed_log(model(layers)) - signed_log(clean)).square().mean()
+
+    noise = (signed_log(layers["primal"]) - signed_log(clean)).square().mean().item()
+    optimizer = torch.optim.Adam(model.parameters(), 1e-2)
+    for _ in range(60):
+        optimizer.zero_grad()
+        loss().backward()
+        optimizer.step()
+    assert loss().item() < 0.1 * noise
+    save_weights(tmp_path / "w.safetensors", model, {})
+    again, _ = load_weights(tmp_path / "w.safetensors")
+    with torch.no_grad():
+        assert again.config == model.config and torch.equal(again(layers), model(layers))
+
+
+@pytest.mark.parametrize(
+    "changes, message",
+    [
+        ({"scales": 0}, "must be from 1 to the 3 levels of the network"),
+        ({"scales": 4}, "must be from 1 to the 3 levels of the network"),
+        ({"kernel": 1}, "kernels of 3 pixels or more of one image"),
+        ({"start": ()}, "there is no image to average"),
+        ({"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
+        ({"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
+    ],
+)
+def test_pyramids_that_cannot_be(changes, message):
+    with pytest.raises(NgptError, match=message):
+        of_a_pyramid(**changes)
 
 
 def test_settings_name_the_size_of_kernels():

@@ -40,7 +40,7 @@ def test_networks_are_shipped():
 @pytest.mark.parametrize("name", SHIPPED)
 def test_a_method_needs_what_its_weights_read_and_says_how_they_were_made(name):
     model, header = load_weights(TWINS / f"{name}.safetensors")
-    assert set(METHODS[name].needs) == set(model.config.needs)
+    assert {*METHODS[name].needs, *METHODS[name].estimates} == set(model.config.needs)
     assert set(METHODS[name].uses) == set(model.config.optional)
     assert {"step", "hours", "settings", "torch", "version"} <= header["training"].keys()
     assert "/" not in str(header["training"]["settings"]["data"]["folders"]), "paths of the machine it was trained on"

@@ -51,6 +51,25 @@ def folder(tmp_path, rng):
     return tmp_path, given
 
 
+def test_inputs_without_gradients(tmp_path, rng):
+    crop = crop_data(rng)
+    bare = [
+        GradientStack({name: stack[name] for name in stack.names if not name.startswith(("dx", "dy"))})
+        for stack in crop.stacks
+    ]
+    path = tmp_path / "a.safetensors"
+    write_shard(path, [CropData(bare, crop.spp, crop.reference, crop.reference_direct)], {"scene": "a"})
+    assert not {"dx", "dy", "dx_se", "dy_se"} & set(Shard(path).names)
+    told = [{"spp": list(crop.spp), "seconds": {"inputs": 1.0}}]
+    entry = {"file": path.name, "sha256": hashlib.sha256(path.read_bytes()).hexdigest(), "scene": "a", "crops": told}
+    entry |= {"bytes": path.stat().st_size, "failures": []}
+    manifest = {"format": FORMAT, "version": VERSION, "config": {}, "planned": 1, "shards": [entry]}
+    (tmp_path / "manifest.json").write_text(json.dumps(manifest))
+    read = Dataset(tmp_path)[0].stack(1)
+    assert sorted(read.names) == sorted(bare[1].names)
+    np.testing.assert_allclose(read["primal"], bare[1]["primal"], rtol=2e-3)
+
+
 def test_what_is_written_is_read_back(folder):
     path, given = folder
     data = pickle.loads(pickle.dumps(Dataset(path)))

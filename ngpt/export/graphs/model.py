@@ -63,8 +63,11 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
     prediction = graph.include(network, "network/", op.Concat(*padded, axis=1))
 
     head = config.head
-    images = [mirror.around(scaled[name], head.radius) for name in head.start]
-    logarithm = head.graph(_OperatorsOfHeads(), mirror.crop(prediction), images)
+    read = dict(scaled)
+    if "reflectance" in head.reads:
+        read["reflectance"] = features.reflectance(scaled["albedo"])
+    images = [mirror.extended(read[name], head.radius) for name in head.reads]
+    logarithm = mirror.crop(head.graph(_OperatorsOfHeads(), prediction, images))
     if config.quiet:
         base = signed_log(scaled["base"])
         share = mirror.crop(_share(mirror, scaled["primal_se"], scaled["base"], config.quiet))

@@ -43,14 +43,15 @@ class Mirror:
         down = op.Gather(layer, self.rows.nearest, axis=2) * (step if signed else abs(step))
         return op.Gather(down, self.columns.here, axis=3)
 
-    def crop(self, image: Value, around: int = 0) -> Value:
-        """What was padded, with so many pixels of the padding left on every side."""
+    def crop(self, image: Value) -> Value:
+        """What was padded, without the padding."""
         sizes = op.Concat(op.Reshape(self.rows.size, [1]), op.Reshape(self.columns.size, [1]), axis=0)
-        return op.Slice(image, [MARGIN - around] * 2, sizes + [MARGIN + around] * 2, [2, 3])
+        return op.Slice(image, [MARGIN] * 2, sizes + [MARGIN] * 2, [2, 3])
 
-    def around(self, image: Value, radius: int) -> Value:
-        """An image with ``radius`` reflected pixels on every side, at most ``MARGIN``."""
-        return self.crop(self.pad(image), radius) if radius else image
+    def extended(self, image: Value, radius: int) -> Value:
+        """An image padded, with ``radius`` more pixels on every side, see ``ngpt.network.padding.extended``."""
+        padded = self.pad(image)
+        return op.Pad(padded, [radius] * 4, None, [2, 3], mode="edge") if radius else padded
 
 
 def _side(size: Value, alignment: int) -> Side:

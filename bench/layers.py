@@ -1,0 +1,211 @@
+"""What `auto` takes of the layers of a stack, and the error it leaves: the tables of docs/RESULTS.md ("By the layers of
+a stack") and docs/from-your-renderer.md ("What auto takes").
+
+    python -m bench.layers --cache /tmp/stacks --scenes diffuse glossy environment lens SCENE.xml ...
+
+Renders stacks with gradients and references (kept in the cache folder), measures what `auto` takes of every choice of
+their layers, with OIDN and without, and of files with the layer names of each renderer. Writes ngpt/measure/layers.json
+and prints both tables as Markdown. Errors are geometric means of the trimmed relMSE over the scenes.
+"""
+
+import argparse
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+import ngpt
+from bench.common import metadata
+from bench.methods import cached
+from ngpt.evaluation.config import scene_name
+from ngpt.io.exr import read
+from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.measure.gains import cases
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+from ngpt.system.writing import write_json
+
+TABLE = Path(__file__).parents[1] / "ngpt" / "measure" / "layers.json"
+SPP, SIZE, REFERENCE_SPP = (4, 16, 64), (192, 108), 2048
+# Of the table of renderers.
+RENDERER_SPP = 16
+
+# Renderer -> layer -> what its channels are called: the prefix, and what follows its dot.
+RENDERERS: dict[str, dict[str, tuple[str, str]]] = {
+    "Cycles": {
+        "primal": ("ViewLayer.Noisy Image", "RGB"),
+        "albedo": ("ViewLayer.Denoising Albedo", "RGB"),
+        "normal": ("ViewLayer.Denoising Normal", "XYZ"),
+        "depth": ("ViewLayer.Denoising Depth", "Z"),
+    },
+    "Arnold": {"primal": ("", "RGB"), "albedo": ("denoise_albedo", "RGB"), "normal": ("N", "XYZ"), "depth": ("", "Z")},
+    "V-Ray": {"primal": ("", "RGB"), "albedo": ("VRayDiffuseFilter", "RGB"), "normal": ("VRayBumpNormals", "RGB")},
+    "RenderMan": {
+        "primal": ("Ci", "rgb"),
+        "albedo": ("albedo", "rgb"),
+        "normal": ("normal", "xyz"),
+        "depth": ("zfiltered", ""),
+    },
+    "pbrt-v4": {"primal": ("", "RGB"), "albedo": ("Albedo", "RGB"), "normal": ("Ns", "XYZ")},
+    "Mitsuba 3": {"primal": ("", "RGB"), "albedo": ("albedo", "RGB"), "normal": ("nn", "XYZ"), "depth": ("dd.y", "T")},
+    "Redshift": {
+        "primal": ("", "RGB"),
+        "albedo": ("DiffuseFilter", "RGB"),
+        "normal": ("BumpNormals", "RGB"),
+        "depth": ("", "Z"),
+    },
+    "Karma": {"primal": ("C", "RGB"), "albedo": ("albedo", "RGB"), "normal": ("N", "XYZ")},
+}
+# Our own names, which any renderer may write.
+OWN = {name: (name, "Z" if name == "depth" else "XYZ" if name == "normal" else "RGB") for name in ngpt.layers.LAYERS}
+FEATURES, GRADIENTS, VARIANCES = ("albedo", "normal", "depth"), ("dx", "dy"), ("primal_var", "dx_var", "dy_var")
+CHOICES: tuple[tuple[str, ...], ...] = (
+    (),
+    ("albedo",),
+    ("albedo", "normal"),
+    FEATURES,
+    (*FEATURES, "primal_var"),
+    GRADIENTS,
+    (*GRADIENTS, *VARIANCES),
+    (*FEATURES, *GRADIENTS),
+    (*FEATURES, *GRADIENTS, *VARIANCES),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """A renderer's file with some layers beside the colour: what `auto` took, and mean errors over the scenes.
+
+    ``oidn``   whether OIDN was there
+    ``error``  of what `auto` gave; ``by_oidn``: of `oidn` on the same file, None without it; ``before``: of the input
+    """
+
+    renderer: str
+    layers: tuple[str, ...]
+    oidn: bool
+    method: str
+    error: float
+    by_oidn: float | None
+    before: float
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--cache", type=Path, required=True, help="folder for the rendered stacks and references")
+    parser.add_argument("--scenes", nargs="+", default=["diffuse", "glossy", "environment", "lens"])
+    parser.add_argument("--size", type=int, nargs=2, default=SIZE, metavar=("WIDTH", "HEIGHT"))
+    args = parser.parse_args()
+
+    from data_gen.backend import use_variant
+
+    use_variant()
+    args.cache.mkdir(parents=True, exist_ok=True)
+    truth = {s: cached(s, REFERENCE_SPP, "primal", 1, args)["primal"] for s in args.scenes}
+    stacks = {n: [(cached(s, n, "auto", 0, args), truth[s]) for s in args.scenes] for n in SPP}
+    rows = [
+        {"method": method, "layers": layers, "error": [error_of(stacks[n], method, layers) for n in SPP]}
+        for method, layers in sorted({("primal", ("primal",)), *cases()}, key=lambda case: (len(case[1]), case))
+    ]
+    about = {"scenes": [scene_name(s) for s in args.scenes], "size": list(args.size), "spp": list(SPP)}
+    write_json(TABLE, {**about, "rows": rows, "metadata": metadata("mitsuba", "mitsuba-oidn")})
+    print(by_layers(rows) + "\n")
+    with tempfile.TemporaryDirectory() as folder:
+        print(by_renderer(renderers(stacks[RENDERER_SPP], Path(folder))))
+
+
+def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, layers: Sequence[str]) -> float:
+    """The geometric mean over (stack, reference) of what a method leaves of these layers."""
+    return mean(relmse_trimmed(reconstruct(part(stack, layers), method).image, truth) for stack, truth in scenes)
+
+
+def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
+    """The stack with these layers only; the emission that samplers of gradients keep apart stays with gradients."""
+    direct = ("direct",) if "dx" in layers and "direct" in stack else ()
+    return GradientStack({name: stack[name] for name in (*layers, *direct)})
+
+
+def renderers(scenes: Sequence[tuple[GradientStack, np.ndarray]], folder: Path) -> list[Row]:
+    """A row for each renderer, each choice of layers that it writes, and with and without OIDN."""
+    rows, known = [], {}
+    for renderer, names in {**RENDERERS, "any, by our names": OWN}.items():
+        for layers in CHOICES:
+            held = ("primal", *layers)
+            # Layers of any renderer are measured by the names of one.
+            if not set(held) <= names.keys() or (names is OWN and "dx" not in layers and "primal_var" not in layers):
+                continue
+            files = [(written(folder / "stack.exr", stack, names, held), truth) for stack, truth in scenes]
+            for oidn in (True, False):
+                if oidn and METHODS["oidn"].missing():
+                    continue
+                key = held, oidn, tuple(stack.names for stack, _ in files)
+                if key not in known:
+                    known[key] = measured(files, oidn)
+                rows.append(Row(renderer, layers, oidn, *known[key]))
+    return rows
+
+
+def written(
+    path: Path, stack: GradientStack, names: dict[str, tuple[str, str]], layers: Sequence[str]
+) -> GradientStack:
+    """These layers as they come back from a file with the names of a renderer."""
+    channels = {}
+    for layer in layers + (("direct",) if "dx" in layers and "direct" in stack else ()):
+        prefix, suffixes = names[layer]
+        keys = [".".join(filter(None, (prefix, suffix))) for suffix in suffixes or [""]]
+        channels |= {key: np.ascontiguousarray(stack[layer][..., i]) for i, key in enumerate(keys)}
+    write_exr(path, ExrImage([ExrPart("", {}, channels)]), overwrite=True)
+    return read(path)
+
+
+def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> tuple[str, float, float | None, float]:
+    """The method that `auto` took, its error, that of `oidn` if it is there, and that of the input."""
+
+    def error(method: str) -> tuple[str, float]:
+        results = [reconstruct(stack, method) for stack, _ in files]
+        errors = (relmse_trimmed(result.image, truth) for result, (_, truth) in zip(results, files, strict=True))
+        return results[0].method, mean(errors)
+
+    with hidden_oidn() if not oidn else patch.dict({}):
+        method, left = error("auto")
+        return method, left, error("oidn")[1] if oidn else None, error("primal")[1]
+
+
+def hidden_oidn():
+    """As if OIDN were not installed."""
+    return patch("ngpt.denoisers.oidn.find_spec", lambda name: None)
+
+
+def mean(values) -> float:
+    return float(np.exp(np.mean(np.log(list(values)))))
+
+
+def by_layers(rows: list[dict]) -> str:
+    lines = [
+        f"| layers that it takes | method | {' | '.join(f'{n} spp' for n in SPP)} |",
+        "|---|---|" + "--:|" * len(SPP),
+    ]
+    for row in rows:
+        cells = " | ".join(f"{error:.4f}" for error in row["error"])
+        lines.append(f"| {', '.join(row['layers'])} | `{row['method']}` | {cells} |")
+    return "\n".join(lines)
+
+
+def by_renderer(rows: list[Row]) -> str:
+    """Markdown: renderers whose files gave the same share a line."""
+    heads = ["layers beside colour", "with OIDN", "error", "of `oidn`", "without", "error", "of the input", "names of"]
+    lines: dict[str, list[str]] = {}
+    for row in (row for row in rows if not row.oidn):
+        there = [r for r in rows if r.oidn and (r.renderer, r.layers) == (row.renderer, row.layers)]
+        with_oidn = [(f"`{r.method}`", f"{r.error:.4f}", f"{r.by_oidn:.4f}") for r in there]
+        cells = [", ".join(row.layers) or "none", *(with_oidn or [("", "", "")])[0], f"`{row.method}`"]
+        lines.setdefault(" | ".join([*cells, f"{row.error:.4f}", f"{row.before:.4f}"]), []).append(row.renderer)
+    table = [f"| {cells} | {', '.join(names)} |" for cells, names in lines.items()]
+    return "\n".join([f"| {' | '.join(heads)} |", "|---|---|--:|--:|---|--:|--:|---|", *table])
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""What a page shows: pictures of scenes, what was measured of them, and what comes after."""
+
+import math
+import statistics
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+REFERENCE = "reference"  # the name of Scene.reference among the pictures
+BASELINE = "primal"  # what tables compare the others to; the first picture where none has that name
+
+
+@dataclass
+class Entry:
+    """One picture of a scene: what a method made of it, or what was in a file."""
+
+    name: str  #                  'primal', 'l2', ...: unique in its scene
+    image: np.ndarray  #          (H, W, 3) scene-linear, any value, non-finite ones included
+    seconds: float | None = None  # reconstruction time
+    # e.g. {'relMSE': 0.012}, or one value per seed, of which the table shows the median and the range
+    metrics: Mapping[str, float | Sequence[float]] = field(default_factory=dict)
+    # Maps of the difference to the reference by name, (H, W) from 0, equal, to 1: 'FLIP', 'SSIM'
+    maps: dict[str, np.ndarray] = field(default_factory=dict)
+
+
+@dataclass
+class Scene:
+    """One tab of the report. All arrays have the same height and width."""
+
+    name: str
+    caption: str  # one line, e.g. 'diffuse room, 128x128, 16 spp, render 1.2 s'
+    reference: np.ndarray | None  # (H, W, 3) scene-linear
+    entries: list[Entry]
+    # Extra views, (H, W), (H, W, 1) or (H, W, 3): 'dx', 'dy', 'normal' and 'depth' get a map of their own, the others
+    # show as colour.
+    layers: dict[str, np.ndarray] = field(default_factory=dict)
+    rising: Collection[str] = ()  # the metrics of which more is better; every other is an error
+
+    @property
+    def pictures(self) -> list[tuple[str, np.ndarray]]:
+        """Everything with light in it, in the order of the page: the entries, then the reference."""
+        pictures = [(entry.name, np.asarray(entry.image)) for entry in self.entries]
+        return pictures if self.reference is None else [*pictures, (REFERENCE, np.asarray(self.reference))]
+
+    @property
+    def baseline(self) -> Entry:
+        """The entry that the others are compared to."""
+        return next((entry for entry in self.entries if entry.name == BASELINE), self.entries[0])
+
+    def best(self, metric: str) -> int | None:
+        """The index of the entry with the best finite value, or None."""
+        values = [(median(entry.metrics.get(metric, math.nan)), row) for row, entry in enumerate(self.entries)]
+        values = [(-value if metric in self.rising else value, row) for value, row in values if math.isfinite(value)]
+        return min(values)[1] if values else None
+
+
+@dataclass
+class Overview:
+    """What comes after the scenes, all optional."""
+
+    tables: dict[str, list[list[str]]] = field(default_factory=dict)  # title -> rows of text, the first is the head
+    plots: dict[str, str] = field(default_factory=dict)  # title -> SVG document
+    formulas: dict[str, str] = field(default_factory=dict)  # metric -> its formula in plain text
+
+
+def median(values: float | Sequence[float]) -> float:
+    """The median over seeds; NaN if one of them is not finite, since that seed failed."""
+    values = [values] if isinstance(values, int | float | np.number) else list(values)
+    return statistics.median(values) if values and all(map(math.isfinite, values)) else math.nan

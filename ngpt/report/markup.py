@@ -1,0 +1,144 @@
+"""The markup of a page: figures with their names, tables of what was measured, and the overview."""
+
+import base64
+import math
+from collections.abc import Mapping, Sequence
+from html import escape
+
+import numpy as np
+
+from ngpt.report import display
+from ngpt.report.content import Overview, Scene, median
+from ngpt.report.png import encode_palette_png, encode_png
+
+THUMBNAIL_WIDTH = 240
+NOTHING = "&ndash;"
+
+
+def section(number: int, scene: Scene, stops: float) -> str:
+    """All of one scene but the pixels; ``stops`` is the exposure of its small pictures."""
+    first = next(iter(scene.entries[0].metrics), "")
+    notes = {
+        entry.name: _note(first, median(entry.metrics[first])) if first in entry.metrics else ""
+        for entry in scene.entries
+    }
+    maps = {entry.name: entry.maps for entry in scene.entries}
+    measured = any(entry.metrics or entry.seconds is not None for entry in scene.entries)
+    pictures = [
+        _figure(
+            name,
+            display.thumbnail(display.to_srgb8(image, stops), THUMBNAIL_WIDTH),
+            notes.get(name, ""),
+            maps.get(name, {}),
+        )
+        for name, image in scene.pictures
+    ]
+    # Layers are shown in full, not as thumbnails: the page has no other copy of them.
+    layers = [_figure(name, display.layer_view(name, layer)) for name, layer in scene.layers.items()]
+    parts = [
+        f'<section class="scene" id="scene-{number}">',
+        f"<h2>{escape(scene.name)}</h2>",
+        f'<p class="caption">{escape(scene.caption)}</p>',
+        '<div class="slot"></div>',
+        '<h3>Pictures</h3><div class="thumbs">' + "".join(pictures) + "</div>",
+        "<h3>Measurements</h3>" + _table(scene) if measured else "",
+        '<h3>Input layers</h3><div class="thumbs">' + "".join(layers) + "</div>" if layers else "",
+        "</section>",
+    ]
+    return "\n".join(part for part in parts if part)
+
+
+def _figure(name: str, picture: np.ndarray, note: str = "", maps: Mapping[str, np.ndarray] | None = None) -> str:
+    height, width = picture.shape[:2]
+    source = "data:image/png;base64," + base64.b64encode(encode_png(picture)).decode()
+    hidden = "".join(f'<img hidden alt="" data-map="{escape(key)}" src="{_map(m)}">' for key, m in (maps or {}).items())
+    small = ' class="pixelated"' if width <= THUMBNAIL_WIDTH // 2 else ""
+    return (
+        f'<figure data-name="{escape(name)}"><div class="frame">'
+        f'<img{small} width="{width}" height="{height}" alt="{escape(name)}" src="{source}">{hidden}'
+        f"</div><figcaption><b>{escape(name)}</b>{note}</figcaption></figure>"
+    )
+
+
+def _map(values: np.ndarray) -> str:
+    """A map of differences as a picture in the colours of the heat table; what is not a number is worst."""
+    places = np.rint(255 * np.clip(np.nan_to_num(values, nan=1.0), 0.0, 1.0)).astype(np.uint8)
+    return "data:image/png;base64," + base64.b64encode(encode_palette_png(places, display.heat_table())).decode()
+
+
+def _note(metric: str, value: float) -> str:
+    return f"<small>{escape(metric)} {_number(value)}</small>"
+
+
+def _table(scene: Scene) -> str:
+    """Pictures down, metrics and seconds across; the best value is bold, all are compared to those of one picture."""
+    metrics = list(dict.fromkeys(metric for entry in scene.entries for metric in entry.metrics))
+    best = {metric: scene.best(metric) for metric in metrics}
+    baseline = scene.baseline
+    timed = any(entry.seconds is not None for entry in scene.entries)
+    heads = [
+        f'<th scope="col">{escape(metric)} <i>{"↑" if metric in scene.rising else "↓"}</i><small></small></th>'
+        for metric in metrics
+    ]
+    rows = []
+    for row, entry in enumerate(scene.entries):
+        cells = []
+        for metric in metrics:
+            values = entry.metrics.get(metric, math.nan)
+            value, primal = median(values), median(baseline.metrics.get(metric, math.nan))
+            compared = "" if entry is baseline else _compared(value, primal, metric in scene.rising)
+            mark = ' class="best"' if best[metric] == row else ""
+            cells.append(f"<td{mark}><span>{_number(value)}</span>{_spread(values)}<small>{compared}</small></td>")
+        seconds = NOTHING if entry.seconds is None else f"{entry.seconds:.3g} s"
+        cells += [f"<td><span>{seconds}</span></td>"] if timed else []
+        rows.append(f'<tr><th scope="row">{escape(entry.name)}</th>{"".join(cells)}</tr>')
+    heads += ['<th scope="col">time</th>'] if timed else []
+    head = f'<tr><th scope="col">picture</th>{"".join(heads)}</tr>'
+    comparison = f"&times; ratio to {escape(baseline.name)} (&plusmn; difference)"
+    legend = f"↓ lower is better, ↑ higher is better; bold: best; {comparison}"
+    return (
+        f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
+        f'<p class="hint">{legend}</p>'
+    )
+
+
+def _spread(values: float | Sequence[float]) -> str:
+    """The lowest and the highest of several seeds."""
+    if isinstance(values, int | float | np.number) or len(values) < 2:
+        return ""
+    return f'<small class="spread">{_number(min(values))} &hellip; {_number(max(values))}</small>'
+
+
+def overview_html(overview: Overview) -> str:
+    """Plots, tables and formulas, each under its title."""
+    parts = []
+    for title, svg in overview.plots.items():
+        # As a picture of its own, so that no script or link in it does anything.
+        data = base64.b64encode(svg.encode()).decode()
+        image = f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{data}">'
+        parts.append(f'<figure class="plot">{image}<figcaption><b>{escape(title)}</b></figcaption></figure>')
+    plots = '<h3>Plots</h3><div class="plots">' + "".join(parts) + "</div>" if parts else ""
+    tables = "".join(f"<h3>{escape(title)}</h3>{_plain_table(rows)}" for title, rows in overview.tables.items())
+    formulas = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in overview.formulas.items())
+    formulas = f'<h3>Metrics</h3><dl class="formulas">{formulas}</dl>' if formulas else ""
+    body = tables + plots + formulas
+    return f'<details id="overview" open><summary>Overview</summary>{body}</details>' if body else ""
+
+
+def _plain_table(rows: list[list[str]]) -> str:
+    head, *body = [[escape(cell) for cell in row] for row in rows]
+    lines = [f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{c}</td>" for c in row[1:]) + "</tr>" for row in body]
+    heads = "".join(f'<th scope="col">{cell}</th>' for cell in head)
+    return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'
+
+
+def _compared(value: float, baseline: float, rising: bool) -> str:
+    if not (math.isfinite(value) and math.isfinite(baseline)):
+        return ""
+    if rising:  # decibels and similarities have no meaningful ratio
+        return f"{value - baseline:+.2f}"
+    return f"&times;{value / baseline:.2g}" if baseline > 0.0 else ""
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else NOTHING

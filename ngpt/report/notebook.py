@@ -1,0 +1,39 @@
+"""How a gradient stack shows itself in a notebook: a small picture and a table, as HTML without style or script."""
+
+import base64
+from collections.abc import Mapping
+from html import escape
+
+import numpy as np
+
+from ngpt.report import display
+from ngpt.report.png import encode_png
+
+WIDTH = 160  # pixels of the picture
+
+
+def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
+    """``title``, a picture of the first of the ``layers`` (H, W, C), and the least, mean and largest value of each.
+
+    Values count where they are finite; the last column says how many pixels have one that is not.
+    """
+    name, image = next(iter(layers.items()))
+    # Of a large image some pixels will do: it should show at once.
+    step = max(1, image.shape[1] // (4 * WIDTH))
+    picture = encode_png(display.thumbnail(display.layer_view(name, image[::step, ::step]), WIDTH))
+    source = "data:image/png;base64," + base64.b64encode(picture).decode()
+    rows = "".join(_row(name, layer) for name, layer in layers.items())
+    heads = "".join(f"<th>{head}</th>" for head in ("layer", "min", "mean", "max", "pixels not finite"))
+    return (
+        f"<p>{escape(title)}</p>"
+        f'<img alt="{escape(name)}" src="{source}">'
+        f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
+    )
+
+
+def _row(name: str, layer: np.ndarray) -> str:
+    finite = np.isfinite(layer)
+    values = layer[finite]
+    numbers = [values.min(), values.mean(dtype=np.float64), values.max()] if values.size else [np.nan] * 3
+    cells = [*(f"{number:.4g}" for number in numbers), str(np.count_nonzero(~finite.all(axis=-1)))]
+    return f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"

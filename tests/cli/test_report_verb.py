@@ -1,0 +1,106 @@
+"""``ngpt report``: images of any renderers on one page, their names, their errors, and what cannot be compared."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+
+from ngpt.cli import main
+from ngpt.io.exr import write, write_exr
+from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.measure.metrics import METRICS
+
+
+@pytest.fixture
+def image(rng):
+    return rng.gamma(2.0, 0.5, (24, 32, 3)).astype(np.float32)
+
+
+def facts(page):
+    """What the page's script is told of its scene."""
+    return json.loads(re.search(r'id="page">(.*?)</script>', page.read_text()).group(1))["scenes"][0]
+
+
+def test_images_of_two_renderers_on_one_page(tmp_path, image, capfd):
+    pytest.importorskip("skimage")
+    pytest.importorskip("flip_evaluator")
+    channels = {f"ViewLayer.Combined.{c}": image[:, :, i] * np.float32(1.2) for i, c in enumerate("RGB")}
+    write_exr(tmp_path / "cycles.exr", ExrImage([ExrPart("", {}, channels)]))
+    write(tmp_path / "mine.exr", image * np.float32(1.1))
+    write(tmp_path / "truth.exr", image)
+    page = tmp_path / "page.html"
+    words = [str(tmp_path / name) for name in ("cycles.exr", "mine.exr")]
+    assert main(["report", *words, "--ref", str(tmp_path / "truth.exr"), "-o", str(page)]) == 0
+    output, messages = capfd.readouterr()
+    shown = facts(page)
+    assert shown["pictures"] == ["cycles", "mine", "reference"] and shown["maps"] == ["SSIM", "FLIP"]
+    assert (shown["a"], shown["b"], shown["width"], shown["height"]) == ("cycles", "mine", 32, 24)
+    table = {line.split()[0]: [float(word) for word in line.split()[1:]] for line in output.splitlines()[1:]}
+    for name, factor in (("cycles", np.float32(1.2)), ("mine", np.float32(1.1))):
+        expected = METRICS["relMSE"].function(image * factor, image)
+        assert table[name][0] == pytest.approx(expected, rel=1e-3)
+    assert table["cycles"][5] > table["mine"][5] > 0  # FLIP
+    assert METRICS["FLIP"].formula in page.read_text() and "data-map=" in page.read_text()
+    assert messages.endswith(f"{page}: open it in a browser\n") and "errors: 2/2 images" in messages
+
+
+def test_without_a_reference_there_is_nothing_to_measure(tmp_path, image, capfd):
+    write(tmp_path / "a.exr", image)
+    assert main(["report", "-q", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]) == 0
+    shown = facts(tmp_path / "page.html")
+    assert shown["pictures"] == ["a"] and not shown["reference"] and shown["maps"] == []
+    text = (tmp_path / "page.html").read_text()
+    assert "no reference: with --ref" in text and "<h3>Measurements</h3>" not in text
+    assert capfd.readouterr() == ("", "")
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
+    for folder in ("spp16", "spp64"):
+        (tmp_path / folder).mkdir()
+        write(tmp_path / folder / "reference.exr", image)
+    words = [str(tmp_path / folder / "reference.exr") for folder in ("spp16", "spp64")]
+    assert main(["report", *words, "--ref", words[1], "-o", str(tmp_path / "page.html")]) == 0
+    assert facts(tmp_path / "page.html")["pictures"] == ["spp16/reference", "spp64/reference", "reference"]
+
+
+def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, image, capfd):
+    write(tmp_path / "a.exr", image)
+    write(tmp_path / "small.exr", image[:20])
+    write(tmp_path / "nothing.exr", image * np.float32(np.nan))
+    a, small, nothing = (str(tmp_path / name) for name in ("a.exr", "small.exr", "nothing.exr"))
+    page = tmp_path / "page.html"
+
+    def refused(*words):
+        assert main(["report", "-q", *words, "-o", str(page)]) == 2
+        _, message = capfd.readouterr()
+        assert message.count("\n") == 1 and not page.exists()
+        return message
+
+    assert f"{small} is 32x20 but {a} is 32x24; render or crop them to one size" in refused(a, small)
+    assert f"{small} is 32x20 but {a} is 32x24" in refused(a, "--ref", small)
+    assert f"{a}: is given twice" in refused(a, a)
+    assert f"{nothing} and {a}: none of 768 pixels is finite in both images" in refused(nothing, "--ref", a)
+    assert "nowhere.exr" in refused("nowhere.exr")
+    page.touch()
+    assert main(["report", a, "-o", str(page)]) == 2
+    assert "exists already" in capfd.readouterr().err and page.read_text() == ""
+
+
+def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
+    monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda module: None)
+    write(tmp_path / "a.exr", image * 4)
+    write(tmp_path / "truth.exr", image)
+    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
+    assert main(["report", *words]) == 0
+    output, messages = capfd.readouterr()
+    assert "FLIP needs flip-evaluator: pip install 'ngpt-recon[peers]'" in messages and "FLIP" not in output
+    assert "a.exr: 2.0 stops brighter than" in messages
+    assert facts(tmp_path / "page.html")["maps"] == []
+
+
+def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
+    write(tmp_path / "a.exr", image[:5, :7])
+    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]
+    assert main(["report", *words]) == 0
+    assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err

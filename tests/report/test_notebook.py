@@ -1,0 +1,68 @@
+"""What a notebook shows of a stack, and the tutorial, which runs as it is."""
+
+import ast
+import base64
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.stack import GradientStack
+
+TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
+
+
+def rows(html):
+    """Layer -> the texts of its cells."""
+    found = re.findall(r"<tr><th>([^<]*)</th>((?:<td>[^<]*</td>)+)</tr>", html)
+    return {name: re.findall(r"<td>([^<]*)", cells) for name, cells in found}
+
+
+def test_a_stack_shows_a_picture_and_the_range_of_its_layers():
+    primal = np.full((40, 700, 3), 0.25, np.float32)
+    primal[3, 4] = [np.nan, 1.0, 0.0]
+    dx = np.full((40, 700, 3), -0.5, np.float32)
+    stack = GradientStack.from_arrays(primal=primal, dx=dx, attributes={"ngpt:spp": 16}, path="<b>.exr")
+    html = stack._repr_html_()
+    assert rows(html) == {"primal": ["0", "0.25", "1", "1"], "dx": ["-0.5", "-0.5", "-0.5", "0"]}
+    assert "GradientStack &lt;b&gt;.exr, 700x40, 16 spp" in html and "<b>" not in html
+    assert repr(stack) == "<GradientStack <b>.exr, 700x40, 16 spp: primal, dx>"
+    picture = base64.b64decode(re.search(r'base64,([^"]*)"', html).group(1))
+    width, height = (int.from_bytes(picture[i : i + 4], "big") for i in (16, 20))
+    assert (width, height) == (140, 8) and len(html) < 60_000
+
+
+def test_a_stack_without_primal_or_numbers_shows_itself_too():
+    stack = GradientStack.from_arrays(depth=np.full((1, 1), np.inf, np.float32))
+    assert rows(stack._repr_html_()) == {"depth": ["nan", "nan", "nan", "1"]}
+
+
+def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
+    """Each cell as a notebook runs it: all in one namespace, the last expression shown."""
+    cells = json.loads(TUTORIAL.read_text())["cells"]
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells if cell["cell_type"] == "code")
+    monkeypatch.chdir(tmp_path)
+    made, shown = {}, []
+    for cell in cells:
+        if cell["cell_type"] == "code":
+            *statements, last = ast.parse("".join(cell["source"])).body
+            if isinstance(last, ast.Expr):
+                exec(compile(ast.Module(statements, []), cell["id"], "exec"), made)
+                shown.append(eval(compile(ast.Expression(last.value), cell["id"], "eval"), made))
+            else:
+                exec(compile(ast.Module([*statements, last], []), cell["id"], "exec"), made)
+    first, second = (value for value in shown if isinstance(value, GradientStack))
+    assert {"dx", "primal_var"} <= rows(first._repr_html_()).keys() and {"primal"} == rows(second._repr_html_()).keys()
+    errors = dict(re.findall(r"^(\S+) +relMSE (\S+)", capsys.readouterr().out, re.M))
+    assert float(errors["ngpt-fast"]) < 0.5 * float(errors["primal"])
+    assert (tmp_path / "report.html").stat().st_size > 100_000
+    # Only graphs that take emission seen directly can tell a lamp from noise.
+    assert made["difference"] < 1e-4 or "direct" not in made["needs"]
+
+
+def test_links_of_the_tutorial_lead_somewhere():
+    links = re.findall(
+        r"\]\(([^)]+)\)", "".join(text for cell in json.loads(TUTORIAL.read_text())["cells"] for text in cell["source"])
+    )
+    assert len(links) > 5 and [link for link in links if not (TUTORIAL.parent / link).exists()] == []
