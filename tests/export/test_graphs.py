@@ -137,13 +137,14 @@ def test_padding_and_what_it_is_cropped_to(size, name):
     def graph(x):
         mirror = padding.Mirror(x, 4)
         padded = mirror.pad(x, name)
-        return padded, mirror.crop(padded), mirror.around(x, 0), mirror.around(x, 3)
+        return padded, mirror.crop(padded), mirror.extended(x, 0), mirror.extended(x, 3)
 
-    padded, cropped, same, around = evaluate(graph, layer)
+    padded, cropped, *images = evaluate(graph, layer)
     assert np.array_equal(padded, expected)
-    assert np.array_equal(cropped, torch_padding.crop(expected, pads)) and np.array_equal(same, layer)
-    image = torch_padding.pad({"primal": torch.from_numpy(layer)}, (3, 3, 3, 3))["primal"]
-    assert np.array_equal(around, image)
+    assert np.array_equal(cropped, torch_padding.crop(expected, pads))
+    image = torch_padding.pad({"primal": torch.from_numpy(layer)}, pads)["primal"]
+    for radius, ours in zip((0, 3), images, strict=True):
+        assert np.array_equal(ours, torch_padding.extended(image, radius))
 
 
 @pytest.mark.parametrize("beside", ["base", "denoised"])
