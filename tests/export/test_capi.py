@@ -21,7 +21,7 @@ from capi import (
 from hosts import VECTOR, read_layers
 
 from ngpt.methods import reconstruct
-from ngpt.network.inputs import DENOISED, base_image, denoised
+from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -82,7 +82,7 @@ def test_a_network_that_corrects_another_denoiser(library):
     assert library.ngpt_prepare(job.handle, 150, 60, PROGRESS(), None) == OK, job.message()
     for name, image in images.items():
         agree(image, expected[name])
-    other = {name: image + data.direct for name, image in denoised(data, made, DENOISED).items()}
+    other = {name: image + data.direct for name, image in denoised(Oidn(data), made, DENOISED).items()}
     for name, image in (other | {"base": images["oidn_base"]}).items():
         assert library.ngpt_set_layer(job.handle, name.encode(), *place(image)) == OK, job.message()
     expected_image = reconstruct(stack_of(layers), "ngpt-combine").image
