@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
+LIBRARY = HOSTS.parent / "capi"
 VECTOR = HOSTS.parent / "vector"
 
 # mitsuba-oidn has OIDN's library in it, with the same functions in a namespace, and without headers: those that the
@@ -79,7 +80,7 @@ def agree_but_for_rounding_in_oidn(image, expected):
 
 
 def compiled(source: str, program: Path, *flags: str) -> list[str]:
-    """The command of a C++ host, compiled against ONNX Runtime of the system or of ORT_ROOT."""
+    """The command of a C++ host, compiled with libngpt against ONNX Runtime of the system or of ORT_ROOT."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("neither g++ nor clang++ is installed")
@@ -89,6 +90,7 @@ def compiled(source: str, program: Path, *flags: str) -> list[str]:
         pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include; name a release's folder in ORT_ROOT")
     library = root / "lib"
     command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / source, "-o", program]
+    command += [*LIBRARY.glob("*.cpp"), f"-I{LIBRARY}", '-DNGPT_VERSION="0"', "-pthread"]
     command += [flag for path in headers for flag in ("-isystem", path) if path != Path("/usr/include")]
     command += [f"-L{library}", f"-Wl,-rpath,{library}", "-lonnxruntime", *flags]
     result = subprocess.run(command, capture_output=True, text=True, timeout=500)

@@ -38,12 +38,12 @@ def stack():
     return wide, GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in wide.items()})
 
 
-@pytest.mark.parametrize("tile", [0, 48])
+@pytest.mark.parametrize("memory", [0, 25])
 @pytest.mark.parametrize("method", ["ngpt-combine", "ngpt-primal"])
-def test_a_host_with_oidn_gives_the_pixels_of_denoise(host, stack, method, tile, tmp_path):
+def test_a_host_with_oidn_gives_the_pixels_of_denoise(host, stack, method, memory, tmp_path):
     layers, held = stack
     write_layers(tmp_path / "layers", layers)
-    result = host(WEIGHTS / f"{method}.onnx", tmp_path / "layers", tmp_path / "image.pfm", tile)
+    result = host(WEIGHTS / f"{method}.onnx", tmp_path / "layers", tmp_path / "image.pfm", memory)
     assert result.returncode == 0, result.stderr
     check = agree if method == "ngpt-primal" else agree_but_for_rounding_in_oidn
     check(read_pfm(tmp_path / "image.pfm"), planes_of(reconstruct(held, method).image))

@@ -1,9 +1,9 @@
 // Runs an ngpt model that corrects Open Image Denoise, ngpt-combine or ngpt-primal, with its images: a host in C++.
 //
-//     ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [TILE]
+//     ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [MEMORY]
 //
-// FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. TILE is the side of the network's tiles, 0 for the whole image
-// at once; OIDN makes its own. Needs OIDN 2.
+// FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. MEMORY is what the network's tiles may take, in MiB, 0 for
+// 2048; OIDN makes its own. Needs OIDN 2.
 
 #include "files.hpp"
 
@@ -79,25 +79,37 @@ private:
 
 int main(int count, char **arguments) try {
     if (count < 4 || count > 5 || (count == 5 && std::string(arguments[4]).find_first_not_of("0123456789") != std::string::npos)) {
-        std::fprintf(stderr, "usage: ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [TILE]\n");
+        std::fprintf(stderr, "usage: ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [MEMORY]\n");
         return 2;
     }
-    Model model(arguments[1]);
-    Layers layers = read_layers(arguments[2], model);
-    Prepared prepared = model.prepare(layers);
-    if (!prepared.images.count("oidn_primal")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
+    Network network(arguments[1]);
+    const auto reads = [&](const char *name) {
+        return std::find(network.inputs.begin(), network.inputs.end(), name) != network.inputs.end();
+    };
+    if (!reads("denoised")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
+    const Layers layers = read_layers(arguments[2], network);
+    for (const auto &[name, layer] : layers) network.give(name, layer);
+    const int height = layers.at("primal").height, width = layers.at("primal").width;
+    Layer primal(3, height, width), albedo = primal, normal = primal, base = primal;
+    network.take("oidn_primal", primal);
+    network.take("oidn_albedo", albedo);
+    network.take("oidn_normal", normal);
+    if (reads("denoised_base")) network.take("oidn_base", base);
+    network.prepare(width, height);
 
     Oidn oidn;
-    const Layer albedo = oidn.prefiltered("albedo", prepared.images["oidn_albedo"]);
-    const Layer normal = oidn.prefiltered("normal", prepared.images["oidn_normal"]);
-    layers["denoised"] = oidn.denoised(prepared.images["oidn_primal"], albedo, normal);
-    if (auto base = prepared.images.find("oidn_base"); base != prepared.images.end()) {
-        layers["denoised_base"] = oidn.denoised(base->second, albedo, normal);
-        layers["base"] = base->second;
+    const Layer clean_albedo = oidn.prefiltered("albedo", albedo), clean_normal = oidn.prefiltered("normal", normal);
+    const Layer denoised = oidn.denoised(primal, clean_albedo, clean_normal);
+    network.give("denoised", denoised);
+    Layer denoised_base;
+    if (reads("denoised_base")) {
+        denoised_base = oidn.denoised(base, clean_albedo, clean_normal);
+        network.give("denoised_base", denoised_base);
+        network.give("base", base);
     }
-
-    const int64_t tile = count > 4 ? std::atoll(arguments[4]) : 0;
-    Layer image = tile ? model.tiled(layers, prepared, tile) : model.whole(layers, &prepared);
+    Layer image(3, height, width);
+    network.take("image", image);
+    network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-oidn-host: %s\n", error.what());

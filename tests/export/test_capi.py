@@ -1,0 +1,217 @@
+"""The C library makes the image that Python makes: whole and in tiles, from pixels that lie anywhere."""
+
+import numpy as np
+import pytest
+from capi import (
+    COLOUR,
+    FAST,
+    MISSING_LAYER,
+    OK,
+    PROGRESS,
+    WEIGHTS,
+    Job,
+    Network,
+    agree,
+    example,
+    in_python,
+    place,
+    result,
+    those,
+)
+from hosts import VECTOR, read_layers
+
+from ngpt.methods import reconstruct
+from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+# --- what it makes ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", sorted(WEIGHTS.glob("ngpt-*[a-z].onnx")), ids=lambda path: path.stem)
+def test_networks_agree_with_python(library, path):
+    if path.stem.endswith(".statistics"):
+        return
+    network = Network(library, path)
+    layers = those(network, example())
+    agree(result(network, layers), in_python(path, layers))
+    network.close()
+
+
+def stack_of(layers) -> GradientStack:
+    return GradientStack.from_arrays(**{name: layer for name, layer in layers.items() if "denoised" not in name})
+
+
+def test_the_vector(fast):
+    layers = {name: np.moveaxis(layer[0], 0, -1) for name, layer in read_layers(VECTOR).items()}
+    agree(result(fast, those(fast, layers)), layers["image"])
+
+
+@pytest.mark.parametrize("memory", [0, 80])
+def test_it_gives_the_pixels_of_denoise(fast, colour, memory):
+    layers = example(100, 400)
+    for network, method in ((fast, "ngpt-fast"), (colour, "ngpt-colour")):
+        expected = reconstruct(stack_of(layers), method).image
+        agree(result(network, those(network, layers), memory), expected)
+
+
+def test_a_rendered_stack(renderer, fast, colour):
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    stack = render_stack(load_scene("diffuse", (96, 72)), 8)
+    assert stack["direct"].any()
+    layers = {name: stack[name] for name in fast.names if name in stack}
+    agree(result(fast, layers), reconstruct(stack, "ngpt-fast").image)
+    agree(result(colour, those(colour, layers)), reconstruct(stack, "ngpt-colour").image)
+
+
+def test_a_network_that_corrects_another_denoiser(library):
+    pytest.importorskip("mitsuba_oidn")
+    network = Network(library, WEIGHTS / "ngpt-combine.onnx")
+    layers = {name: layer for name, layer in example(60, 150).items() if "denoised" not in name}
+    data = repair(stack_of(layers))
+    made = base_image(data, "wcv")
+    expected = {"oidn_primal": data.image + data.direct, "oidn_base": made + data.direct}
+    expected |= {"oidn_albedo": data.features["albedo"], "oidn_normal": data.features["normal"]}
+    job = Job(network, those(network, layers))
+    images = {name: np.zeros_like(image) for name, image in expected.items()}
+    for name, image in images.items():
+        assert library.ngpt_set_output(job.handle, name.encode(), *place(image)) == OK, job.message()
+    assert job.run() == MISSING_LAYER and "denoised, denoised_base" in job.message()
+    assert library.ngpt_prepare(job.handle, 150, 60, PROGRESS(), None) == OK, job.message()
+    for name, image in images.items():
+        agree(image, expected[name])
+    other = {name: image + data.direct for name, image in denoised(Oidn(data), made, DENOISED).items()}
+    for name, image in (other | {"base": images["oidn_base"]}).items():
+        assert library.ngpt_set_layer(job.handle, name.encode(), *place(image)) == OK, job.message()
+    expected_image = reconstruct(stack_of(layers), "ngpt-combine").image
+    for memory in (0, 60):
+        assert job.run(memory) == OK, job.message()
+        agree(job.image, expected_image)
+    job.free()
+    network.close()
+
+
+@pytest.mark.parametrize(("name", "height", "width", "memory"), [("fast", 23, 700, 25), ("colour", 150, 170, 20)])
+def test_tiles_agree_with_the_whole(request, name, height, width, memory):
+    network = request.getfixturevalue(name)
+    layers, fractions = those(network, example(height, width)), []
+    tiled = result(network, layers, memory, progress=lambda fraction: fractions.append(fraction) or 0)
+    assert len(set(fractions)) > 2 and (fractions[0], fractions[-1]) == (0, 1)
+    agree(tiled, result(network, layers))
+
+
+def test_the_tiles_are_those_of_python(colour):
+    from ngpt.network.run_onnx import Network as InPython
+
+    layers = those(colour, example(200, 300))
+    fractions = []
+    result(colour, layers, 40, progress=lambda fraction: fractions.append(fraction) or 0)
+    tiles, _ = InPython(COLOUR).plan(200, 300, 40)
+    assert len(set(fractions)) == len(tiles) + 1 > 3
+
+
+def test_sizes_from_one_pixel(fast):
+    for height, width in ((1, 1), (1, 40), (17, 1), (16, 16)):
+        layers = those(fast, example(height, width))
+        agree(result(fast, layers), in_python(FAST, layers))
+
+
+def test_a_base_may_be_given(fast):
+    assert "base" in fast.names and "statistics" not in fast.names
+    layers = example()
+    base = np.nan_to_num(0.8 * layers["primal"], posinf=1)
+    layers = those(fast, layers)
+    with_base = result(fast, layers | {"base": base})
+    agree(with_base, in_python(FAST, layers | {"base": base}))
+    assert np.abs(result(fast, layers) - with_base).max() > 1e-3
+
+
+def test_layers_that_are_not_there(fast, colour):
+    layers = those(fast, example())
+    without = {name: layer for name, layer in layers.items() if not name.endswith("_var")}
+    unknown = {name: np.full_like(layer, -1) for name, layer in layers.items() if name.endswith("_var")}
+    agree(result(fast, without), in_python(FAST, without | unknown))
+    layers = those(colour, example())
+    zeros = {name: np.zeros_like(layer) for name, layer in layers.items() if name != "primal"}
+    agree(result(colour, {"primal": layers["primal"]}), in_python(COLOUR, layers | zeros))
+
+
+def test_a_layer_can_be_taken_away(library, colour):
+    layers = those(colour, example())
+    job = Job(colour, layers)
+    assert library.ngpt_set_layer(job.handle, b"albedo", None, 0, 0, 0, 0, 0) == OK
+    assert job.run() == OK
+    agree(job.image, result(colour, {name: layer for name, layer in layers.items() if name != "albedo"}))
+    assert library.ngpt_set_layer(job.handle, b"primal", None, 0, 0, 0, 0, 0) == OK
+    assert job.run() == MISSING_LAYER and "primal" in job.message()
+    job.free()
+
+
+# --- where pixels lie ------------------------------------------------------------------------------------------------
+
+
+def odd_address(array):
+    room = np.zeros(array.nbytes + 1, np.uint8)[1:].view()
+    room[:] = np.frombuffer(array.tobytes(), np.uint8)
+    return np.ndarray(array.shape, array.dtype, room.data)
+
+
+def crop(array):
+    height, width, channels = array.shape
+    large = np.full((height + 5, width + 7, channels + 1), 99, array.dtype)
+    large[2 : height + 2, 3 : width + 3, :channels] = array
+    return large[2 : height + 2, 3 : width + 3, :channels]
+
+
+LAYOUTS = {
+    "planes": lambda a: np.moveaxis(np.ascontiguousarray(np.moveaxis(a, -1, 0)), 0, -1),
+    "from the bottom": lambda a: np.ascontiguousarray(a[::-1])[::-1],
+    "columns": lambda a: np.asfortranarray(a),
+    "part of a larger image": crop,
+    "more channels": lambda a: np.concatenate([a, np.full_like(a[..., :1], 99)], axis=-1),
+    "BGR": lambda a: np.ascontiguousarray(a[..., ::-1])[..., ::-1],
+    "odd addresses": odd_address,
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS.values(), ids=LAYOUTS)
+def test_layouts_give_the_same(fast, layout):
+    layers = those(fast, example())
+    expected = result(fast, layers)
+    before = {name: layout(layer) for name, layer in layers.items()}
+    given = {name: layer.copy() for name, layer in before.items()}
+    image = layout(np.full(expected.shape, 7, np.float32))
+    np.testing.assert_array_equal(result(fast, before, image=image)[..., :3], expected)
+    assert (image[..., 3:] == 99).all()
+    for name in given:
+        np.testing.assert_array_equal(before[name], given[name])
+
+
+def test_strides_of_nought_are_those_without_gaps(library, fast):
+    layers = those(fast, example())
+    job = Job(fast, layers)
+    for name, layer in layers.items():
+        data, form, channels, *_ = place(layer)
+        assert library.ngpt_set_layer(job.handle, name.encode(), data, form, channels, 0, 0, 0) == OK
+    assert library.ngpt_set_output(job.handle, b"image", job.image.ctypes.data, 0, 3, 0, 0, 0) == OK
+    assert job.run() == OK
+    np.testing.assert_array_equal(job.image, result(fast, layers))
+    job.free()
+
+
+def test_halves(colour):
+    every = np.arange(2**16, dtype=np.uint16).view(np.float16)
+    halves = np.resize(np.where(np.isfinite(every), every, 0), (683, 32, 3))
+    expected = result(colour, {"primal": halves.astype(np.float32)})
+    np.testing.assert_array_equal(result(colour, {"primal": halves}), expected)
+    image = result(colour, {"primal": halves}, image=np.zeros(halves.shape, np.float16))
+    with np.errstate(over="ignore"):
+        np.testing.assert_array_equal(image, expected.astype(np.float16))
+
+
+def test_the_output_may_lie_where_a_layer_is(fast):
+    layers = those(fast, example(23, 700))
+    expected = result(fast, layers, 25)
+    np.testing.assert_array_equal(result(fast, layers, 25, image=layers["primal"]), expected)

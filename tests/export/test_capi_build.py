@@ -1,0 +1,171 @@
+"""The C library as a package: its header, its symbols, find_package, the program of the docs, and no leak."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+from capi import COLOUR, FAST, HEADER, SOURCE, Network, command, example, install, result, those, tool
+
+import ngpt
+
+DOCS = SOURCE.parents[1] / "docs" / "c-library.md"
+STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
+
+PROJECT = """
+cmake_minimum_required(VERSION 3.16)
+project(renderer C CXX)
+find_package(ngpt VERSION REQUIRED)
+configure_file(renderer.c renderer.cpp COPYONLY)
+add_executable(in-c renderer.c)
+add_executable(in-cpp ${CMAKE_CURRENT_BINARY_DIR}/renderer.cpp)
+foreach(program in-c in-cpp)
+  target_compile_options(${program} PRIVATE -Wall -Wextra -pedantic -Werror)
+  target_link_libraries(${program} PRIVATE ngpt::ngpt)
+endforeach()
+set_target_properties(in-c PROPERTIES C_STANDARD 90 C_EXTENSIONS OFF)
+file(WRITE ${CMAKE_BINARY_DIR}/networks.txt ${ngpt_NETWORKS})
+"""
+
+# Every function, once and again, in one process: with what is right, wrong, and cancelled.
+STRESS = """
+#include <assert.h>
+#include <ngpt.h>
+#include <stdlib.h>
+#include <string.h>
+
+static int cancel(void *user, double fraction) {
+    (void)fraction;
+    return ++*(int *)user > 1;
+}
+
+int main(int count, char **arguments) {
+    char message[64];
+    int turn, calls, i, width = 700, height = 20;
+    assert(count == 3 && !ngpt_open("none.onnx", 0, message, sizeof message));
+    for (turn = 0; turn < atoi(arguments[2]); turn++) {
+        ngpt_network *network = ngpt_open(arguments[1], 1, message, sizeof message);
+        ngpt_job *job = ngpt_job_new(network);
+        float *pixels = (float *)malloc(sizeof(float) * 3 * width * height);
+        assert(job && !strcmp(message, ""));
+        for (i = 0; i < 3 * width * height; i++) pixels[i] = (float)i;
+        for (i = 0; i < ngpt_layer_count(network); i++)
+            if (strcmp(ngpt_layer_name(network, i), "base"))
+                assert(!ngpt_set_layer(job, ngpt_layer_name(network, i), pixels, NGPT_FLOAT, 3, 0, 0, 0));
+        assert(ngpt_run(job, width, height, 0, NULL, NULL) == NGPT_MISSING_LAYER);
+        assert(!ngpt_set_output(job, "image", pixels, NGPT_FLOAT, 3, 0, 0, 0));
+        assert(ngpt_set_output(job, "picture", pixels, NGPT_FLOAT, 3, 0, 0, 0) == NGPT_BAD_ARGUMENT);
+        calls = 0;
+        assert(ngpt_run(job, width, height, 25, cancel, &calls) == NGPT_CANCELLED);
+        assert(ngpt_run(job, width, height, 25, NULL, NULL) == NGPT_OK);
+        assert(ngpt_run(job, width, height, 0, NULL, NULL) == NGPT_OK);
+        assert(ngpt_prepare(job, width, height, NULL, NULL) == NGPT_OK);
+        ngpt_close(network);
+        assert(ngpt_run(job, width, height, 0, NULL, NULL) == NGPT_OK);
+        ngpt_job_free(job);
+        free(pixels);
+    }
+    return 0;
+}
+"""
+
+
+@pytest.mark.parametrize("standard", ["c89", "c99", "c17"])
+def test_the_header_is_c(standard):
+    command(
+        tool("gcc", "clang"), f"-std={standard}", "-Wall", "-Wextra", "-pedantic", "-Werror", "-fsyntax-only", HEADER
+    )
+
+
+def test_the_header_is_cpp():
+    command(tool("g++", "clang++"), "-std=c++98", *STRICT, "-fsyntax-only", "-x", "c++", HEADER)
+
+
+def test_only_functions_of_the_header_are_exported(prefix):
+    listing = command(tool("nm"), "-D", "--defined-only", prefix / "lib" / "libngpt.so")
+    declared = set(re.findall(r"\b(ngpt_\w+)\(", re.sub(r"/\*.*?\*/", "", HEADER.read_text(), flags=re.S)))
+    assert {line.split()[-1].partition("@")[0] for line in listing.splitlines()} == declared
+    assert len(declared) == 16
+
+
+@pytest.fixture(scope="module")
+def renderer_project(prefix, tmp_path_factory):
+    """The build folder of a project that uses the package, with the program of the docs."""
+    folder = tmp_path_factory.mktemp("renderer")
+    (folder / "renderer.c").write_text(re.search(r"```c\n(.*?)```", DOCS.read_text(), re.S)[1])
+    (folder / "CMakeLists.txt").write_text(PROJECT.replace("VERSION REQUIRED", f"{ngpt.__version__} REQUIRED"))
+    command(tool("cmake"), "-S", folder, "-B", folder / "build", f"-DCMAKE_PREFIX_PATH={prefix}")
+    command(tool("cmake"), "--build", folder / "build")
+    return folder / "build"
+
+
+@pytest.mark.parametrize("program", ["in-c", "in-cpp"])
+def test_the_program_of_the_docs(renderer_project, program):
+    networks = (renderer_project / "networks.txt").read_text()
+    outcome = subprocess.run(
+        [renderer_project / program, f"{networks}/ngpt-colour.onnx"], capture_output=True, text=True, timeout=100
+    )
+    assert outcome.returncode == 0, outcome.stderr
+    assert 0.7 < float(outcome.stdout) < 1.3
+    assert outcome.stderr.startswith("reads primal, 3 channels, always\nreads direct, 3 channels, if there is one")
+    assert outcome.stderr.endswith("100 %\n")
+    outcome = subprocess.run([renderer_project / program, "none.onnx"], capture_output=True, text=True, timeout=100)
+    assert outcome.returncode == 1 and outcome.stderr == "none.onnx: cannot be read, or is empty\n"
+
+
+def test_python_as_the_docs_show(prefix):
+    (code,) = re.findall(r"```python\n(.*?)```", DOCS.read_text(), re.S)
+    environment = os.environ | {"LD_LIBRARY_PATH": str(prefix / "lib")}
+    outcome = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=100)
+    assert outcome.stdout == f"{ngpt.__version__}\n", outcome.stderr
+
+
+def test_versions_that_do_not_fit_are_not_found(prefix, tmp_path):
+    (tmp_path / "CMakeLists.txt").write_text(PROJECT.replace("VERSION REQUIRED", "99.0 REQUIRED"))
+    (tmp_path / "renderer.c").write_text("")
+    arguments = [tool("cmake"), "-S", tmp_path, "-B", tmp_path / "build", f"-DCMAKE_PREFIX_PATH={prefix}"]
+    outcome = subprocess.run(arguments, capture_output=True, text=True, timeout=100)
+    assert outcome.returncode and f"version: {ngpt.__version__}" in outcome.stderr
+
+
+def resident() -> int:
+    """KiB of this process."""
+    with open("/proc/self/status") as file:
+        return int(re.search(r"VmRSS:\s+(\d+)", file.read())[1])
+
+
+def test_memory_stays_the_same(library):
+    layers = example(40, 40)
+
+    def work(turns):
+        for _ in range(turns):
+            network = Network(library, COLOUR)
+            for _ in range(5):
+                result(network, those(network, layers))
+            network.close()
+
+    work(5)
+    before = resident()
+    work(20)
+    # A network is 2.7 MB, what it takes to run 3 MB.
+    assert resident() - before < 8 * 1024
+
+
+def test_sanitized(runtime, tmp_path):
+    """Under AddressSanitizer, which also reports leaks: neither library nor program does what it must not."""
+    flags = "-fsanitize=address,undefined -fno-sanitize-recover=all -g"
+    (tmp_path / "stress.c").write_text(STRESS)
+    probe = [tool("g++", "clang++"), *flags.split(), "-x", "c++", "-", "-o", tmp_path / "probe"]
+    if subprocess.run(list(map(str, probe)), input="int main() {}", text=True, capture_output=True).returncode:
+        pytest.skip("the compiler has no AddressSanitizer")
+    prefix = install(runtime, tmp_path, f"-DCMAKE_CXX_FLAGS={flags}", "-DCMAKE_BUILD_TYPE=Debug")
+    program = tmp_path / "stress"
+    libraries = [f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lngpt"]
+    command(
+        tool("gcc", "clang"), *flags.split(), f"-I{prefix}/include", tmp_path / "stress.c", "-o", program, *libraries
+    )
+    for network in (FAST, COLOUR):
+        outcome = subprocess.run([program, network, "2"], capture_output=True, text=True, timeout=400)
+        assert outcome.returncode == 0, outcome.stderr[-3000:]
+        assert not outcome.stderr
