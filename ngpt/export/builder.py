@@ -95,14 +95,16 @@ class Graph:
 
     def output(self, name: str, value: Value, shape: Shape) -> None:
         """Makes a float32 value an output."""
-        self._bodies[-1].append(helper.make_node("Identity", [value.name], [name]))
+        self._bodies[-1].append(helper.make_node("Identity", [value.name], [name], name=f"node of {name}"))
         self._outputs.append(helper.make_tensor_value_info(name, FLOAT, shape))
 
     def node(self, kind: str, inputs: Sequence[Any], outputs: int, attributes: Mapping[str, Any]) -> Any:
         """The value, or tuple of values, that a new node makes of ``inputs``; None leaves an optional one out."""
         names = ["" if value is None else self._value(value).name for value in inputs]
         results = tuple(self._new(kind) for _ in range(outputs))
-        self._bodies[-1].append(helper.make_node(kind, names, [result.name for result in results], **attributes))
+        # Named: an optimizer of ONNX Runtime 1.21 gives what it makes the name of a node, and refuses one name twice.
+        outputs_of = [result.name for result in results]
+        self._bodies[-1].append(helper.make_node(kind, names, outputs_of, f"node of {outputs_of[0]}", **attributes))
         return results[0] if outputs == 1 else results
 
     def include(self, model: onnx.ModelProto, prefix: str, value: Value) -> Value:

@@ -7,6 +7,7 @@ pytest.importorskip("onnx")
 torch = pytest.importorskip("torch")
 
 # ruff: noqa: E402
+import onnx
 import onnxruntime
 from full_stack import full_layers
 
@@ -20,6 +21,7 @@ from ngpt.network import features as torch_features
 from ngpt.network import padding as torch_padding
 from ngpt.network import transfer as torch_transfer
 from ngpt.network.heads import Direct, Kernels, Mixture, Residual
+from ngpt.network.run import WEIGHTS
 from ngpt.repair import repair as numpy_repair
 from ngpt.stack import GradientStack
 
@@ -219,3 +221,18 @@ def test_what_no_output_needs_is_left_out_and_equal_constants_are_one():
     assert [node.op_type for node in model.graph.node] == ["Add", "Mul", "Identity"] and unused.name
     assert len(model.graph.initializer) == 1
     assert {item.key: item.value for item in model.metadata_props} == {"ngpt.method": "small"}
+
+
+def test_nodes_have_names_of_their_own():
+    """ONNX Runtime 1.21 fuses nodes under the name of one of them, and refuses a model with one name twice."""
+
+    def names(graph):
+        for node in graph.node:
+            yield node.name
+            for attribute in node.attribute:
+                if attribute.HasField("g"):
+                    yield from names(attribute.g)
+
+    for path in sorted(WEIGHTS.glob("*.onnx")):
+        found = list(names(onnx.load(path).graph))
+        assert all(found) and len(set(found)) == len(found), path.name
