@@ -7,7 +7,7 @@ in with the first tensor. On tensors everything is differentiable and runs on th
 
 import os
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from types import ModuleType
@@ -61,10 +61,10 @@ def image(planes: Array) -> Array:
     return module(planes).moveaxis(planes, 0, -1)
 
 
-def empty(array: Array, *lead: int, channels_last: bool = False) -> Array:
+def empty(array: Array, *lead: int, channels_last: bool = False, dtype: Any = None) -> Array:
     """Uninitialised (*lead, H, W) for ``array`` (..., H, W); one leading axis may lie innermost in memory."""
-    shape = (*array.shape[-2:], *lead) if channels_last else (*lead, *array.shape[-2:])
-    new = np.empty(shape, array.dtype) if isinstance(array, np.ndarray) else array.new_empty(shape)
+    shape, dtype = (*array.shape[-2:], *lead) if channels_last else (*lead, *array.shape[-2:]), dtype or array.dtype
+    new = np.empty(shape, dtype) if isinstance(array, np.ndarray) else array.new_empty(shape, dtype=dtype)
     return planes(new) if channels_last else new
 
 
@@ -78,12 +78,18 @@ def map_rows(function: Callable[[int, int], Any], *like: Array) -> list:
         return [function(0, height)]
     rows = max(1, BAND * height // sum(array.size for array in like))
 
-    def band(first: int) -> Any:
+    return map_parts(lambda first: function(first, min(first + rows, height)), range(0, height, rows))
+
+
+def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
+    """What ``function(part)`` returns for each of ``parts``, in their order, computed on all cores; for NumPy."""
+
+    def silent(part: Any) -> Any:
         # Errors are silenced per thread; reconstruct() checks what comes out.
         with np.errstate(all="ignore"):
-            return function(first, min(first + rows, height))
+            return function(part)
 
-    return list(_threads().map(band, range(0, height, rows)))
+    return list(_threads().map(silent, parts))
 
 
 def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
