@@ -5,16 +5,15 @@ and against this file for the rest: cosine transforms, bands of rows, precision.
 in with the first tensor. On tensors everything is differentiable and runs on their device.
 """
 
-import os
 import sys
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import scipy.fft
+
+from ngpt.system.threads import map_parts
 
 # Array is a NumPy array or a torch tensor: (..., H, W), float32 or float64.
 Array = Any
@@ -78,18 +77,17 @@ def map_rows(function: Callable[[int, int], Any], *like: Array) -> list:
         return [function(0, height)]
     rows = max(1, BAND * height // sum(array.size for array in like))
 
-    return map_parts(lambda first: function(first, min(first + rows, height)), range(0, height, rows))
+    return map_silent(lambda first: function(first, min(first + rows, height)), range(0, height, rows))
 
 
-def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
-    """What ``function(part)`` returns for each of ``parts``, in their order, computed on all cores; for NumPy."""
+def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
+    """``map_parts`` without NumPy's warnings, which are silenced per thread; reconstruct() checks what comes out."""
 
     def silent(part: Any) -> Any:
-        # Errors are silenced per thread; reconstruct() checks what comes out.
         with np.errstate(all="ignore"):
             return function(part)
 
-    return list(_threads().map(silent, parts))
+    return map_parts(silent, parts)
 
 
 def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
@@ -111,11 +109,6 @@ def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
         return values[len(out) :]
 
     return (*out, map_rows(band, *out))
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ngpt")
 
 
 def dct2(x: Array) -> Array:

@@ -9,7 +9,7 @@ repeated 50 times from the primal. var I_p, not var I_q: weights of the sender w
 iterations have lowered the variance of a pixel; the reference implementation of Rousselle et al. takes 1 / Π_k≤n
 (1.01 + 4 · 2⁻ᵏ). It adds 1e-4 to all variances, which depends on exposure; ``ngpt.classical.variances`` has what we do.
 
-Memory in bytes per pixel of three float32 channels, beyond the 36 (wcv 72) of the input, with the output: 85.
+Memory in bytes per pixel of three float32 channels, beyond the 36 (wcv 72) of the input, with the output: 94.
 
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 5.2; Rousselle, Jarosz and Novák 2016, "Image-space
 Control Variates for Rendering"]

@@ -15,7 +15,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ngpt.classical.arrays import map_parts
+from ngpt.classical.arrays import map_silent
 
 # Sweeps between two exchanges of rows.
 DEPTH = 5
@@ -36,13 +36,13 @@ def jacobi(r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, fa
     height = r.shape[2]
     count = max(1, round(height / _STRIP))
     cuts = [height * i // count for i in range(count + 1)]
-    strips = map_parts(lambda rows: _Strip(r, primal_var[0], difference_var[:, 0], *rows), pairwise(cuts))
+    strips = map_silent(lambda rows: _Strip(r, primal_var[0], difference_var[:, 0], *rows), pairwise(cuts))
     for first in range(0, len(factors), DEPTH):
         now = factors[first : first + DEPTH]
         if first:
             for upper, lower in pairwise(strips):
                 upper.exchange(lower)
-        map_parts(partial(_Strip.run, factors=now), strips)
+        map_silent(partial(_Strip.run, factors=now), strips)
     u = r[0]
     for strip in strips:
         u[:, strip.first : strip.last] = strip.inner
