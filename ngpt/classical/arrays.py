@@ -75,7 +75,7 @@ def map_rows(function: Callable[[int, int], Any], *like: Array) -> list:
     height = like[0].shape[-2]
     if not isinstance(like[0], np.ndarray):
         return [function(0, height)]
-    rows = max(1, BAND * height // sum(array.size for array in like))
+    rows = max(1, BAND * height // max(1, sum(array.size for array in like)))
 
     return map_silent(lambda first: function(first, min(first + rows, height)), range(0, height, rows))
 
