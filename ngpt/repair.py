@@ -54,7 +54,7 @@ def repair(stack: GradientStack) -> Repaired:
     """
     primal = stack["primal"]
     direct = stack["direct"] if "direct" in stack else np.zeros_like(primal)
-    good = np.isfinite(primal).all(axis=-1) & np.isfinite(direct).all(axis=-1)
+    good = _finite_pixels(primal) & _finite_pixels(direct)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
     # Copies only of what changes: layers of large images are large.
@@ -64,7 +64,7 @@ def repair(stack: GradientStack) -> Repaired:
         image, direct = _from_neighbours(primal, direct, good), np.where(good[..., None], direct, 0)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
-    known = good & ~direct.any(axis=-1)
+    known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, stack["primal_var"]) if "primal_var" in stack else None
     if "dx" not in stack or "dy" not in stack:
         return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features, noise)
@@ -73,7 +73,7 @@ def repair(stack: GradientStack) -> Repaired:
         both = good.copy()
         here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
         both[here] &= good[there]
-        both &= np.isfinite(stack[name]).all(axis=-1)
+        both &= _finite_pixels(stack[name])
         border = np.s_[:, -1] if axis == 1 else np.s_[-1]
         both[border] = True  # no difference there, so nothing to mistrust
         layer = stack[name]
@@ -89,6 +89,12 @@ def repair(stack: GradientStack) -> Repaired:
         variances = (noise, _where(trusted[0], stack["dx_var"]), _where(trusted[1], stack["dy_var"]))
     dx, dy = gradients
     return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features, noise)
+
+
+def _finite_pixels(layer: np.ndarray) -> np.ndarray:
+    """Where all channels of (H, W, C) are finite; at once if all are, since short last axes are slow to look along."""
+    good = np.isfinite(layer)
+    return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
 
 
 def _finite(layer: np.ndarray) -> np.ndarray:

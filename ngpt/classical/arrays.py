@@ -5,16 +5,15 @@ and against this file for the rest: cosine transforms, bands of rows, precision.
 in with the first tensor. On tensors everything is differentiable and runs on their device.
 """
 
-import os
 import sys
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
+from collections.abc import Callable, Iterable
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import scipy.fft
+
+from ngpt.system.threads import map_parts
 
 # Array is a NumPy array or a torch tensor: (..., H, W), float32 or float64.
 Array = Any
@@ -61,10 +60,10 @@ def image(planes: Array) -> Array:
     return module(planes).moveaxis(planes, 0, -1)
 
 
-def empty(array: Array, *lead: int, channels_last: bool = False) -> Array:
+def empty(array: Array, *lead: int, channels_last: bool = False, dtype: Any = None) -> Array:
     """Uninitialised (*lead, H, W) for ``array`` (..., H, W); one leading axis may lie innermost in memory."""
-    shape = (*array.shape[-2:], *lead) if channels_last else (*lead, *array.shape[-2:])
-    new = np.empty(shape, array.dtype) if isinstance(array, np.ndarray) else array.new_empty(shape)
+    shape, dtype = (*array.shape[-2:], *lead) if channels_last else (*lead, *array.shape[-2:]), dtype or array.dtype
+    new = np.empty(shape, dtype) if isinstance(array, np.ndarray) else array.new_empty(shape, dtype=dtype)
     return planes(new) if channels_last else new
 
 
@@ -76,14 +75,19 @@ def map_rows(function: Callable[[int, int], Any], *like: Array) -> list:
     height = like[0].shape[-2]
     if not isinstance(like[0], np.ndarray):
         return [function(0, height)]
-    rows = max(1, BAND * height // sum(array.size for array in like))
+    rows = max(1, BAND * height // max(1, sum(array.size for array in like)))
 
-    def band(first: int) -> Any:
-        # Errors are silenced per thread; reconstruct() checks what comes out.
+    return map_silent(lambda first: function(first, min(first + rows, height)), range(0, height, rows))
+
+
+def map_silent(function: Callable[[Any], Any], parts: Iterable) -> list:
+    """``map_parts`` without NumPy's warnings, which are silenced per thread; reconstruct() checks what comes out."""
+
+    def silent(part: Any) -> Any:
         with np.errstate(all="ignore"):
-            return function(first, min(first + rows, height))
+            return function(part)
 
-    return list(_threads().map(band, range(0, height, rows)))
+    return map_parts(silent, parts)
 
 
 def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
@@ -105,11 +109,6 @@ def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
         return values[len(out) :]
 
     return (*out, map_rows(band, *out))
-
-
-@cache
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ngpt")
 
 
 def dct2(x: Array) -> Array:

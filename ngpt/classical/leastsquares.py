@@ -8,7 +8,20 @@ import math
 
 import numpy as np
 
-from ngpt.classical.arrays import Array, by_rows, cast, dct2, detach, empty, idct2, image, like, module, planes
+from ngpt.classical.arrays import (
+    Array,
+    by_rows,
+    cast,
+    dct2,
+    detach,
+    empty,
+    idct2,
+    image,
+    like,
+    map_rows,
+    module,
+    planes,
+)
 from ngpt.classical.gradients import adjoint, adjoint_by_rows, differences
 from ngpt.errors import NgptError
 
@@ -238,14 +251,20 @@ def total_of(bands: list) -> float:
     return float(sum(value for (value,) in bands))
 
 
-def robust_mean(values: Array) -> float:
-    """The mean of values >= 0 when none counts as more than ``CLIP`` times this mean.
+def robust_mean(*layers: Array) -> float:
+    """The mean of values >= 0, in arrays of any shape, when none counts as more than ``CLIP`` times this mean.
 
     Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
     """
+    rows = [layer.reshape(-1, layer.shape[-1]) for layer in layers if math.prod(layer.shape)]
+    count = sum(math.prod(values.shape) for values in rows)
     mean = math.inf
     while True:
-        clipped = float(values.clip(None, CLIP * mean).mean(dtype=module(values).float64)) if values.shape[-1] else 0.0
+        clipped = sum(_clipped_sum(values, CLIP * mean) for values in rows) / max(count, 1)
         if not clipped < 0.5 * mean:
             return clipped
         mean = clipped
+
+
+def _clipped_sum(values: Array, most: float) -> float:
+    return sum(map_rows(lambda first, last: sum_of(values[first:last].clip(None, most)), values))

@@ -11,8 +11,8 @@ import math
 
 import numpy as np
 
-from ngpt.classical.arrays import Array, cast, detach, module, to_numpy
-from ngpt.classical.leastsquares import robust_mean
+from ngpt.classical.arrays import Array, by_rows, cast, detach, empty, module, to_numpy
+from ngpt.classical.leastsquares import robust_mean, sum_of
 
 # What is added to every variance, as a share of the mean over primal and differences.
 FLOOR = 1e-3
@@ -60,8 +60,8 @@ def smooth_variances(
     noise it is 1 everywhere. Differences that are not ``trusted``, and those that do not exist, have infinite variance.
     """
     xp = module(primal_var)
-    layers = [_smoothed(*_over_colours(layer)) for layer in (primal_var, dx_var[:, :-1], dy_var[:-1])]
-    mean = robust_mean(xp.concatenate([layer.reshape(-1) for layer in layers]))
+    layers = [_smoothed(layer) for layer in (primal_var, dx_var[:, :-1], dy_var[:-1])]
+    mean = robust_mean(*layers)
     p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
     differences = xp.stack([p, p])
     differences[0, :, :-1], differences[1, :-1] = x, y
@@ -87,17 +87,32 @@ def _positive_values(variance: Array) -> np.ndarray:
 def _over_colours(variance: Array) -> tuple[Array, Array]:
     """(H, W, C) -> sum over C in double precision (squares of large radiances add up), and where it is usable."""
     xp = module(variance)
-    good = (xp.isfinite(variance) & (variance >= 0)).all(-1)
-    return xp.where(good, cast(variance, xp.float64).sum(-1), 0), good
+    channels = [variance[..., i] for i in range(variance.shape[-1])]
+    total, good = cast(channels[0], xp.float64), channels[0] >= 0
+    for channel in channels[1:]:
+        total, good = total + channel, good & (channel >= 0)
+    good = good & xp.isfinite(total)
+    return xp.where(good, total, 0), good
 
 
-def _smoothed(variance: Array, good: Array) -> Array:
-    """Twice the mean over 3 x 3 values that are good; where there are none, the mean of all that are."""
-    count = cast(good, variance.dtype)
-    mean = float(variance.sum()) / max(float(count.sum()), 1)
-    for _ in range(2):
-        variance, count = _box(variance), _box(count)
-    return module(variance).where(count > 0, variance / count.clip(FEW, None), mean)
+def _smoothed(variance: Array) -> Array:
+    """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none."""
+    xp, height = module(variance), len(variance)
+
+    def rows(first: int, last: int) -> tuple:
+        top, bottom = max(first - 2, 0), min(last + 2, height)
+        total, good = _over_colours(variance[top:bottom])
+        count = cast(good, variance.dtype)
+        own = slice(first - top, last - top)
+        sums = sum_of(total[own]), sum_of(count[own])
+        for _ in range(2):
+            total, count = _box(total), _box(count)
+        # No variance is negative: what is missing.
+        return xp.where(count > 0, total / count.clip(FEW, None), -1)[own], *sums
+
+    smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=xp.float64))
+    mean = sum(total for total, _ in bands) / max(sum(count for _, count in bands), 1)
+    return xp.where(smooth < 0, mean, smooth)
 
 
 def _box(values: Array) -> Array:

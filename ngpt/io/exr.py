@@ -19,6 +19,7 @@ from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
+from ngpt.system.threads import map_parts
 from ngpt.version import __version__
 
 __all__ = [
@@ -43,6 +44,7 @@ _STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWin
 MADE_BY = ("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds")
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
+_ROWS = 16  # that are gathered at a time
 
 
 @dataclass(frozen=True)
@@ -77,7 +79,8 @@ def read(
     """
     image = read_exr_isolated(path) if isolated else read_exr(path)
     resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path))
-    arrays = {name: _gather(image.parts[found.part], found.channels) for name, found in resolution.items()}
+    layers_found = map_parts(lambda found: _gather(image.parts[found.part], found.channels), resolution.values())
+    arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
     attributes = {name: value for name, value in main.header.items() if name not in _STRUCTURE}
     stack = GradientStack(arrays, attributes, StackSource(image, resolution), str(path))
@@ -201,7 +204,22 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
 
 def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
     """Returns the channels ``names`` as one array (H, W, C) float32."""
-    return np.stack([part.channels[name].astype(np.float32) for name in names], axis=-1)
+    channels = [part.channels[name] for name in names]
+    layer = np.empty((*channels[0].shape, len(channels)), np.float32)
+    # Some rows at a time: what one channel wrote is then in the cache when the next comes between it.
+    for top in range(0, len(layer), _ROWS):
+        rows = slice(top, top + _ROWS)
+        for index, channel in enumerate(channels):
+            layer[rows, :, index] = channel[rows]
+    return layer
+
+
+def _holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
+    """Whether the channels ``names`` are ``values`` (H, W, C) float32, bit for bit."""
+    return values.shape[:2] == part.channels[names[0]].shape and all(
+        np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
+        for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
+    )
 
 
 def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, int]:
@@ -222,12 +240,15 @@ def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, in
             )
     header = {name: value for name, value in image.parts[main].header.items() if name in _STRUCTURE}
     image.parts[main] = replace(image.parts[main], header={**header, **stack.attributes})
+    found = {name: (image.parts[resolution[name].part], resolution[name].channels) for name in resolution}
+    known = [name for name in stack.names if name in resolution]
+    unchanged = dict(zip(known, map_parts(lambda name: _holds(*found[name], stack[name]), known), strict=True))
     for name in stack.names:
         values, half = stack[name], False
+        if unchanged.get(name):
+            continue
         if name in resolution:
-            part, names = image.parts[resolution[name].part], resolution[name].channels
-            if np.array_equal(_gather(part, names).view(np.uint32), values.view(np.uint32)):
-                continue
+            part, names = found[name]
             half = _is_half(part, names) and not LAYERS[name].float_on_disk
         else:
             prefix = "" if name in ("primal", "alpha") else f"{name}."

@@ -18,6 +18,7 @@ import io
 import math
 import os
 import stat
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from fractions import Fraction
@@ -30,6 +31,7 @@ import OpenEXR
 from ngpt.errors import NgptError
 from ngpt.io.header import PartHeader, read_headers
 from ngpt.system.files import atomic_output
+from ngpt.system.limits import free_address_space, processors
 
 _LOSSY = (
     OpenEXR.PXR24_COMPRESSION,
@@ -54,6 +56,10 @@ _ATTRIBUTE_TYPES = (
 )
 # Where open files have names by their number, which open them anew; Linux alone has such.
 _NUMBERS = Path("/proc/self/fd")
+# Lest one call ends the threads of another. OpenEXR keeps Python's lock anyway.
+_one_at_a_time = threading.Lock()
+# MiB of address space that a thread may reserve, for its stack and its share of the heap.
+_THREAD = 256
 _FLOAT_MAX = float(np.finfo(np.float32).max)
 
 
@@ -120,7 +126,8 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
     parts = [_writable(part, str(path)) for part in image.parts]
     with atomic_output(path, overwrite) as temporary, _name_to_write(temporary) as name:
         try:
-            OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
+            with _all_cores():
+                OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
             raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
@@ -177,7 +184,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed), _without_native_stderr():
+        with contextlib.redirect_stdout(printed), _without_native_stderr(), _all_cores():
             parts = OpenEXR.File(name, separate_channels=True).parts
     except MemoryError as error:
         size = sum(header.bytes for header in headers) / 2**20
@@ -211,6 +218,25 @@ def _without_native_stderr() -> Iterator[None]:
         os.dup2(kept, 2)
         os.close(kept)
         os.close(null)
+
+
+@contextlib.contextmanager
+def _all_cores() -> Iterator[None]:
+    """OpenEXR decodes and encodes on all cores, which it does not by itself; with threads that end with the call.
+
+    Threads that live on would be missing in a forked process, which would wait for them for ever. Where address space
+    is short there are none, and where the caller has set a number it holds.
+    """
+    short = free_address_space() < processors() * _THREAD
+    with _one_at_a_time:
+        if short or OpenEXR.global_thread_count():
+            yield
+            return
+        OpenEXR.set_global_thread_count(processors())
+        try:
+            yield
+        finally:
+            OpenEXR.set_global_thread_count(0)
 
 
 def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:

@@ -1,5 +1,6 @@
 """OpenEXR files, verbatim: every attribute type, tiles and levels, lossy sources, memory layouts, and bad files."""
 
+import multiprocessing
 import os
 from fractions import Fraction
 
@@ -8,6 +9,7 @@ import OpenEXR
 import pytest
 from exr_files import comparable, noise, read_raw, same_bits, window, write_levels, write_raw
 
+import ngpt
 from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 
@@ -290,3 +292,40 @@ def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
         assert "\n" not in str(caught.value) and str(caught.value).startswith(f"{path}: ")
         assert "damaged" in str(caught.value)
     assert capsys.readouterr().out == ""
+
+
+# Threads
+
+
+def test_threads_of_openexr_end_with_the_call_and_the_caller_s_number_stays(tmp_path):
+    image = ExrImage([ExrPart("", {}, {name: np.ones((40, 30), np.float32) for name in "RGB"})])
+    for count in (0, 1):
+        OpenEXR.set_global_thread_count(count)
+        try:
+            write_exr(tmp_path / "a.exr", image, overwrite=True)
+            read_exr(tmp_path / "a.exr")
+            with pytest.raises(NgptError):
+                read_exr(damaged(tmp_path / "a.exr"))
+            assert OpenEXR.global_thread_count() == count
+        finally:
+            OpenEXR.set_global_thread_count(0)
+
+
+def damaged(path):
+    """A copy whose last half is missing."""
+    copy = path.with_name("damaged.exr")
+    copy.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    return copy
+
+
+@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+def test_a_forked_child_reads_what_its_parent_read(tmp_path):
+    path = ngpt.write(tmp_path / "a.exr", np.ones((40, 30, 3), np.float32))
+    ngpt.read(path)
+    child = multiprocessing.get_context("fork").Process(target=ngpt.read, args=(path,))
+    child.start()
+    child.join(30)
+    alive = child.is_alive()
+    child.kill()
+    assert not alive and child.exitcode == 0

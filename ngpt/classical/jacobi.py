@@ -1,0 +1,170 @@
+"""The sweeps of ``ngpt.classical.controlvariates`` on NumPy arrays, arranged for the caches of a processor.
+
+NumPy alone, and three times as fast as its expressions over bands of an image, by these means:
+
+- The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` rows more on both sides, copies of
+  its neighbours', so that so many sweeps need no word from them: what is wrong at its ends moves in by a row a sweep.
+- Within a strip, sweeps follow each other a row apart, on some rows at a time. What they read stays in the cache.
+- Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. What the last
+  pixel of a row says of the first of the next has weight 0.
+"""
+
+import math
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from ngpt.classical.arrays import map_silent
+
+# Sweeps between two exchanges of rows.
+DEPTH = 5
+# Rows of a strip without those of its neighbours; fewer make more of these, more leave threads without work.
+_STRIP = 120
+# Pixels that are worked on at a time: with their temporaries about a megabyte.
+_PIXELS = 10240
+# Bytes of the widest vectors: operations on addresses that are no multiples take twice as long.
+_VECTOR = 64
+
+
+def jacobi(r: np.ndarray, primal_var: np.ndarray, difference_var: np.ndarray, factors: list[float]) -> np.ndarray:
+    """The correction u (C, H, W) after one sweep from 0 for each of ``factors``, as of ``controlvariates``.
+
+    ``r`` (2, C, H, W) residuals of the differences, ``primal_var`` (1, H, W) > 0, ``difference_var`` (2, 1, H, W),
+    infinite where there is no difference; float32 or float64. ``r`` is overwritten: u is in its memory.
+    """
+    height = r.shape[2]
+    count = max(1, round(height / _STRIP))
+    cuts = [height * i // count for i in range(count + 1)]
+    strips = map_silent(lambda rows: _Strip(r, primal_var[0], difference_var[:, 0], *rows), pairwise(cuts))
+    for first in range(0, len(factors), DEPTH):
+        now = factors[first : first + DEPTH]
+        if first:
+            for upper, lower in pairwise(strips):
+                upper.exchange(lower)
+        map_silent(partial(_Strip.run, factors=now), strips)
+    u = r[0]
+    for strip in strips:
+        u[:, strip.first : strip.last] = strip.inner
+    return u
+
+
+class _Strip:
+    """Rows first .. last - 1 of the image, and ``DEPTH`` more on both sides.
+
+    All arrays are (..., rows * pitch). ``ratio`` is, for the neighbours right, below, left and above, the variance of
+    the difference over that of the pixel, and infinite where there is none.
+    """
+
+    def __init__(self, r: np.ndarray, v: np.ndarray, differences: np.ndarray, first: int, last: int):
+        channels, height, width = r.shape[1:]
+        self.first, self.last, self.width, dtype = first, last, width, r.dtype
+        self.lead = _VECTOR // dtype.itemsize
+        self.pitch = -(-width // self.lead) * self.lead
+        self.rows = last - first + 2 * DEPTH
+        # Those of them that the image has: of the image, and of the strip.
+        image = slice(max(first - DEPTH, 0), min(last + DEPTH, height))
+        strip = slice(image.start - first + DEPTH, image.stop - first + DEPTH)
+        size = self.rows * self.pitch
+        # One row more on top, to which the first one has no difference, and below.
+        self.u = _aligned((channels, size + 2 * self.pitch), dtype, 0)
+        self.x, self.y = _aligned((2, channels, size), dtype, 0)
+        self.ratio = _aligned((4, size), dtype, np.inf)
+        for flat, values in ((self.x, r[0]), (self.y, r[1])):
+            self._grid(flat)[:, strip, :width] = values[:, image]
+        right, below, left, above = self._grid(self.ratio)[:, strip, :width]
+        v, (vx, vy) = v[image], differences[:, image]
+        np.divide(vx, v, out=right)
+        np.divide(vy, v, out=below)
+        np.divide(vx[:, :-1], v[:, 1:], out=left[:, 1:])
+        np.divide(vy[:-1], v[1:], out=above[1:])
+
+    @property
+    def inner(self) -> np.ndarray:
+        """The correction in the rows that are this strip's own, (C, last - first, W)."""
+        return self._grid(self.u)[:, DEPTH + 1 : -DEPTH - 1, : self.width]
+
+    def exchange(self, lower: "_Strip") -> None:
+        """Copies rows between this strip and the one below."""
+        here, below = self._grid(self.u)[:, 1:-1], self._grid(lower.u)[:, 1:-1]
+        here[:, -DEPTH:], below[:, :DEPTH] = below[:, DEPTH : 2 * DEPTH], here[:, -2 * DEPTH : -DEPTH]
+
+    def run(self, factors: list[float]) -> None:
+        """One sweep for each factor, each one row behind the one before."""
+        rows = max(1, _PIXELS // self.pitch)
+        scratch = _Scratch(self, rows)
+        numbers = [self.x.dtype.type(factor) for factor in factors]
+        for bottom in range(rows, self.rows + len(factors) + rows - 1, rows):
+            for late, factor in enumerate(numbers):
+                top, end = max(bottom - rows - late, 0), min(bottom - late, self.rows)
+                if top < end:
+                    self._rows(top, end, factor, scratch, scratch.above[late])
+
+    def _rows(self, top: int, end: int, factor: np.floating, scratch: "_Scratch", above: np.ndarray) -> None:
+        """One sweep over rows top .. end - 1.
+
+        ``above`` (C, pitch) is what the last row of those before said of this sweep's first, and will be of the next.
+        """
+        lead, pitch = self.lead, self.pitch
+        first, last = top * pitch, end * pitch
+        here = slice(first + pitch, last + pitch)
+        weight = scratch.weights[:, : last - first]
+        said, product = (a[:, : last - first] for a in (scratch.said, scratch.product))
+        np.add(self.ratio[:, first:last], factor, out=weight)
+        np.divide(factor, weight, out=weight)
+        right, below, left, over = weight
+        share = scratch.share[: last - first]
+        np.add(right, below, out=share)
+        share += left
+        share += over
+        share += 1
+        np.reciprocal(share, out=share)
+        u = self.u[:, here]
+        # Of dx, one vector more to the left.
+        d = scratch.difference[:, : lead + last - first]
+        before = slice(here.start - lead, here.stop)
+        np.subtract(self.u[:, here.start - lead + 1 : here.stop + 1], self.u[:, before], out=d)
+        d[:, lead:] -= self.x[:, first:last]
+        if first:
+            d[:, :lead] -= self.x[:, first - lead : first]
+        np.multiply(right, d[:, lead:], out=said)
+        np.multiply(left, d[:, lead - 1 : -1], out=product)
+        said -= product
+        # Of dy, the row above, as it was before this sweep.
+        d = scratch.difference[:, : pitch + last - first]
+        d[:, :pitch] = above
+        np.subtract(self.u[:, here.start + pitch : here.stop + pitch], u, out=d[:, pitch:])
+        d[:, pitch:] -= self.y[:, first:last]
+        above[...] = d[:, last - first :]
+        np.multiply(below, d[:, pitch:], out=product)
+        said += product
+        np.multiply(over, d[:, : last - first], out=product)
+        said -= product
+        said *= share
+        u += said
+
+    def _grid(self, flat: np.ndarray) -> np.ndarray:
+        return flat.reshape(*flat.shape[:-1], -1, self.pitch)
+
+
+class _Scratch:
+    """What a thread needs beside the strip for so many rows; ``above`` is of each of the sweeps under way."""
+
+    def __init__(self, strip: _Strip, rows: int):
+        channels, pitch, dtype = len(strip.u), strip.pitch, strip.u.dtype
+        size = rows * pitch
+        self.weights, self.share = _aligned((4, size), dtype), _aligned((size,), dtype)
+        self.said, self.product = _aligned((channels, size), dtype), _aligned((channels, size), dtype)
+        self.difference = _aligned((channels, size + pitch), dtype)
+        self.above = _aligned((DEPTH, channels, pitch), dtype, 0)
+
+
+def _aligned(shape: tuple[int, ...], dtype: np.dtype, value: float | None = None) -> np.ndarray:
+    """An array that begins at a whole vector, filled with ``value`` or not at all."""
+    size = math.prod(shape) * dtype.itemsize
+    memory = np.empty(size + _VECTOR, np.uint8)
+    start = -memory.ctypes.data % _VECTOR
+    array = memory[start : start + size].view(dtype).reshape(shape)
+    if value is not None:
+        array.fill(value)
+    return array

@@ -1,0 +1,78 @@
+"""The sweeps in strips that stay in the cache are those over the whole image, wherever strips and rows are cut."""
+
+import numpy as np
+import pytest
+from solvers import noisy_stack
+
+from ngpt.classical import jacobi
+from ngpt.classical.controlvariates import SWEEPS, cv, decay, wcv
+from ngpt.classical.leastsquares import Equations
+from ngpt.classical.variances import smooth_variances
+
+
+def one_sweep(u, r, own, difference_var):
+    """By the formula, one neighbour after the other."""
+    change, weight = np.zeros_like(u), np.ones_like(own)
+    vx, vy = difference_var
+    for axis, variance, residual in ((2, vx, r[0]), (1, vy, r[1])):
+        here, there = [slice(None)] * 3, [slice(None)] * 3
+        here[axis], there[axis] = slice(None, -1), slice(1, None)
+        here, there = tuple(here), tuple(there)
+        said = u[there] - u[here] - residual[here]
+        forth, back = own[here] / (own[here] + variance[here]), own[there] / (own[there] + variance[here])
+        change[here] += forth * said
+        change[there] -= back * said
+        weight[here] += forth
+        weight[there] += back
+    return u + change / weight
+
+
+def by_the_formula(primal, dx, dy, variances, trusted, factors):
+    equations = Equations(primal, dx, dy, trusted)
+    r, scale = equations.scaled_residual()
+    v, differences = smooth_variances(*variances, trusted)
+    u = np.zeros_like(r[0])
+    for factor in factors:
+        u = one_sweep(u, r, factor * v, differences)
+    return equations.image(u, scale)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (40, 1), (5, 7), (61, 16), (130, 33), (257, 20)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_wcv_is_the_formula(monkeypatch, size, dtype):
+    """Strips of about 30 rows, of which some are worked on at a time."""
+    monkeypatch.setattr(jacobi, "_STRIP", 30)
+    monkeypatch.setattr(jacobi, "_PIXELS", 100)
+    _, primal, dx, dy, variances = noisy_stack(*size, dtype=dtype)
+    random = np.random.default_rng(1)
+    trusted = tuple(random.random(size) < 0.95 for _ in range(2))
+    expected = by_the_formula(primal, dx, dy, variances, trusted, decay(SWEEPS))
+    result = wcv(primal, dx, dy, *variances, trusted)
+    tolerance = 2e-6 if dtype is np.float32 else 1e-12
+    assert result.dtype == dtype
+    assert np.abs(result - expected).max() <= tolerance * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("sweeps", [0, 1, 4, 5, 6, 13])
+def test_any_number_of_sweeps(monkeypatch, sweeps):
+    monkeypatch.setattr(jacobi, "_STRIP", 20)
+    _, primal, dx, dy, _ = noisy_stack(90, 24)
+    one, never = np.ones((1, 90, 24), np.float32), np.zeros((2, 1, 90, 24), np.float32)
+    never[0, ..., -1], never[1, ..., -1, :] = np.inf, np.inf
+    equations = Equations(primal, dx, dy)
+    r, scale = equations.scaled_residual()
+    u = np.zeros_like(r[0])
+    for _ in range(sweeps):
+        u = one_sweep(u, r, one, never)
+    expected = equations.image(u, scale)
+    assert np.abs(cv(primal, dx, dy, sweeps=sweeps) - expected).max() <= 2e-6 * np.abs(expected).max()
+
+
+def test_where_strips_are_cut_does_not_show(monkeypatch):
+    _, primal, dx, dy, variances = noisy_stack(300, 50)
+    results = []
+    for strip, pixels in ((300, 1 << 20), (120, 10240), (17, 1)):
+        monkeypatch.setattr(jacobi, "_STRIP", strip)
+        monkeypatch.setattr(jacobi, "_PIXELS", pixels)
+        results.append(wcv(primal, dx, dy, *variances))
+    assert all(np.array_equal(result, results[0]) for result in results)
