@@ -121,7 +121,7 @@ def read_table(path: str | Path | None = None) -> dict[str, Any]:
     """The table in a file, or the one that comes with the package."""
     source = Path(path) if path else package_files("ngpt.measure") / "advice.json"
     try:
-        table = json.loads(source.read_text())
+        table = json.loads(source.read_text("utf-8"))
     except (OSError, ValueError) as error:
         raise NgptError(f"{source}: cannot be read: {error}; python eval.py --advice FILE makes one") from error
     if not isinstance(table, dict) or not {"methods", "scenes"} <= table.keys():

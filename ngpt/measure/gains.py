@@ -93,7 +93,7 @@ def cases() -> dict[tuple[str, tuple[str, ...]], None]:
 @lru_cache(maxsize=1)
 def read_errors() -> tuple[tuple[int, ...], dict[tuple[str, tuple[str, ...]], tuple[float, ...]]]:
     """The sample counts, and the error at each of them by method and the layers it takes."""
-    table: dict[str, Any] = json.loads((package_files("ngpt.measure") / "layers.json").read_text())
+    table: dict[str, Any] = json.loads((package_files("ngpt.measure") / "layers.json").read_text("utf-8"))
     rows = {(row["method"], tuple(row["layers"])): tuple(row["error"]) for row in table["rows"]}
     return tuple(table["spp"]), rows
 
