@@ -57,8 +57,7 @@ def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
     errors = dict(re.findall(r"^(\S+) +relMSE (\S+)", capsys.readouterr().out, re.M))
     assert float(errors["ngpt-fast"]) < 0.5 * float(errors["primal"])
     assert (tmp_path / "report.html").stat().st_size > 100_000
-    # Only graphs that take emission seen directly can tell a lamp from noise.
-    assert made["difference"] < 1e-4 or "direct" not in made["needs"]
+    assert made["difference"] < 1e-4
 
 
 def test_links_of_the_tutorial_lead_somewhere():
