@@ -12,7 +12,7 @@ from ngpt.measure.metrics import relmse_trimmed
 pytestmark = pytest.mark.slow
 
 # As in test_blender.py.
-WITHOUT_OIDN = 4.5
+WITHOUT_OIDN = 3.6
 
 
 @pytest.fixture(scope="module")
