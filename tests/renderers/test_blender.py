@@ -14,7 +14,7 @@ pytestmark = pytest.mark.slow
 
 SIZE = (256, 144)
 # `auto` where OIDN is not installed, over OIDN's error. ngpt-colour is what sets it: tighten it with every new one.
-WITHOUT_OIDN = 8.0
+WITHOUT_OIDN = 4.0
 
 
 def render(folder, *options, size=SIZE):
