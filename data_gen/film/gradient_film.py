@@ -22,7 +22,7 @@ SHIFTS = {
 DIAGNOSTICS = {"shift_failures": "diagnostics.shiftFailures"}
 DISCARDED = "diagnostics.discarded"
 
-_WITH_VARIANCE = frozenset({"primal", *SHIFTS})
+_WITH_VARIANCE = frozenset({"primal", "caustic", *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
@@ -164,6 +164,10 @@ class GradientFilm:
                 layers[name] = self._image(self._statistics(name)[1])
         count, _, variance = self._statistics("primal")
         variances = {"primal_var": self._image(variance)}
+        if "caustic" in layers:
+            # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
+            layers["primal"] = layers["primal"] + layers["caustic"]
+            variances["caustic_var"] = self._image(self._statistics("caustic")[2])
         for layer in DIFFERENCES:
             if f"{layer}+" in self.moments:
                 layers[layer], variances[f"{layer}_var"] = self._gradient(layer)

@@ -144,6 +144,7 @@ for _sampler in (
             "shift": "before paths join: replay, or half-vector, which copies that of smooth events",
             "reuse": "true: the primal is the mean over base paths and the offset paths of neighbours",
             "roughness_threshold": "the microfacet roughness above which materials are connectable",
+            "caustic": "false: light over rough surfaces and then mirrors or glass is in the gradients, as noise",
             "diagnostics": "true: rates of failed shifts",
         },
         rank=1,

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths import caustic
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
@@ -44,9 +45,13 @@ class Step:
     Le: mi.Spectrum  # emitted at x1 toward x
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
+    # See data_gen.paths.caustic; L_light and L_bsdf hold nothing of that layer
+    L_caustic: mi.Spectrum  # f m Le / p of both techniques
+    rough: mi.Bool  # behind x
+    late: mi.Bool  # behind x
 
 
-def base_step(scene, plan: Plan, random, x, β, η, depth, seen, offsets) -> tuple[Step, mi.Float]:
+def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, offsets) -> tuple[Step, mi.Float]:
     """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
@@ -84,11 +89,20 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, offsets) -> tup
 
     # ------------------- Next vertex, and Le there ---------------
     x1 = scene.ray_intersect(x.spawn_ray(x.to_world(sample.wo)), goes_on)
+    x_connectable = plan.materials.connectable(bsdf)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
+    L_bsdf, L_caustic = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0)
+
+    # ------------------- The layer ``caustic`` -------------------
+    if plan.caustic:
+        L_light, caustic_light = caustic.split(caustic.lit_late(rough, late, x_connectable), L_light)
+        rough, late = caustic.classes(rough, late, found, kind, x_connectable)
+        L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
+        L_caustic = caustic_light + f_p * caustic_bsdf
     step = Step(
         x=x,
-        x_connectable=plan.materials.connectable(bsdf),
+        x_connectable=x_connectable,
         β=β,
         u_light=u_light,
         light=light,
@@ -111,7 +125,10 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, offsets) -> tup
         x1_connectable=~x1.is_valid() | plan.materials.connectable(x1.bsdf()),
         Le=Le,
         p_light=p_light,
-        L_bsdf=Le * mis_weight(sample.pdf, p_light),
+        L_bsdf=L_bsdf,
+        L_caustic=L_caustic,
+        rough=rough,
+        late=late,
     )
     return step, η
 

@@ -18,6 +18,8 @@ four offsets cost about as much as the base path and not four times that.
                       techniques, which are shifted separately: C is the contribution f m of one
     a                 once a path is settled, all that follows in Δ is a times the radiance that reaches the base path
     A                 the base path's part of Δ, the sum of 2 w C(x) / p(x)
+    rough, late       whether light belongs to the layer ``caustic``, of which L and Δ hold nothing: see
+                      data_gen.paths.caustic
 
 An offset path is *apart* from its base path, then *joined* to it for one step (it shares the vertex, but arrives there
 from elsewhere), then *settled*: joined for longer, ended, or rejected. A base path that ends while offset paths are
@@ -65,6 +67,8 @@ class GPT(GradientIntegrator):
                              replayed, which is rarely better
     ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
+    ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
+                             a layer of its own, not in the gradients, see ``data_gen.paths.caustic``; false: it is
     ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
                              without a counterpart: rejected, or of zero density, at a step that the base path took
 
@@ -80,6 +84,7 @@ class GPT(GradientIntegrator):
         self.shift = props.get("shift", "replay")
         self.reuse = props.get("reuse", False)
         self.diagnostics = props.get("diagnostics", False)
+        self.caustic = props.get("caustic", True)
         if self.shift not in ("replay", "half-vector"):
             raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: replay, half-vector")
 
@@ -102,6 +107,7 @@ class GPT(GradientIntegrator):
             rr_depth=self.rr_depth,
             shift=self.shift,
             hide_emitters=self.hide_emitters,
+            caustic=self.caustic,
         )
         return lambda camera, film: self.sample_pass(scene, plan, camera, film)
 
@@ -111,8 +117,8 @@ class GPT(GradientIntegrator):
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        L, Le, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
-        L, Le = to_rgb(L, ray.wavelengths), to_rgb(Le, ray.wavelengths)
+        L, Le, L_caustic, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
+        L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (L, Le, L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
 
         # ------------------------ Samples ----------------------------
@@ -120,6 +126,8 @@ class GPT(GradientIntegrator):
         if self.reuse:
             L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in offsets], Δ, inside)
         values = {"primal": L + Le, "direct": Le}
+        if plan.caustic:
+            values["caustic"] = L_caustic
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         if self.diagnostics:
             values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
@@ -145,35 +153,41 @@ class GPT(GradientIntegrator):
             hit = self.first_hit(scene, offset_ray)
             offsets.append(start(plan, x, importance, offset_ray, hit, offset_importance, inside))
         if plan.max_depth < 2:
-            return dr.zeros(mi.Spectrum, dr.width(hit.t)), Le, offsets
+            return dr.zeros(mi.Spectrum, dr.width(hit.t)), Le, dr.zeros(mi.Spectrum, dr.width(hit.t)), offsets
 
         # --------------------- The first step ------------------------
         # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
         β = dr.select(x.is_valid(), importance, 0)
-        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, offsets)
+        false = mi.Bool(False)
+        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, false, false, offsets)
         # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
         L = β * step.L_light + step.β1 * step.L_bsdf
+        L_caustic = β * step.L_caustic if plan.caustic else step.L_caustic
         offsets = first_steps(scene, plan, step, offsets)
-        L, offsets = self.walk(scene, plan, random, step, η, L, offsets)
-        return L, Le, offsets
+        L, L_caustic, offsets = self.walk(scene, plan, random, step, η, L, L_caustic, offsets)
+        return L, Le, L_caustic, offsets
 
     @dr.syntax
-    def walk(self, scene, plan, random, step, η, L, offsets):
+    def walk(self, scene, plan, random, step, η, L, L_caustic, offsets):
         """The rest of all paths past their first ``step``."""
         # ---------------------- Loop state ---------------------------
         x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
+        rough, late = step.rough, step.late
         depth = mi.UInt32(2)
         # As long as the base path lives, or a ghost has company
         active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         while dr.hint(active, label="gpt"):
             # The base path first: an offset path can only join a vertex that is known.
-            step, η = base_step(scene, plan, random, x, β, η, depth, seen, offsets)
+            step, η = base_step(scene, plan, random, x, β, η, depth, seen, rough, late, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
+            if dr.hint(plan.caustic, mode="scalar"):
+                L_caustic += β * step.L_caustic
             offsets = later_steps(scene, plan, step, offsets)
             x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
+            rough, late = step.rough, step.late
             depth += 1
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
-        return L, offsets
+        return L, L_caustic, offsets
 
     def first_hit(self, scene, ray) -> mi.PreliminaryIntersection3f:
         """Where a camera ray leads, through lamps that hide from the camera."""

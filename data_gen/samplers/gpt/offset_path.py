@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import shift
+from data_gen.paths import caustic, shift
 from data_gen.paths.lights import emission, replay_light, shared_emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
@@ -31,6 +31,7 @@ class Offset:
     failed: mi.Bool  # the base path went on to where no offset path corresponds to it
     w2: mi.Float  # settled: 2 w of all that follows
     A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ
+    rough: mi.Bool  # see data_gen.paths.caustic; it is never late
 
 
 @dataclass
@@ -45,6 +46,7 @@ class Move:
     L_bsdf: mi.Spectrum
     reaches: mi.Bool  # there is a next vertex
     good: mi.Bool
+    rough: mi.Bool
 
 
 def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Offset:
@@ -71,6 +73,7 @@ def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Off
         # Beyond the border there is no path that could have its part of the weight.
         w2=dr.select(ended, 1 if plan.replays else 2, dr.select(inside, mi.Float(0), 2)),
         A=dr.zeros(mi.Spectrum, dr.width(hit.t)),
+        rough=mi.Bool(False),
     )
 
 
@@ -141,6 +144,8 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
     # Each path has its own m: from y, the emitter is found with other densities than from x.
     L_light = f * light.weight * light_mis(light.delta, light.p, p)
+    if plan.caustic:
+        L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), connectable), L_light)
     # Never rejected: an emitter that y does not see is a sample of value 0, and the reverse shift knows it as such.
     w2_light = shift.gradient_weight(path.r, True)
     # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
@@ -152,7 +157,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     parts = step.walks & ~joins
     none = mi.Bool(False)
     # What neither does is rejected: β' = 0, r = 0.
-    move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none)
+    move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none, path.rough)
     move = dr.if_stmt((move,), joins, lambda move: reconnect(scene, plan, step, y, bsdf, move), lambda move: move)
     if plan.replays:
         move = dr.if_stmt(
@@ -178,9 +183,10 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         # Rejected or at its end, it has nothing to set against the rest of the base path.
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
-        failed=path.failed | (step.goes_on & (r1 == 0)),
+        failed=path.failed | (step.goes_on & ~step.late & (r1 == 0)),
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
+        rough=move.rough,
     )
 
 
@@ -214,6 +220,7 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
         L_bsdf=Le * mis_weight(p, p_light),
         reaches=reaches,
         good=~occluded,
+        rough=mi.Bool(plan.caustic),
     )
 
 
@@ -254,6 +261,11 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     inverts = shift.replay_inverts(
         kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
     )
+    # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
+    rough = move.rough
+    if plan.caustic:
+        rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
+        allowed &= ~late & ~step.late
     return Move(
         ray=ray,
         hit=hit,
@@ -263,6 +275,7 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
         L_bsdf=Le * mis_weight(p, p_light),
         reaches=reaches,
         good=allowed & inverts,
+        rough=rough,
     )
 
 
@@ -304,4 +317,5 @@ def step_joined(step: Step, path: Offset) -> Offset:
         failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
         w2=dr.select(path.joined, w2, path.w2),
         A=dr.select(path.joined, A, path.A),
+        rough=path.rough,
     )

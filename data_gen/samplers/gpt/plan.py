@@ -16,6 +16,7 @@ class Plan:
 
     ``replays``       offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
     ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
+    ``caustic``       light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
     ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
     """
 
@@ -26,6 +27,7 @@ class Plan:
     replays: bool
     half_vectors: bool
     hide_emitters: bool
+    caustic: bool
 
     @property
     def hides(self) -> bool:
@@ -39,10 +41,13 @@ def make_plan(
     rr_depth: int,
     shift: str,
     hide_emitters: bool,
+    caustic: bool,
 ) -> Plan:
     """Inspects the scene; the parameters are those of ``gpt``."""
     materials = Materials(scene, roughness_threshold)
     # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
     replays = not materials.all_connectable
     half_vectors = replays and shift == "half-vector"
-    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters)
+    return Plan(
+        materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic and replays
+    )

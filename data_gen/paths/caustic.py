@@ -1,0 +1,43 @@
+"""Which light goes into the layer ``caustic``: what has come over a surface that scatters widely, and then a sharp one.
+
+A path seen from the camera that has scattered at a connectable vertex and then meets a mirror, glass or sharp gloss is
+rare, bright, and cannot be followed: its shifted copy meets another point of the glass, from which the lamp is missed.
+Its differences are nothing but noise. So it is left to what needs none, in a layer of its own, and all that follows
+with it.
+
+    rough   the path has scattered smoothly at a connectable vertex
+    late    and has later left a vertex by a mirror, glass or sharp gloss: its light belongs to the layer
+
+Both are properties of the path alone, not of its shift. So primal - caustic is the image of some of the paths, and the
+differences are those of this image: a path of the layer counts 0 in them, whether it is a base path or a shifted copy.
+What a pair loses by it is exact: where either of the two is late, the shift is rejected from both sides.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.vertex import DELTA, SMOOTH
+
+
+def classes(rough: mi.Bool, late: mi.Bool, found: mi.Bool, kind: mi.UInt32, connectable: mi.Bool) -> tuple:
+    """``rough`` and ``late`` behind a vertex that is ``connectable`` or not, left by an event of that ``kind``.
+
+    Where no direction was ``found``, the path ends, and nothing changes: what its shifted copies go on to find is
+    theirs. Holes change nothing either.
+    """
+    smooth = found & (kind == SMOOTH)
+    sharp = (found & (kind == DELTA)) | (smooth & ~connectable)
+    return rough | (smooth & connectable), late | (rough & sharp)
+
+
+def lit_late(rough: mi.Bool, late: mi.Bool, connectable: mi.Bool) -> mi.Bool:
+    """Whether light from a sampled emitter, scattered at this vertex, belongs to the layer."""
+    # As if its direction had been sampled by a smooth event: both techniques divide the light alike.
+    return late | (rough & ~connectable)
+
+
+def split(late: mi.Bool, light: mi.Spectrum) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """``light`` as what does not belong to the layer, and what does."""
+    return dr.select(late, 0, light), dr.select(late, light, 0)

@@ -1,0 +1,118 @@
+"""The layer ``caustic`` of ``gpt``: which paths it holds, that nothing is lost by it, and what it gains.
+
+The differences of the layer's own noise would hide an error of dx. So dx and dy are compared with the differences of
+what independent renders have beside the layer; that all of it together is the image is the test of the primal. The
+budget is fixed: 16 stacks of 64 spp against 16 of 256 spp at 32x32 pixels, at a level of 1 %.
+"""
+
+import numpy as np
+import pytest
+from data_gen_scenes import glass, plenty
+from unbiased import light_of_gradients, load, render_ours, render_references
+
+from ngpt.classical.gradients import forward_differences
+from ngpt.testing import z_test
+
+SPP = 256
+
+
+def others(scene, **options):
+    """Independent images of the light that dx and dy hold."""
+    from data_gen.render import render_stack
+
+    return [light_of_gradients(render_stack(scene, SPP, 100 + i, "gpt", **options).layers) for i in range(16)]
+
+
+def verdict(stacks, images, name):
+    slopes = [forward_differences(image)[("dx", "dy").index(name)] for image in images]
+    return z_test(np.stack([stack[name] for stack in stacks]), np.stack(slopes))
+
+
+@pytest.mark.parametrize("scene", ["glossy", glass, plenty])
+def test_differences_are_those_of_the_rest(renderer, scene):
+    scene = load(renderer, scene, (32, 32))
+    stacks, images = render_ours(scene, "gpt"), others(scene)
+    assert np.mean([stack["caustic"] for stack in stacks]) > 1e-4
+    for name in ("dx", "dy"):
+        result = verdict(stacks, images, name)
+        assert result.passed, f"{name}: {result}"
+
+
+def test_nothing_is_lost(renderer):
+    scene = load(renderer, glass, (32, 32))
+    stacks, references = render_ours(scene, "gpt"), render_references(renderer, scene, spp=128)
+    whole = np.stack([stack["primal"] for stack in stacks])
+    assert z_test(whole, references).passed
+    # Without the layer's light it would be seen.
+    assert not z_test(np.stack([stack["primal"] - stack["caustic"] for stack in stacks]), references).passed
+
+
+@pytest.mark.parametrize(
+    "mutant",
+    [
+        lambda rough, late, found, kind, connectable: (rough, late | rough),
+        lambda rough, late, found, kind, connectable: (rough, late & ~late),
+    ],
+    ids=["copies are late at once", "copies are never late"],
+)
+def test_mutants_on_one_side_fail_the_z_test(renderer, mutant, monkeypatch):
+    """The class of the base path as it should be, and another one of its shifted copies."""
+    from types import SimpleNamespace
+
+    from data_gen.paths import caustic
+    from data_gen.samplers.gpt import offset_path
+
+    scene = load(renderer, glass, (32, 32))
+    images = others(scene)
+    monkeypatch.setattr(offset_path, "caustic", SimpleNamespace(**vars(caustic) | {"classes": mutant}))
+    stacks = render_ours(scene, "gpt")
+    assert not all(verdict(stacks, images, name).passed for name in ("dx", "dy"))
+
+
+def test_classes(renderer):
+    import mitsuba as mi
+
+    from data_gen.paths.caustic import classes, lit_late
+    from data_gen.paths.vertex import DELTA, NULL, SMOOTH
+
+    def walk(*vertices):
+        """Whether the path that leaves vertices (kind of event, connectable) is of the layer."""
+        rough, late = mi.Bool(False), mi.Bool(False)
+        for kind, connectable in vertices:
+            rough, late = classes(rough, late, mi.Bool(True), mi.UInt32(kind), mi.Bool(connectable))
+        return bool(late[0])
+
+    wide, mirror, gloss, hole, coat = (SMOOTH, True), (DELTA, False), (SMOOTH, False), (NULL, True), (DELTA, True)
+    assert not walk(mirror, mirror, gloss, wide, wide)  # from the camera through glass, then widely
+    assert walk(wide, mirror) and walk(wide, gloss) and walk(wide, coat)
+    assert walk(wide, mirror, wide)  # and all that follows
+    assert walk(mirror, wide, hole, mirror) and not walk(wide, hole, wide) and not walk(coat, gloss)
+    true, false = mi.Bool(True), mi.Bool(False)
+    assert not classes(true, false, false, mi.UInt32(DELTA), true)[1][0]  # an end is no mirror
+    assert lit_late(true, false, false)[0] and lit_late(false, true, true)[0]
+    assert not lit_late(true, false, true)[0] and not lit_late(false, false, false)[0]
+
+
+def test_variances_are_those_of_what_they_belong_to(renderer):
+    scene = load(renderer, glass, (32, 32))
+    stacks = render_ours(scene, "gpt", batches=64, spp=16)
+    for name, image in (("primal_var", lambda s: s["primal"] - s["caustic"]), ("caustic_var", lambda s: s["caustic"])):
+        found = np.var([image(stack) for stack in stacks], axis=0, ddof=1).mean()
+        assert np.mean([stack[name] for stack in stacks]) == pytest.approx(found, rel=0.15), name
+
+
+def test_gradients_have_less_noise_for_it(renderer):
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "glossy", (64, 64))
+    without, with_layer = (render_stack(scene, 32, 0, "gpt", caustic=caustic) for caustic in (False, True))
+    assert "caustic" not in without and "caustic_var" not in without
+    assert with_layer["primal"].mean() == pytest.approx(without["primal"].mean(), rel=0.02)
+    for name in ("dx_var", "dy_var"):
+        assert with_layer[name].mean() < 0.7 * without[name].mean()
+
+
+def test_no_layer_where_no_path_can_be_of_it(renderer):
+    from data_gen.render import render_stack
+
+    assert "caustic" not in render_stack(load(renderer, "diffuse", (8, 8)), 2)
