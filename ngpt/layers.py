@@ -25,12 +25,16 @@ LAYERS: dict[str, Layer] = {
     for layer in (
         Layer("primal", RGB, False, "Monte Carlo estimate of the pixel, directly seen emission included"),
         Layer("direct", RGB, False, "emission the camera sees directly: part of primal, not of dx and dy"),
+        Layer(
+            "caustic", RGB, True, "light over rough surfaces, then mirrors or glass: part of primal, not of dx and dy"
+        ),
         Layer("dx", RGB, True, "forward differences: dx[y,x] estimates I[y,x+1] - I[y,x], last column 0"),
         Layer("dy", RGB, True, "forward differences: dy[y,x] estimates I[y+1,x] - I[y,x], last row 0"),
         Layer("albedo", RGB, False, "reflectance at the first non-specular vertex, in [0, 1]"),
         Layer("normal", XYZ, False, "unit shading normal there, camera space: +x right, +y up, +z toward the viewer"),
         Layer("depth", ("Z",), True, "path length from the camera to that vertex, world units, 0 where it escapes"),
-        Layer("primal_var", RGB, True, "sample variance of the pixel mean of primal (already divided by spp)"),
+        Layer("primal_var", RGB, True, "sample variance of the pixel mean of primal - caustic (divided by spp)"),
+        Layer("caustic_var", RGB, True, "sample variance of the pixel mean of caustic"),
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),

@@ -168,7 +168,7 @@ class Examples(TorchDataset):
             return self._cache[which, k]
         crop = self.crops[which]
         stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
-        layers = layers_of(repair(stack), self.config)
+        layers = layers_of(repair(stack, self.config.reads_gradients), self.config)
         target = target_of(crop, self.config).transpose(2, 0, 1)
         layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
         size = sum(layer.numel() * layer.element_size() for layer in layers.values())
