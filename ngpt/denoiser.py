@@ -58,9 +58,11 @@ def denoise(
     dx: Any = None,
     dy: Any = None,
     direct: Any = None,
+    caustic: Any = None,
     primal_var: Any = None,
     dx_var: Any = None,
     dy_var: Any = None,
+    caustic_var: Any = None,
     **options: Any,
 ) -> Any:
     """The reconstruction of an image or a stack, scene-linear.
@@ -72,14 +74,16 @@ def denoise(
     ``method``   "auto", the best for the layers given and the packages installed, or one of those below
     ``albedo``, ``normal``, ``depth``  features of the same size, in the units of ``GradientStack``: normals in camera
                  space, +x right, +y up, +z toward the viewer (``Denoiser`` turns those of Mitsuba)
-    ``dx``, ``dy``, ``direct``, ``primal_var``, ``dx_var``, ``dy_var``  further layers of a gradient stack
+    ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
+                 a gradient stack
     ``options``  of the method, see below
 
     Raises NgptError for shapes and types that do not fit, unknown names, layers that the method lacks, and an image
     without any finite pixel.
     """
     given = {"albedo": albedo, "normal": normal, "depth": depth, "dx": dx, "dy": dy, "direct": direct}
-    given |= {"primal_var": primal_var, "dx_var": dx_var, "dy_var": dy_var}
+    given |= {"caustic": caustic, "primal_var": primal_var, "dx_var": dx_var, "dy_var": dy_var}
+    given |= {"caustic_var": caustic_var}
     given = {name: value for name, value in given.items() if value is not None}
     _check_options("denoise", method, options, _BESIDE)
     if isinstance(image, str | os.PathLike):
@@ -184,8 +188,8 @@ class Denoiser:
         All (H, W, C), scene-linear. ``noisy`` has 3 channels, or 4: alpha. ``normals`` are in the space of Mitsuba's
         sensor (+x left, +y up, +z forward), or in the one that ``to_sensor`` leads from: (3, 3) or (4, 4), an array or
         a transform with a ``matrix``; for normals in world space ``sensor.world_transform().inverse()``. ``layers``
-        are ``dx``, ``dy``, ``depth``, ``direct``, ``primal_var``, ``dx_var`` and ``dy_var``, with the meaning of the
-        layers of ``GradientStack``; ``depth`` may be (H, W).
+        are ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var`` and
+        ``caustic_var``, with the meaning of the layers of ``GradientStack``; ``depth`` may be (H, W).
 
         A bitmap may hold the others as channels: ``denoiser(bitmap, "albedo", "normals", to_sensor)``, or by keyword,
         ``albedo_ch="albedo", normals_ch="normals"``. ``noisy_ch`` is the layer to denoise, by default the root.

@@ -33,7 +33,7 @@ LAYERS: dict[str, Layer] = {
         Layer("albedo", RGB, False, "reflectance at the first non-specular vertex, in [0, 1]"),
         Layer("normal", XYZ, False, "unit shading normal there, camera space: +x right, +y up, +z toward the viewer"),
         Layer("depth", ("Z",), True, "path length from the camera to that vertex, world units, 0 where it escapes"),
-        Layer("primal_var", RGB, True, "sample variance of the pixel mean of primal (already divided by spp)"),
+        Layer("primal_var", RGB, True, "sample variance of the pixel mean of primal - caustic (divided by spp)"),
         Layer("caustic_var", RGB, True, "sample variance of the pixel mean of caustic"),
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),

@@ -17,7 +17,7 @@ from ngpt.io.exr import pass_through, with_channels
 from ngpt.stack import GradientStack
 
 # Layers with a variance, and the layers that hold it.
-VARIANCES = {"primal": "primal_var", "dx": "dx_var", "dy": "dy_var"}
+VARIANCES = {"primal": "primal_var", "dx": "dx_var", "dy": "dy_var", "caustic": "caustic_var"}
 # Channels beside the layers that are means over samples too.
 DIAGNOSTICS = "diagnostics."
 
@@ -51,7 +51,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     for name, variance in VARIANCES.items():
         known = all(variance in stack or n == 1 for stack, n in zip(stacks, counts, strict=True))
         if name in layers and known:
-            layers[variance] = _variance(stacks, counts, name, variance)
+            layers[variance] = _variance([_varies(stack, name) for stack in stacks], stacks, counts, variance)
     attributes = dict(stacks[0].attributes) | {
         "ngpt:spp": total,
         "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
@@ -75,12 +75,22 @@ def _mean(layers: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
         return total / sum(weights)
 
 
-def _variance(stacks: Sequence[GradientStack], counts: Sequence[int], name: str, variance: str) -> np.ndarray:
-    mean = _mean([stack[name] for stack in stacks], counts)
+def _varies(stack: GradientStack, name: str) -> np.ndarray:
+    """What the variance of a layer is of: of the primal what is not in ``caustic``; in double precision."""
+    values = stack[name].astype(np.float64)
+    if name == "primal" and "caustic" in stack:
+        with np.errstate(invalid="ignore"):
+            values -= stack["caustic"]
+    return values
+
+
+def _variance(
+    means: Sequence[np.ndarray], stacks: Sequence[GradientStack], counts: Sequence[int], variance: str
+) -> np.ndarray:
+    mean = _mean(means, counts)
     squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
-        for stack, n in zip(stacks, counts, strict=True):
-            values = stack[name].astype(np.float64)
+        for values, stack, n in zip(means, stacks, counts, strict=True):
             there = ~np.isnan(values)
             within = n * (n - 1) * stack[variance].astype(np.float64) if n > 1 else 0.0
             squares += np.where(there, within + n * (values - mean) ** 2, 0)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
-from ngpt.denoisers import nfor, nlm, oidn
+from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
@@ -26,7 +26,7 @@ class Method:
 
     ``summary``  one line for the user
     ``needs``    layers of the stack it cannot do without
-    ``run``      Repaired, options -> (H, W, 3) float32 without direct emission
+    ``run``      Repaired, options -> (H, W, 3) float32 of the light that Repaired's ``image`` is of
     ``options``  the options it takes, with their defaults
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
     ``uses``     layers that it takes where the stack has them
@@ -42,6 +42,11 @@ class Method:
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
+
+    @property
+    def reads_gradients(self) -> bool:
+        """Whether it works on the light that gradients are the differences of; see ``ngpt.repair``."""
+        return "dx" in self.needs
 
 
 @dataclass(frozen=True)
@@ -226,10 +231,13 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
-    data = repair(stack)
+    reads_gradients = Shipped(name).reads_gradients(**(entry.options | options)) if own else entry.reads_gradients
+    data = repair(stack, reads_gradients)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **(entry.options | options)) + data.direct
+        if data.caustic is not None:
+            image += caustic.denoised(data)
     seconds = time.perf_counter() - start
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))

@@ -17,7 +17,7 @@ BLOCK = 8
 class Repaired:
     """What reconstruction works on.
 
-    ``image``    (H, W, 3) primal without direct emission, finite
+    ``image``    (H, W, 3) primal without direct emission, finite; for methods that read gradients without ``caustic``
     ``direct``   (H, W, 3) direct emission, finite, to be added back
     ``dx, dy``   (H, W, 3) gradients, finite (0 where they are not trusted), None where the stack has none
     ``trusted``  for dx and dy, (H, W) booleans, None if all of them are
@@ -26,6 +26,9 @@ class Repaired:
     ``pixels``   number of pixels whose primal was replaced
     ``gradients``  number of differences left out
     ``features``  albedo, normal and depth, those the stack holds, with 0 where they are not finite
+    ``caustic``  (H, W, 3) the light that was taken out of image since gradients hold none of it, finite, to be denoised
+                 by itself and added back; None where there is none
+    ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
     """
 
     image: np.ndarray
@@ -38,6 +41,8 @@ class Repaired:
     gradients: int
     features: dict[str, np.ndarray] = field(default_factory=dict)
     noise: np.ndarray | None = None
+    caustic: np.ndarray | None = None
+    caustic_var: np.ndarray | None = None
 
     def known_variances(self) -> dict[str, np.ndarray]:
         """Those of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
@@ -46,8 +51,11 @@ class Repaired:
         return {} if self.noise is None else {"primal_var": self.noise}
 
 
-def repair(stack: GradientStack) -> Repaired:
+def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     """Separates direct emission, replaces non-finite pixels and finds the gradients that cannot be trusted.
+
+    ``gradients``  whether this is for a method that reads gradients: it works on what they are the differences of,
+                   without ``caustic``. All others see the whole primal, and the variance of all of it.
 
     A difference is not trusted if it is not finite itself or one of its two pixels was not. Raises NgptError when the
     primal has no finite pixel at all.
@@ -55,20 +63,33 @@ def repair(stack: GradientStack) -> Repaired:
     primal = stack["primal"]
     direct = stack["direct"] if "direct" in stack else np.zeros_like(primal)
     good = _finite_pixels(primal) & _finite_pixels(direct)
+    caustic = stack["caustic"] if "caustic" in stack and stack["caustic"].any() else None
+    if caustic is not None:
+        good &= _finite_pixels(caustic)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
     # Copies only of what changes: layers of large images are large.
-    if good.all():
-        image = primal - direct if direct.any() else primal
-    else:
-        image, direct = _from_neighbours(primal, direct, good), np.where(good[..., None], direct, 0)
+    image = primal
+    # What is not finite may be Inf - Inf here; it is replaced below.
+    with np.errstate(invalid="ignore"):
+        if direct.any():
+            image = image - direct
+        if caustic is not None and gradients:
+            image = image - caustic
+    if not good.all():
+        image, direct = _from_neighbours(image, good), np.where(good[..., None], direct, 0)
+        caustic = None if caustic is None else _from_neighbours(caustic, good)
     features = {name: _finite(stack[name]) for name in ("albedo", "normal", "depth") if name in stack}
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
     known = good & ~direct.any(axis=-1) if direct.any() else good
-    noise = _where(known, stack["primal_var"]) if "primal_var" in stack else None
+    noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
+    apart: dict[str, Any] = {}
+    if caustic is not None and gradients:
+        variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
+        apart = {"caustic": caustic, "caustic_var": variance}
     if "dx" not in stack or "dy" not in stack:
-        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features, noise)
-    gradients, trusted = [], []
+        return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features, noise, **apart)
+    differences, trusted = [], []
     for name, axis in (("dx", 1), ("dy", 0)):
         both = good.copy()
         here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
@@ -80,15 +101,28 @@ def repair(stack: GradientStack) -> Repaired:
         if not both.all() or layer[border].any():
             layer = np.where(both[..., None], layer, 0)
             layer[border] = 0
-        gradients.append(layer)
+        differences.append(layer)
         trusted.append(both)
     lost = int(sum(np.sum(~t) for t in trusted))
     flags = (trusted[0], trusted[1]) if lost else None
     variances = None
     if noise is not None and "dx_var" in stack and "dy_var" in stack:
         variances = (noise, _where(trusted[0], stack["dx_var"]), _where(trusted[1], stack["dy_var"]))
-    dx, dy = gradients
-    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features, noise)
+    dx, dy = differences
+    return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features, noise, **apart)
+
+
+def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndarray:
+    """The variance of the primal, (H, W, 3): with ``gradients`` of what they are the differences of, else of all of it.
+
+    All of it is not known, and NaN, where there is light in ``caustic`` and no ``caustic_var``.
+    """
+    variance = stack["primal_var"]
+    if gradients or "caustic" not in stack or not stack["caustic"].any():
+        return variance
+    if "caustic_var" in stack:
+        return variance + stack["caustic_var"]
+    return np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
 
 
 def _finite_pixels(layer: np.ndarray) -> np.ndarray:
@@ -107,13 +141,13 @@ def _where(flags: np.ndarray, variance: np.ndarray) -> np.ndarray:
     return variance if flags.all() else np.where(flags[..., None], variance, np.float32(np.nan))
 
 
-def _from_neighbours(primal: np.ndarray, direct: np.ndarray, good: np.ndarray) -> np.ndarray:
-    """primal - direct, with pixels that are not good replaced.
+def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
+    """The light (H, W, 3), with pixels that are not good replaced.
 
     By the mean of the good ones among their eight neighbours, or where there is none, in the inside of a larger hole,
     by the mean of those in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
     """
-    image = np.subtract(primal, direct, where=good[..., None], out=np.zeros_like(primal))
+    image = np.where(good[..., None], light, np.float32(0))
     weight = uniform_filter(good.astype(np.float64), 3, mode="constant")
     mean = uniform_filter(image.astype(np.float64), (3, 3, 1), mode="constant")
     near = ~good & (weight > 1e-6)

@@ -67,7 +67,7 @@ def test_sizes_names_and_membership():
     ("layers", "expected"),
     [
         ({}, "needs at least one layer"),
-        ({"primal": image(), "gx": image()}, "no layer is called 'gx'; the layers are primal, direct, dx"),
+        ({"primal": image(), "gx": image()}, "no layer is called 'gx'; the layers are primal, direct, caustic, dx"),
         ({"primal": image().astype(complex)}, "layer 'primal' is of type complex128; convert it to float32"),
         ({"primal": image() > 1}, "layer 'primal' is of type bool"),
         ({"primal": image().astype(object)}, "layer 'primal' is of type object"),

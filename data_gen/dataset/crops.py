@@ -116,11 +116,14 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
     converged = render_stack(around.scene, config.reference_spp, seeds[-1], config.sampler)
-    reference = denoise(converged, method=config.reference_method)
+    reference, caustic = references(converged, config.reference_method)
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
     direct = np.nan_to_num(converged["direct"], posinf=0)
-    data = CropData([stack for stack, _ in cleaned], counts, np.maximum(reference, direct), direct)
+    light = np.maximum(reference, direct)
+    data = CropData(
+        [stack for stack, _ in cleaned], counts, light if caustic is None else light + caustic, direct, caustic
+    )
     told = {
         "crop": crop,
         "spp": counts,
@@ -132,6 +135,16 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
     return data, told
 
 
+def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """The clean image without the light of the layer ``caustic``, and that light; None where there is no such layer."""
+    image = denoise(converged, method=method)
+    if "caustic" not in converged:
+        return image, None
+    none = np.zeros_like(image)
+    rest = denoise(converged.replace(primal=converged["primal"] - converged["caustic"], caustic=none), method=method)
+    return rest, image - rest
+
+
 def finite(stack: GradientStack) -> tuple[GradientStack, int]:
     """The stack without values that are not finite, and how many pixels or differences had some.
 
@@ -140,6 +153,9 @@ def finite(stack: GradientStack) -> tuple[GradientStack, int]:
     """
     whole = repair(stack)
     layers = {"primal": whole.image + whole.direct, "direct": whole.direct}
+    if "caustic" in stack:
+        layers["caustic"] = np.zeros_like(whole.image) if whole.caustic is None else whole.caustic
+        layers["primal"] = layers["primal"] + layers["caustic"]
     if whole.dx is not None:
         layers |= {"dx": whole.dx, "dy": whole.dy}
     bad = whole.pixels + whole.gradients

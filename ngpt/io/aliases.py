@@ -26,8 +26,9 @@ class Alias(NamedTuple):
 # moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
 # V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
-    *(Alias(name, "ngpt", name) for name in LAYERS if name != "direct"),
+    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic")),
     Alias("direct", "ngpt", "direct", "only beside dx or dy: elsewhere `direct` is direct lighting"),
+    Alias("caustic", "ngpt", "caustic", "only beside dx, dy or caustic_var: elsewhere it may be any light"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),
     Alias("primal", "RenderMan", "Ci"),
@@ -85,6 +86,8 @@ _LOOKS = {
     "dx": ("gradientx", "gradx"),
     "dy": ("gradienty", "grady"),
 }
+# Names that mean something else in files that are not ours, and what shows that a file is.
+_OWN = {"direct": {"dx", "dy"}, "caustic": {"dx", "dy", "caustic_var"}}
 # How names of variances and errors end.
 _NOISE = ("var", "variance", "mse", "error")
 
@@ -167,8 +170,9 @@ def resolve(
         # The root of a multi-part file may be a part called `albedo`, say, and then it is no primal.
         if name != "primal" and "primal" not in overrides and other[:2] == primal[:2]:
             raise _no_primal(groups, path)
-    if "direct" in found and "direct" not in overrides and not {"dx", "dy"} & found.keys():
-        del found["direct"]
+    for name, beside in _OWN.items():
+        if name in found and name not in overrides and not beside & found.keys():
+            del found[name]
     if "alpha" not in found:
         own = next((group for group in groups if group.part == primal.part and group.name == primal.name), None)
         if own and "A" in own.channels:

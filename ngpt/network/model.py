@@ -139,6 +139,11 @@ class ModelConfig:
         """The layers a stack must hold, by the names of the contract."""
         return inputs.needs(self.layers, self.base, self.optional)
 
+    @property
+    def reads_gradients(self) -> bool:
+        """Whether it works on the light that gradients are the differences of; see ``ngpt.repair``."""
+        return "dx" in self.needs
+
     def to_dict(self) -> dict[str, Any]:
         """The fields as TOML and JSON have them."""
         return asdict(self)

@@ -40,8 +40,16 @@ class Shipped:
             return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
         return self.also_missing()
 
+    def reads_gradients(self, weights: str, device: str, memory: int) -> bool:
+        """Whether ``run`` with these options works on what gradients are the differences of; see ``ngpt.repair``."""
+        path = Path(weights or self.path)
+        if path.suffix != ".safetensors":
+            network = run_onnx.Network(path, device)
+            return "dx" in inputs.needs(network.inputs, network.base, network.optional)
+        return "dx" in self._torch(path).config_of(path, device).needs
+
     def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
-        """The image (H, W, 3) float32, scene-linear, without direct emission.
+        """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of.
 
         ``weights``  a file instead of the shipped one: .onnx runs in ONNX Runtime, .safetensors in PyTorch
         ``device``   one of the runtime's, or "auto"
@@ -55,9 +63,12 @@ class Shipped:
             reader = f"weights {path}"
             layers = inputs.gather(data, names, network.base, reader, network.optional, network.emission, estimate=True)
             return inputs.without_emission(network.reconstruct(layers, memory=memory), data, network.emission)
+        return self._torch(path).run(data, path, device)
+
+    def _torch(self, path: Path) -> Any:
+        """``ngpt.network.run_torch``: torch takes seconds to come in."""
         if find_spec("torch") is None or find_spec("safetensors") is None:
             raise NgptError(f"weights {path}: to run them needs PyTorch: pip install 'ngpt-recon[train]'")
-        # torch takes seconds to come in.
         from ngpt.network import run_torch
 
-        return run_torch.run(data, path, device)
+        return run_torch

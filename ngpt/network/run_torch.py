@@ -20,13 +20,18 @@ from ngpt.repair import Repaired
 TILE = 640
 
 
+def config_of(path: str | Path, device: str = "auto") -> ModelConfig:
+    """The configuration of the weights of that file, which are loaded as ``run`` needs them."""
+    return _loaded(path, device).config
+
+
 def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE) -> np.ndarray:
-    """The image (H, W, 3) float32, scene-linear, without direct emission, by the weights of that file.
+    """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of, by that file's weights.
 
     ``device`` is one of PyTorch's, or "auto": a GPU where there is one. Tiles overlap by what the network sees, so that
     their size does not change the result. Raises NgptError for weights that cannot be read, and layers they need.
     """
-    model = _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
+    model = _loaded(path, device)
     read = layers_of(data, model.config, f"weights {path}", estimate=True)
     layers = {name: layer[None] for name, layer in read.items()}
     image = reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
@@ -78,6 +83,10 @@ def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[sl
 
 def _within(inner: slice, outer: slice) -> slice:
     return slice(inner.start - outer.start, inner.stop - outer.start)
+
+
+def _loaded(path: str | Path, device: str) -> Reconstructor:
+    return _model(str(path), os.stat(path).st_mtime_ns if Path(path).is_file() else 0, device)
 
 
 @lru_cache(maxsize=4)

@@ -20,6 +20,7 @@ Layers = dict[str, Tensor]
 # Layers with three colours that change with those of the light, and with those of the surfaces.
 _LIGHT = RADIANCE | {"target"}
 _COLOR = _LIGHT | {"albedo"}
+_VARIANCES = ("primal_var", "dx_var", "dy_var", "caustic_var")
 
 
 @dataclass(frozen=True)
@@ -74,20 +75,24 @@ class Augmentation:
         return result
 
 
-def quieter(stack: GradientStack, reference: np.ndarray, direct: np.ndarray, factor: float) -> GradientStack:
+def quieter(
+    stack: GradientStack, reference: np.ndarray, direct: np.ndarray, caustic: np.ndarray, factor: float
+) -> GradientStack:
     """The stack with ``factor`` times its noise, as of 1 / factor² times the samples: a mean with the reference.
 
-    ``reference`` (H, W, 3) includes emission seen directly, ``direct`` is that alone. Features stay as they are.
+    ``reference`` (H, W, 3) includes emission seen directly and the light of the layer ``caustic``; ``direct`` and
+    ``caustic`` are these alone. Features stay as they are.
     """
-    light = reference - direct
+    light = reference - direct - caustic
     truth = {
         "primal": reference,
         "direct": direct,
+        "caustic": caustic,
         "dx": np.diff(light, axis=1, append=light[:, -1:]),
         "dy": np.diff(light, axis=0, append=light[-1:]),
     }
     layers = {name: factor * stack[name] + (1 - factor) * truth[name] for name in truth if name in stack}
-    layers |= {name: factor**2 * stack[name] for name in ("primal_var", "dx_var", "dy_var") if name in stack}
+    layers |= {name: factor**2 * stack[name] for name in _VARIANCES if name in stack}
     return stack.replace(**layers)
 
 

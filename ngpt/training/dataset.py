@@ -21,7 +21,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
-from ngpt.training.shards import GRADIENTS, INPUTS, Shard, tensor_names
+from ngpt.training.shards import CAUSTIC, GRADIENTS, OF_INPUTS, REFERENCE_CAUSTIC, Shard, tensor_names
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
@@ -51,9 +51,9 @@ class Crop:
         """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite."""
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
-        names = [name for name in self.shard.names if name in INPUTS | GRADIENTS]
+        names = [name for name in self.shard.names if name in OF_INPUTS]
         layers = {name: self.shard.input(name, self.index, k) for name in names}
-        layers["primal"] = layers.pop("indirect") + layers["direct"]
+        layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
         attributes = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
@@ -62,12 +62,19 @@ class Crop:
     @property
     def reference(self) -> np.ndarray:
         """(H, W, 3) float32, the converged image, emission seen directly included."""
-        return self.shard.crop("reference_indirect", self.index) + self.reference_direct
+        return self.shard.crop("reference_indirect", self.index) + self.reference_direct + self.reference_caustic
 
     @property
     def reference_direct(self) -> np.ndarray:
         """(H, W, 3) float32, that emission alone."""
         return self.shard.crop("reference_direct", self.index)
+
+    @property
+    def reference_caustic(self) -> np.ndarray:
+        """(H, W, 3) float32, what of it the layer ``caustic`` of the inputs estimates; zeros where they have none."""
+        if REFERENCE_CAUSTIC in self.shard.names:
+            return self.shard.crop(REFERENCE_CAUSTIC, self.index)
+        return np.zeros_like(self.reference_direct)
 
 
 class Dataset:
@@ -169,7 +176,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     shard, crops = Shard(path), entry["crops"]
     if not crops:
         return shard
-    names = tensor_names(gradients=not GRADIENTS.keys().isdisjoint(shard.names))
+    names = tensor_names(*(not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC)))
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
@@ -181,8 +188,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         expected: tuple[int, ...] = (len(crops), height, width, 3)
         if name == "spp":
             expected = (len(crops), inputs)
-        elif name in INPUTS | GRADIENTS:
-            expected = (len(crops), inputs, height, width, (INPUTS | GRADIENTS)[name])
+        elif name in OF_INPUTS:
+            expected = (len(crops), inputs, height, width, OF_INPUTS[name])
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):

@@ -36,6 +36,9 @@ class Crop(Protocol):
     @property
     def reference_direct(self) -> np.ndarray: ...
 
+    @property
+    def reference_caustic(self) -> np.ndarray: ...
+
 
 class StackCrop:
     """The stacks of one folder and the reference they share."""
@@ -43,7 +46,10 @@ class StackCrop:
     def __init__(self, folder: Path, stacks: list[Path], reference: Path):
         self.scene, self.inputs = folder.name, len(stacks)
         self._stacks, self._reference = stacks, reference
-        self.spp = tuple(int(read(str(path)).attributes.get("ngpt:spp", 0)) for path in stacks)
+        held = [read(str(path)) for path in stacks]
+        self.spp = tuple(int(stack.attributes.get("ngpt:spp", 0)) for stack in held)
+        self._caustic = ["caustic" in stack for stack in held]
+        self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
 
     def stack(self, k: int) -> GradientStack:
         return read(str(self._stacks[k]))
@@ -61,6 +67,20 @@ class StackCrop:
             if "direct" in stack:
                 return stack["direct"]
         return np.zeros_like(stack["primal"])
+
+    @property
+    def reference_caustic(self) -> np.ndarray:
+        """Zeros if the stacks have no such layer; raises NgptError if the reference or some of them lack it."""
+        reference = read(str(self._reference))
+        if all(self._caustic) and "caustic" in reference:
+            return reference["caustic"]
+        if not self._lit:
+            return np.zeros_like(reference["primal"])
+        lacking = self._reference if all(self._caustic) else self._stacks[self._caustic.index(False)]
+        raise NgptError(
+            f"{lacking}: has no layer 'caustic', but other files of {self.scene} have: their gradients hold nothing of "
+            "that light, so a target must be without it; render all of them with --sampler gpt"
+        )
 
 
 class StackFolder(Sequence[StackCrop]):
@@ -168,7 +188,7 @@ class Examples(TorchDataset):
             return self._cache[which, k]
         crop = self.crops[which]
         stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
-        layers = layers_of(repair(stack), self.config)
+        layers = layers_of(repair(stack, self.config.reads_gradients), self.config)
         target = target_of(crop, self.config).transpose(2, 0, 1)
         layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
         size = sum(layer.numel() * layer.element_size() for layer in layers.values())
@@ -181,7 +201,8 @@ class Examples(TorchDataset):
         crop = self.crops[which]
         low, high = np.log(self.augmentation.quieter)
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
-        return quieter(crop.stack(int(np.argmax(crop.spp))), crop.reference, crop.reference_direct, factor)
+        best = crop.stack(int(np.argmax(crop.spp)))
+        return quieter(best, crop.reference, crop.reference_direct, crop.reference_caustic, factor)
 
     def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
         height, width = layers["primal"].shape[-2:]
@@ -195,7 +216,8 @@ class Examples(TorchDataset):
 
 def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
     """What a network of that configuration is to make of a crop's stacks, (H, W, 3)."""
-    return crop.reference if config.emission else crop.reference - crop.reference_direct
+    target = crop.reference if config.emission else crop.reference - crop.reference_direct
+    return target - crop.reference_caustic if config.reads_gradients else target
 
 
 def _scaled(layers: Layers) -> Layers:

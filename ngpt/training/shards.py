@@ -2,10 +2,13 @@
 
 Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-linear:
 
-    indirect, direct            primal - direct and direct: kept apart, or half floats would lose what a lamp outshines
+    indirect, direct            primal - direct - caustic, and direct: kept apart, or half floats would lose what a lamp
+                                outshines
     albedo, normal, depth
     primal_se                   standard errors: variances of small numbers would underflow in half floats
     dx, dy, dx_se, dy_se        all or none: inputs of a sampler without gradients have none
+    caustic, caustic_se         all three or none: light that dx and dy hold nothing of
+    reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
     spp                         (N, K) samples per pixel, int32
 
@@ -31,7 +34,10 @@ from ngpt.system.records import check, parse_json
 # Tensors of the inputs and their channels.
 GRADIENTS = {"dx": 3, "dy": 3, "dx_se": 3, "dy_se": 3}
 INPUTS = {"indirect": 3, "direct": 3, "albedo": 3, "normal": 3, "depth": 1, "primal_se": 3}
+CAUSTIC = {"caustic": 3, "caustic_se": 3}
+OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC
 REFERENCES = ("reference_indirect", "reference_direct")
+REFERENCE_CAUSTIC = "reference_caustic"
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -39,30 +45,40 @@ MAX_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class CropData:
-    """One crop as it was rendered: K finite stacks, and the converged image with and of directly seen emission."""
+    """One crop as it was rendered: K finite stacks, and the converged image.
+
+    ``reference`` is all of it, ``reference_direct`` the emission seen directly in it, and ``reference_caustic`` what
+    the layer ``caustic`` of the stacks estimates; None where they have no such layer.
+    """
 
     stacks: Sequence[GradientStack]
     spp: Sequence[int]
     reference: np.ndarray
     reference_direct: np.ndarray
+    reference_caustic: np.ndarray | None = None
 
     def tensors(self) -> dict[str, np.ndarray]:
         inputs = [_input_tensors(stack) for stack in self.stacks]
         tensors = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
         tensors["reference_indirect"] = self.reference - self.reference_direct
         tensors["reference_direct"] = self.reference_direct
+        if self.reference_caustic is not None:
+            tensors["reference_indirect"] = tensors["reference_indirect"] - self.reference_caustic
+            tensors[REFERENCE_CAUSTIC] = self.reference_caustic
         tensors["spp"] = np.array(self.spp, np.int32)
         return tensors
 
 
-def tensor_names(gradients: bool) -> tuple[str, ...]:
-    """The tensors of a shard whose inputs have gradients, or have none."""
-    return (*INPUTS, *(GRADIENTS if gradients else ()), *REFERENCES, "spp")
+def tensor_names(gradients: bool, caustic: bool = False) -> tuple[str, ...]:
+    """The tensors of a shard whose inputs have gradients, or have none; and the layer ``caustic``, or not."""
+    further = (*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()
+    return (*INPUTS, *(GRADIENTS if gradients else ()), *further, *REFERENCES, "spp")
 
 
 def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
-    tensors = {"indirect": stack["primal"] - stack["direct"]}
-    for name in (*INPUTS, *(GRADIENTS if "dx" in stack else ())):
+    caustic = "caustic" in stack
+    tensors = {"indirect": stack["primal"] - stack["direct"] - (stack["caustic"] if caustic else 0)}
+    for name in (*INPUTS, *(GRADIENTS if "dx" in stack else ()), *(CAUSTIC if caustic else ())):
         if name.endswith("_se"):
             tensors[name] = np.sqrt(stack[name.removesuffix("_se") + "_var"])
         elif name != "indirect":

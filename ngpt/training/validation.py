@@ -53,7 +53,7 @@ def validate(
     primal, base, network, rows = [], [], [], []
     shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
     for index, (crop, k) in enumerate(views):
-        data = repair(crop.stack(k))
+        data = repair(crop.stack(k), model.config.reads_gradients)
         reference = target_of(crop, model.config)
         layers = {name: layer[None].to(device) for name, layer in layers_of(data, model.config).items()}
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):

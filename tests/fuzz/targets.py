@@ -120,7 +120,7 @@ class _Crop:
         return full_stack(16, 16)
 
     reference = property(lambda self: self.stack(0)["primal"])
-    reference_direct = property(lambda self: np.zeros((16, 16, 3), np.float32))
+    reference_direct = reference_caustic = property(lambda self: np.zeros((16, 16, 3), np.float32))
 
 
 def _trainer(folder: Path):

@@ -298,7 +298,7 @@ def test_overrides_beat_aliases_and_match_tails():
 @pytest.mark.parametrize(
     ("overrides", "expected"),
     [
-        ({"colour": "x"}, ["no layer is called 'colour'", "primal, direct, dx"]),
+        ({"colour": "x"}, ["no layer is called 'colour'", "primal, direct, caustic, dx"]),
         ({"albedo": "Paint"}, ['--layer albedo="Paint"', "fits no layer", '"root" (R G B)', '"N" (X Y Z)']),
         ({"dx": "albed"}, ['--layer dx="albed"', "fits no layer"]),
         ({"dx": "uv"}, ['--layer dx="uv"', "fits no layer with channels R G B", '"uv" (U V)']),

@@ -20,6 +20,7 @@ class SyntheticCrop:
         self.scene, self.seed, self.size = scene, seed, size
         self.reference = image.astype(np.float32)
         self.reference_direct = np.zeros_like(self.reference)
+        self.reference_caustic = np.zeros_like(self.reference)
         self.features = {
             "albedo": np.clip(self.reference, 0, 1),
             "normal": np.broadcast_to(np.float32([0, 0, 1]), image.shape),

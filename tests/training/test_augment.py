@@ -92,22 +92,23 @@ def test_nothing_happens_when_everything_is_off():
 def test_a_quieter_stack_has_a_part_of_the_noise():
     """Errors and standard errors of all layers shrink alike, and the stack stays one."""
     rng = np.random.default_rng(3)
-    light, direct = rng.random((6, 9, 3), np.float32), np.zeros((6, 9, 3), np.float32)
-    direct[2, 3] = 7
-    truth = {"primal": light + direct, "direct": direct}
+    light, direct, caustic = rng.random((6, 9, 3), np.float32), *np.zeros((2, 6, 9, 3), np.float32)
+    direct[2, 3], caustic[4, 5] = 7, 3
+    whole = light + direct + caustic
+    truth = {"primal": whole, "direct": direct, "caustic": caustic}
     truth |= {"dx": np.diff(light, axis=1, append=light[:, -1:]), "dy": np.diff(light, axis=0, append=light[-1:])}
     noisy = {name: layer + rng.standard_normal((6, 9, 3), np.float32) for name, layer in truth.items()}
-    variances = {f"{name}_var": rng.random((6, 9, 3), np.float32) for name in ("primal", "dx", "dy")}
+    variances = {f"{name}_var": rng.random((6, 9, 3), np.float32) for name in ("primal", "dx", "dy", "caustic")}
     albedo = rng.random((6, 9, 3), np.float32)
     stack = GradientStack.from_arrays(**noisy, **variances, albedo=albedo, attributes={"ngpt:spp": 4})
-    result = quieter(stack, light + direct, direct, 0.1)
+    result = quieter(stack, whole, direct, caustic, 0.1)
     for name, layer in truth.items():
         assert np.allclose(result[name] - layer, 0.1 * (noisy[name] - layer), atol=1e-5)
     for name, layer in variances.items():
         assert np.allclose(result[name], 0.01 * layer)
     assert np.array_equal(result["albedo"], albedo) and np.array_equal(stack["primal"], noisy["primal"])
     bare = GradientStack.from_arrays(primal=noisy["primal"])
-    assert quieter(bare, light + direct, direct, 0.1).names == ("primal",)
+    assert quieter(bare, whole, direct, caustic, 0.1).names == ("primal",)
 
 
 @pytest.mark.parametrize("factors", [(0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3)])

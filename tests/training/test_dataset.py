@@ -17,18 +17,25 @@ from ngpt.training.shards import MAX_LOSS, CropData, Shard, smallest_float, writ
 pytest.importorskip("safetensors")
 
 
-def crop_data(rng, scale=1.0, inputs=2, size=8):
+def crop_data(rng, scale=1.0, inputs=2, size=8, caustic=False):
     def layers():
         made = {name: scale * rng.random((size, size, 3)) for name in ("direct", "dx", "dy")}
         made["primal"] = made["direct"] + scale * rng.random((size, size, 3))
         made |= {name: rng.random((size, size, 3)) for name in ("albedo", "normal")} | {
             "depth": rng.random((size, size))
         }
-        return made | {f"{name}_var": scale**2 * rng.random((size, size, 3)) for name in ("primal", "dx", "dy")}
+        varying = ["primal", "dx", "dy"]
+        if caustic:
+            varying.append("caustic")
+            made["caustic"] = scale * rng.random((size, size, 3))
+            made["primal"] = made["primal"] + made["caustic"]
+        return made | {f"{name}_var": scale**2 * rng.random((size, size, 3)) for name in varying}
 
     stacks = [GradientStack(layers()) for _ in range(inputs)]
     direct = np.float32(scale * rng.random((size, size, 3)))
-    return CropData(stacks, [2, 9][:inputs], direct + np.float32(scale), direct)
+    light = np.float32(scale * rng.random((size, size, 3))) if caustic else None
+    reference = direct + np.float32(scale) + (light if caustic else 0)
+    return CropData(stacks, [2, 9][:inputs], reference, direct, light)
 
 
 @pytest.fixture
@@ -36,7 +43,7 @@ def folder(tmp_path, rng):
     """A training set of two shards, with 2 and 1 crops of two scenes; and what is in it."""
     given, entries = [], []
     for scene, count in (("a", 2), ("b", 1)):
-        crops = [crop_data(rng) for _ in range(count)]
+        crops = [crop_data(rng, caustic=scene == "b") for _ in range(count)]
         path = tmp_path / "shards" / f"{scene}-000.safetensors"
         path.parent.mkdir(exist_ok=True)
         told = [{"spp": list(crop.spp), "seconds": {"inputs": 1.0}} for crop in crops]
@@ -78,6 +85,8 @@ def test_what_is_written_is_read_back(folder):
         assert (crop.inputs, crop.spp) == (2, (2, 9))
         np.testing.assert_allclose(crop.reference, expected.reference, rtol=2e-3)
         np.testing.assert_allclose(crop.reference_direct, expected.reference_direct, atol=1e-3)
+        light = 0 if expected.reference_caustic is None else expected.reference_caustic
+        np.testing.assert_allclose(crop.reference_caustic, light, atol=1e-3)
         for k in range(2):
             stack = crop.stack(k)
             assert set(stack.names) == set(expected.stacks[k].names)

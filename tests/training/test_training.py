@@ -221,6 +221,52 @@ def test_a_network_that_sees_emission_learns_the_same_whether_it_is_kept_aside_o
     assert np.allclose(scores[0].network, scores[1].network, rtol=1e-3)
 
 
+class CausticCrop(SyntheticCrop):
+    """With light that gradients hold nothing of, in a layer of its own."""
+
+    def __init__(self):
+        super().__init__("caustic", 0)
+        self.plain = self.reference
+        self.reference_caustic = np.where(np.random.default_rng(1).random(self.reference.shape) > 0.9, 2, 0)
+        self.reference_caustic = self.reference_caustic.astype(np.float32)
+        self.reference = self.plain + self.reference_caustic
+
+    def stack(self, k):
+        stack = SyntheticCrop("caustic", 0).stack(k)
+        caustic = self.reference_caustic
+        return stack.replace(primal=stack["primal"] + caustic, caustic=caustic, caustic_var=0 * caustic)
+
+
+def test_targets_hold_what_the_inputs_estimate():
+    """Networks with gradients make the image without the layer ``caustic``, all others the whole of it."""
+    plain = {"network": "plain", "units": [], "inputs": ["primal", "albedo"], "start": ["primal"]}
+    whole = from_dict({"model": SETTINGS["model"] | plain}, "test").model
+    for config, with_layer in ((settings().model, False), (whole, True)):
+        crop = CausticCrop()
+        drawn = examples.Examples([crop], config, Augmentation(quieter=(0.1, 0.5)), 32, seed=0)
+        target = examples.target_of(crop, config)
+        assert np.allclose(target, crop.reference if with_layer else crop.plain)
+        errors = [drawn._layers(0, k)["primal"] - drawn._layers(0, k)["target"] for k in range(3)]
+        assert max(float(error.abs().max()) for error in errors) < 2
+
+
+def test_folders_with_a_layer_that_the_reference_lacks_are_refused(tmp_path):
+    crop, view = CausticCrop(), tmp_path / "view"
+    view.mkdir()
+    ngpt.write(view / "a.exr", crop.stack(0))
+    ngpt.write(view / "reference.exr", crop.reference)
+    with pytest.raises(NgptError, match=r"reference\.exr: has no layer 'caustic', but other files of view have"):
+        _ = examples.open_crops(tmp_path)[0].reference_caustic
+    stack = crop.stack(1)
+    ngpt.write(view / "reference.exr", stack, overwrite=True)
+    assert np.array_equal(examples.open_crops(tmp_path)[0].reference_caustic, crop.reference_caustic)
+    ngpt.write(view / "b.exr", SyntheticCrop("caustic", 0).stack(0))
+    with pytest.raises(NgptError, match=r"b\.exr: has no layer 'caustic'"):
+        _ = examples.open_crops(tmp_path)[0].reference_caustic
+    (view / "a.exr").unlink()
+    assert not examples.open_crops(tmp_path)[0].reference_caustic.any()
+
+
 def test_the_best_input_is_shown_once_more_with_less_noise():
     s = settings()
     crop = SyntheticCrop("noisy", 0)

@@ -1,0 +1,143 @@
+"""The layer ``caustic``: taken out for methods that read gradients, left in for all others, and added back denoised."""
+
+import numpy as np
+import pytest
+from full_stack import full_stack
+
+import ngpt
+from ngpt.io.aliases import resolve
+from ngpt.io.exr import read, read_exr, write
+from ngpt.merging import merge
+from ngpt.methods import METHODS, reconstruct
+from ngpt.repair import repair, variance_of_primal
+from ngpt.stack import GradientStack
+
+SIZE = (20, 27)
+SPARKS = np.s_[3:17:5, 2:25:6]
+
+
+def with_caustic(stack, scale=1.0):
+    """The stack with rare bright light in ``caustic``, which its primal holds too and its gradients do not."""
+    caustic = np.zeros_like(stack["primal"])
+    caustic[SPARKS] = scale * np.float32([40, 30, 20])
+    return stack.replace(primal=stack["primal"] + caustic, caustic=caustic, caustic_var=caustic**2 / 16)
+
+
+def test_methods_with_gradients_work_on_what_gradients_are_differences_of():
+    stack = full_stack(*SIZE)
+    data, plain = repair(with_caustic(stack)), repair(stack)
+    assert np.allclose(data.image, plain.image, atol=1e-5)
+    assert np.array_equal(data.noise, plain.noise)
+    assert np.array_equal(data.caustic, with_caustic(stack)["caustic"])
+
+
+def test_other_methods_see_all_light_and_all_its_variance():
+    stack = with_caustic(full_stack(*SIZE))
+    data = repair(stack, gradients=False)
+    assert data.caustic is None
+    assert np.array_equal(data.image, stack["primal"])
+    assert np.array_equal(data.noise, stack["primal_var"] + stack["caustic_var"])
+
+
+def test_without_its_variance_that_of_the_sum_is_not_known():
+    stack = with_caustic(full_stack(*SIZE))
+    layers = {name: stack[name] for name in stack.names if name != "caustic_var"}
+    variance = variance_of_primal(GradientStack(layers))
+    assert np.isnan(variance[SPARKS]).all()
+    assert np.isnan(variance).sum() == variance[SPARKS].size
+
+
+def test_an_empty_layer_changes_nothing():
+    stack = full_stack(*SIZE)
+    empty = stack.replace(caustic=np.zeros_like(stack["primal"]), caustic_var=np.zeros_like(stack["primal"]))
+    for method in ("primal", "l1", "wcv", "nfor"):
+        assert np.array_equal(ngpt.denoise(empty, method), ngpt.denoise(stack, method)), method
+    assert repair(empty).caustic is None
+
+
+@pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2"])
+def test_its_light_is_added_back_once(method):
+    stack = full_stack(*SIZE)
+    lit, added = with_caustic(stack), with_caustic(stack)["caustic"].sum(dtype=np.float64)
+    more = (ngpt.denoise(lit, method).astype(np.float64) - ngpt.denoise(stack, method)).sum()
+    assert more == pytest.approx(added, rel=0.03)
+
+
+def test_the_identity_keeps_it_to_the_bit():
+    stack = with_caustic(full_stack(*SIZE))
+    assert np.array_equal(ngpt.denoise(stack, "primal"), stack["primal"])
+
+
+@pytest.mark.parametrize("method", ["l1", "wcv"])
+@pytest.mark.parametrize("power", [-10, 10])
+def test_brightness_is_a_unit(method, power):
+    dim = ngpt.denoise(with_caustic(full_stack(*SIZE)), method)
+    bright = ngpt.denoise(with_caustic(full_stack(*SIZE, scale=2.0**power), scale=2.0**power), method)
+    assert np.allclose(bright, 2.0**power * dim, rtol=0.01, atol=1e-4 * 2.0**power)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_pixels_that_are_not_finite_are_repaired_and_counted(bad):
+    stack = with_caustic(full_stack(*SIZE))
+    caustic = stack["caustic"].copy()
+    caustic[8, 8, 1] = caustic[3, 2] = bad
+    broken = stack.replace(caustic=caustic, primal=stack["primal"] + np.where(np.isfinite(caustic), 0, bad))
+    for gradients in (True, False):
+        data = repair(broken, gradients)
+        assert data.pixels == 2
+        assert np.isfinite(data.image).all()
+    data = repair(broken)
+    assert np.isfinite(data.caustic).all()
+    assert np.isnan(data.caustic_var[8, 8]).all() and np.isnan(data.noise[8, 8]).all()
+    result = reconstruct(broken, "wcv")
+    assert result.repaired == 2 and result.untrusted == 8
+
+
+def test_files_keep_it_in_full_precision(tmp_path):
+    stack = with_caustic(full_stack(*SIZE), scale=1e4)
+    write(tmp_path / "stack.exr", stack)
+    part = read_exr(tmp_path / "stack.exr").parts[0]
+    assert {part.channels[f"{name}.R"].dtype for name in ("caustic", "caustic_var")} == {np.dtype(np.float32)}
+    again = read(tmp_path / "stack.exr")
+    write(tmp_path / "result.exr", ngpt.denoise(again, "wcv"), like=again)
+    for held in (again, read(tmp_path / "result.exr")):
+        for name in ("primal", "caustic", "caustic_var"):
+            assert np.array_equal(held[name], stack[name]), name
+
+
+def test_the_name_counts_only_in_files_of_ours():
+    def names(*layers):
+        return [f"{layer}.{c}" if layer else c for layer in layers for c in "RGB"]
+
+    assert "caustic" not in resolve([("", names("", "caustic"))])
+    assert "caustic" in resolve([("", names("", "caustic"))], {"caustic": "caustic"})
+    for beside in ("dx", "caustic_var"):
+        assert "caustic" in resolve([("", names("", "caustic", beside))])
+
+
+def test_merged_stacks_are_the_stack_of_all_samples(rng):
+    """The variance of the primal is that of what is not in the layer, between stacks too."""
+    samples = {"rest": 5 + rng.normal(size=(12, 5, 4, 3)), "caustic": rng.gamma(0.1, 10, (12, 5, 4, 3))}
+
+    def stack(part, seed):
+        n = len(samples["rest"][part])
+        means = {name: values[part].mean(axis=0) for name, values in samples.items()}
+        variances = {name: values[part].var(axis=0, ddof=1) / n for name, values in samples.items()}
+        layers = {"primal": means["rest"] + means["caustic"], "caustic": means["caustic"]}
+        layers |= {"primal_var": variances["rest"], "caustic_var": variances["caustic"]}
+        return GradientStack.from_arrays(attributes={"ngpt:spp": n, "ngpt:seed": str(seed)}, **layers)
+
+    merged, whole = merge([stack(np.s_[:4], 0), stack(np.s_[4:], 1)]), stack(np.s_[:], 2)
+    for name in whole.names:
+        assert np.allclose(merged[name], whole[name], rtol=1e-5, atol=1e-6), name
+
+
+def test_arrays_take_it():
+    stack = with_caustic(full_stack(*SIZE))
+    layers = {name: stack[name] for name in stack.names if name != "primal"}
+    assert np.array_equal(ngpt.denoise(stack["primal"], "wcv", **layers), ngpt.denoise(stack, "wcv"))
+
+
+def test_every_method_says_whether_it_reads_gradients():
+    without = {name for name, method in METHODS.items() if not method.reads_gradients}
+    assert without == {"primal", "ngpt-primal", "ngpt-colour", "nlm", "nfor"} | {n for n in METHODS if "oidn" in n}
