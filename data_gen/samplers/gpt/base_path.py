@@ -49,6 +49,7 @@ class Step:
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
     rough: mi.Bool  # behind x
     late: mi.Bool  # behind x
+    ends_late: mi.Bool  # or behind x1 at the latest
 
 
 def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, offsets) -> tuple[Step, mi.Float]:
@@ -92,7 +93,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     x_connectable = plan.materials.connectable(bsdf)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
-    L_bsdf, L_caustic = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0)
+    L_bsdf, L_caustic, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0), mi.Bool(False)
 
     # ------------------- The layer ``caustic`` -------------------
     if plan.caustic:
@@ -100,6 +101,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
+        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, plan.materials.sharp(x1, scene))
     step = Step(
         x=x,
         x_connectable=x_connectable,
@@ -129,6 +131,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         L_caustic=L_caustic,
         rough=rough,
         late=late,
+        ends_late=ends_late,
     )
     return step, η
 

@@ -154,7 +154,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     # ------------- BSDF sampling: reconnect, or part -------------
     joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
     # Beside a ghost as well, which walks but does not go on
-    parts = step.walks & ~joins
+    parts = step.walks & ~joins & ~step.ends_late
     none = mi.Bool(False)
     # What neither does is rejected: β' = 0, r = 0.
     move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none, path.rough)
@@ -262,10 +262,11 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
         kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
     )
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
+    # That of the base path is not here at all.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
-        allowed &= ~late & ~step.late
+        allowed &= ~(late | caustic.ends_late(kind == SMOOTH, connectable, plan.materials.sharp(y1, scene)))
     return Move(
         ray=ray,
         hit=hit,
