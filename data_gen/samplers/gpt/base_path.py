@@ -24,8 +24,8 @@ class Step:
     # Emitter sampling
     u_light: mi.Point2f
     light: mi.DirectionSample3f
-    light_weight: mi.Spectrum  # Le / p; Le V / p where emitters are not shared
-    lit: mi.Bool  # the sample is seen from x
+    light_weight: mi.Spectrum  # Le / p
+    lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
     u_lobe: mi.Float
@@ -64,13 +64,13 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, light_weight = scene.sample_emitter_direction(x, u_light, not plan.lights.shared, lit)
-    lit &= light.pdf != 0
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
-    if plan.lights.shared:
-        lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit)
+    light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
+    lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once: materials are virtual functions, and calls to them dear.
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
+    lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets])))
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
 
