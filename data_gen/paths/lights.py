@@ -112,5 +112,5 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     """
     if integrator.hide_emitters or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
-    si = scene.ray_intersect(ray, active)
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
     return si.emitter(scene, active).eval(si, active)

@@ -62,7 +62,6 @@ class Materials:
         rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
 
-
     def sharp(self, si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
         """Whether a path can leave vertex ``si`` by mirror, glass or sharp gloss alone, and no emitter is there."""
         bsdf = si.bsdf()
