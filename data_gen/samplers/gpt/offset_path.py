@@ -183,7 +183,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         # Rejected or at its end, it has nothing to set against the rest of the base path.
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
-        failed=path.failed | (step.goes_on & ~step.late & (r1 == 0)),
+        failed=path.failed | (step.goes_on & ~step.ends_late & (r1 == 0)),
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
         rough=move.rough,
