@@ -1,10 +1,13 @@
 """The layer ``caustic``: taken out for methods that read gradients, left in for all others, and added back denoised."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from full_stack import full_stack
 
 import ngpt
+from ngpt.denoisers import caustic
 from ngpt.io.aliases import resolve
 from ngpt.io.exr import read, read_exr, write
 from ngpt.merging import merge
@@ -18,9 +21,9 @@ SPARKS = np.s_[3:17:5, 2:25:6]
 
 def with_caustic(stack, scale=1.0):
     """The stack with rare bright light in ``caustic``, which its primal holds too and its gradients do not."""
-    caustic = np.zeros_like(stack["primal"])
-    caustic[SPARKS] = scale * np.float32([40, 30, 20])
-    return stack.replace(primal=stack["primal"] + caustic, caustic=caustic, caustic_var=caustic**2 / 16)
+    light = np.zeros_like(stack["primal"])
+    light[SPARKS] = scale * np.float32([40, 30, 20])
+    return stack.replace(primal=stack["primal"] + light, caustic=light, caustic_var=light**2)
 
 
 def test_methods_with_gradients_work_on_what_gradients_are_differences_of():
@@ -79,9 +82,9 @@ def test_brightness_is_a_unit(method, power):
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_pixels_that_are_not_finite_are_repaired_and_counted(bad):
     stack = with_caustic(full_stack(*SIZE))
-    caustic = stack["caustic"].copy()
-    caustic[8, 8, 1] = caustic[3, 2] = bad
-    broken = stack.replace(caustic=caustic, primal=stack["primal"] + np.where(np.isfinite(caustic), 0, bad))
+    light = stack["caustic"].copy()
+    light[8, 8, 1] = light[3, 2] = bad
+    broken = stack.replace(caustic=light, primal=stack["primal"] + np.where(np.isfinite(light), 0, bad))
     for gradients in (True, False):
         data = repair(broken, gradients)
         assert data.pixels == 2
@@ -141,3 +144,49 @@ def test_arrays_take_it():
 def test_every_method_says_whether_it_reads_gradients():
     without = {name for name, method in METHODS.items() if not method.reads_gradients}
     assert without == {"primal", "ngpt-primal", "ngpt-colour", "nlm", "nfor"} | {n for n in METHODS if "oidn" in n}
+
+
+def test_denoising_keeps_the_light_and_spreads_it():
+    stack = with_caustic(full_stack(*SIZE))
+    data = repair(stack)
+    image = caustic.denoised(data)
+    assert image.sum(dtype=np.float64) == pytest.approx(data.caustic.sum(dtype=np.float64), rel=1e-5)
+    flat = caustic.denoised(replace(data, features={}))
+    assert flat.std() < 0.2 * data.caustic.std()
+    # Surfaces of random colours and normals exchange less.
+    assert flat.std() < image.std() < data.caustic.std()
+
+
+def test_light_that_is_no_noise_stays_where_it_is():
+    edge = np.zeros((24, 30, 3), np.float32)
+    edge[:, 15:] = 2
+    data = repair(full_stack(24, 30).replace(primal=edge, caustic=edge, caustic_var=np.full_like(edge, 1e-4)))
+    assert np.abs(caustic.denoised(data) - edge).max() < 0.02
+
+
+def test_light_does_not_cross_from_surface_to_surface():
+    stack = with_caustic(full_stack(40, 40))
+    lit = stack["caustic"].copy()
+    lit[:, 20:] = 0
+    layers = {"albedo": np.full_like(lit, 0.5), "normal": np.zeros_like(lit), "depth": np.full((40, 40, 1), 3.0)}
+    layers["normal"][:, :20, 2] = layers["normal"][:, 20:, 0] = 3
+    image = caustic.denoised(repair(stack.replace(caustic=lit, caustic_var=lit**2, **layers)))
+    assert image[:, 20:].sum() < 0.01 * image.sum()
+
+
+def test_without_variance_all_of_it_may_be_noise():
+    stack = with_caustic(full_stack(*SIZE))
+    known = stack.replace(caustic_var=stack["caustic"] ** 2)
+    unknown = GradientStack({name: stack[name] for name in stack.names if name != "caustic_var"})
+    assert np.array_equal(caustic.denoised(repair(known)), caustic.denoised(repair(unknown)))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 9), (7, 1), (2, 2), (3, 70)])
+@pytest.mark.parametrize("scale", [1e-20, 1e18])
+def test_any_size_and_brightness(size, scale):
+    light = np.full((*size, 3), 3 * scale, np.float32)
+    light[0, 0] = -scale
+    stack = full_stack(*size).replace(caustic=light, caustic_var=np.full_like(light, np.inf))
+    image = caustic.denoised(repair(stack))
+    assert np.isfinite(image).all()
+    assert image.sum(dtype=np.float64) == pytest.approx(light.sum(dtype=np.float64), rel=1e-4)
