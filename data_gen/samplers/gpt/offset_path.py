@@ -197,6 +197,7 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
     x1 = step.x1
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
+
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
     J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
@@ -262,7 +263,7 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
         kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
     )
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
-    # That of the base path is not here at all.
+    # A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
