@@ -67,12 +67,18 @@ _CPP = """
 #include "caustic.hpp"
 int main() {
     const Layer whole = read_layer("raw", slurp("raw/layers.json"), "primal");
-    Layer primal = whole, added = take_out_caustic("raw", {"primal", "dx"}, primal);
+    Layer primal = whole, added = spread(take_out_caustic("raw", {"primal", "dx"}, primal));
     std::ofstream file("made.f32", std::ios::binary);
     for (const Layer *layer : {&primal, &added})
         file.write(reinterpret_cast<const char *>(layer->pixels.data()), layer->pixels.size() * sizeof(float));
     Layer other = whole;
-    const bool none = take_out_caustic("raw", {"primal", "albedo"}, other).pixels.empty();
+    const bool none = take_out_caustic("raw", {"primal", "albedo"}, other).empty();
+    // With an image of another denoiser, here one that darkens: as much light, too.
+    Layer dark = added;
+    for (float &x : dark.pixels) x *= 0.5f;
+    const Layer image = completed(read_layer("raw", slurp("raw/layers.json"), "caustic"), dark);
+    std::ofstream("completed.f32", std::ios::binary)
+        .write(reinterpret_cast<const char *>(image.pixels.data()), image.pixels.size() * sizeof(float));
     return none && other.pixels == whole.pixels ? 0 : 1;
 }
 """
@@ -93,7 +99,7 @@ def test_javascript(raw):
     check(stack, folder)
 
 
-def test_cpp(raw):
+def test_cpp(raw, monkeypatch):
     if shutil.which("g++") is None:
         pytest.skip("g++ is not installed")
     stack, folder = raw
@@ -114,3 +120,7 @@ def test_cpp(raw):
     )
     run("./main", folder=folder.parent)
     check(stack, folder)
+    made = np.fromfile(folder.parent / "completed.f32", "<f4").reshape(3, *SIZE).transpose(1, 2, 0)
+    monkeypatch.setattr(caustic, "oidn", lambda data, *_: 0.5 * caustic.denoised(repair(stack)))
+    expected = caustic.denoised(repair(stack), by_oidn=True)
+    assert np.abs(made - expected).max() < 1e-4 * expected.max()

@@ -81,21 +81,59 @@ inline Layer spread(const Layers &held) {
     return light;
 }
 
-// Takes the light out of `primal` if the folder holds any and the network reads gradients, and returns what is to be
-// added to its image; without pixels if there is nothing.
-inline Layer take_out_caustic(const std::string &folder, const std::vector<std::string> &inputs, Layer &primal) {
+// The mean of 65 x 65 pixels; beyond the border the image is mirrored, so that no light is lost there.
+inline Layer averaged(const Layer &image) {
+    Layer result = image;
+    const auto along = [&](int lines, int length, ptrdiff_t line, ptrdiff_t step) {
+        const auto mirrored = [=](int i) {
+            i = (i % (2 * length) + 2 * length) % (2 * length);
+            return ptrdiff_t(i < length ? i : 2 * length - 1 - i) * step;
+        };
+        std::vector<float> row(length);
+        for (int c = 0; c < image.channels; c++)
+            for (int l = 0; l < lines; l++) {
+                float *pixels = result.pixels.data() + c * image.plane() + l * line;
+                double sum = 0;
+                for (int i = -32; i <= 32; i++) sum += pixels[mirrored(i)];
+                for (int i = 0; i < length; i++) {
+                    row[i] = sum / 65;
+                    sum += double(pixels[mirrored(i + 33)]) - pixels[mirrored(i - 32)];
+                }
+                for (int i = 0; i < length; i++) pixels[i * step] = row[i];
+            }
+    };
+    along(image.height, image.width, image.width, 1);
+    along(image.width, image.height, 1, image.width);
+    return result;
+}
+
+// OIDN's image of the light, and what it left out, averaged widely.
+inline Layer completed(const Layer &caustic, const Layer &denoised) {
+    Layer rest = caustic, result = denoised;
+    for (size_t i = 0; i < rest.pixels.size(); i++) rest.pixels[i] -= denoised.pixels[i];
+    rest = averaged(averaged(rest));
+    for (size_t i = 0; i < rest.pixels.size(); i++) result.pixels[i] += rest.pixels[i];
+    return result;
+}
+
+// Takes the light out of `primal` if the folder holds any and the network reads gradients, and returns it and the
+// features beside it; nothing if there is none.
+inline Layers take_out_caustic(const std::string &folder, const std::vector<std::string> &inputs, Layer &primal) {
     const std::string listing = slurp(folder + "/layers.json");
     const auto has = [&](const std::string &name) { return listing.find("\"" + name + "\"") != std::string::npos; };
     if (!has("caustic") || std::find(inputs.begin(), inputs.end(), "dx") == inputs.end()) return {};
     Layers held;
     for (const char *name : {"caustic", "caustic_var", "albedo", "normal", "depth"})
         if (has(name)) held[name] = read_layer(folder, listing, name);
-    const Layer &caustic = held.at("caustic");
+    Layer &caustic = held.at("caustic");
     if (caustic.pixels.size() != primal.pixels.size()) throw std::runtime_error("caustic is not of the size of primal");
-    for (size_t i = 0; i < primal.pixels.size(); i++) primal.pixels[i] -= caustic.pixels[i];
-    return spread(held);
+    for (size_t i = 0; i < primal.pixels.size(); i++) {
+        primal.pixels[i] -= caustic.pixels[i];
+        if (!std::isfinite(caustic.pixels[i])) caustic.pixels[i] = 0;
+    }
+    return held;
 }
 
 inline void add(Layer &image, const Layer &added) {
-    for (size_t i = 0; i < added.pixels.size(); i++) image.pixels[i] += added.pixels[i];
+    for (size_t i = 0; i < image.pixels.size(); i++) image.pixels[i] += added.pixels[i];
 }

@@ -24,7 +24,7 @@ int main(int count, char **arguments) try {
     for (const std::string &name : network.inputs)
         if (name.rfind("denoised", 0) == 0) throw std::runtime_error("the model reads OIDN's images: use ngpt-oidn-host");
     Layers layers = read_layers(arguments[2], network);
-    const Layer added = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const Layer &primal = layers.at("primal");
     Layer image(3, primal.height, primal.width);
@@ -34,7 +34,7 @@ int main(int count, char **arguments) try {
         network.run(image.width, image.height, memory);
         std::printf("%.1f ms\n", std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start).count());
     }
-    add(image, added);
+    if (!light.empty()) add(image, spread(light));
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-host: %s\n", error.what());

@@ -88,7 +88,7 @@ int main(int count, char **arguments) try {
     };
     if (!reads("denoised")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
     Layers layers = read_layers(arguments[2], network);
-    const Layer added = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const int height = layers.at("primal").height, width = layers.at("primal").width;
     Layer primal(3, height, width), albedo = primal, normal = primal, base = primal;
@@ -111,7 +111,8 @@ int main(int count, char **arguments) try {
     Layer image(3, height, width);
     network.take("image", image);
     network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
-    add(image, added);
+    if (!light.empty())
+        add(image, completed(light.at("caustic"), oidn.denoised(light.at("caustic"), albedo, normal)));
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-oidn-host: %s\n", error.what());
