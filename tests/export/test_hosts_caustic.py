@@ -30,6 +30,11 @@ def lit_stack():
 def check(stack, folder):
     """What the host made: the primal for a network with gradients, and what is added to its image."""
     primal, added = np.fromfile(folder.parent / "made.f32", "<f4").reshape(2, 3, *SIZE)
+    noise = np.fromfile(folder.parent / "noise.f32", "<f4").reshape(3, *SIZE)
+    whole = np.moveaxis(repair(stack, gradients=False).noise, -1, 0)
+    known = np.isfinite(whole)
+    assert np.array_equal(np.isfinite(noise).all(axis=0), known.all(axis=0))
+    assert np.allclose(noise[known], whole[known], rtol=1e-5)
     data = repair(stack)
     assert np.allclose(primal, np.moveaxis(data.image, -1, 0), rtol=1e-6)
     expected = np.moveaxis(caustic.denoised(data), -1, 0)
@@ -61,25 +66,30 @@ const added = withAdded(new Float32Array(primal.length), made.added);
 writeFileSync("made.f32", Buffer.concat([made.layers.primal, added].map(each => Buffer.from(each.buffer))));
 const other = withoutCaustic(layers, ["primal", "albedo"], width, height);
 if (other.added || other.layers.primal !== primal) throw new Error("a network of colour sees all light");
+writeFileSync("noise.f32", Buffer.from(other.layers.primal_var.buffer));
 """
 
 _CPP = """
 #include "caustic.hpp"
 int main() {
-    const Layer whole = read_layer("raw", slurp("raw/layers.json"), "primal");
-    Layer primal = whole, added = spread(take_out_caustic("raw", {"primal", "dx"}, primal));
+    const std::string listing = slurp("raw/layers.json");
+    const Layers raw = {{"primal", read_layer("raw", listing, "primal")},
+                        {"primal_var", read_layer("raw", listing, "primal_var")}};
+    Layers given = raw, all = raw;
+    const Layer added = spread(take_out_caustic("raw", {"primal", "dx"}, given)), &primal = given.at("primal");
     std::ofstream file("made.f32", std::ios::binary);
     for (const Layer *layer : {&primal, &added})
         file.write(reinterpret_cast<const char *>(layer->pixels.data()), layer->pixels.size() * sizeof(float));
-    Layer other = whole;
-    const bool none = take_out_caustic("raw", {"primal", "albedo"}, other).empty();
+    const bool none = take_out_caustic("raw", {"primal", "albedo"}, all).empty();
+    std::ofstream("noise.f32", std::ios::binary)
+        .write(reinterpret_cast<const char *>(all["primal_var"].pixels.data()), primal.pixels.size() * sizeof(float));
     // With an image of another denoiser, here one that darkens: as much light, too.
     Layer dark = added;
     for (float &x : dark.pixels) x *= 0.5f;
-    const Layer image = completed(read_layer("raw", slurp("raw/layers.json"), "caustic"), dark);
+    const Layer image = completed(read_layer("raw", listing, "caustic"), dark);
     std::ofstream("completed.f32", std::ios::binary)
         .write(reinterpret_cast<const char *>(image.pixels.data()), image.pixels.size() * sizeof(float));
-    return none && other.pixels == whole.pixels ? 0 : 1;
+    return none && all["primal"].pixels == raw.at("primal").pixels ? 0 : 1;
 }
 """
 

@@ -116,22 +116,26 @@ inline Layer completed(const Layer &caustic, const Layer &denoised) {
     return result;
 }
 
-// Takes the light out of `primal` if the folder holds any and the network reads gradients, and returns it and the
-// features beside it; nothing if there is none.
-inline Layers take_out_caustic(const std::string &folder, const std::vector<std::string> &inputs, Layer &primal) {
+// If the folder holds such light, takes it out of `primal` for a network that reads gradients, and returns it and the
+// features beside it. Any other network sees all light; its noise is that of both parts.
+inline Layers take_out_caustic(const std::string &folder, const std::vector<std::string> &inputs, Layers &layers) {
     const std::string listing = slurp(folder + "/layers.json");
     const auto has = [&](const std::string &name) { return listing.find("\"" + name + "\"") != std::string::npos; };
-    if (!has("caustic") || std::find(inputs.begin(), inputs.end(), "dx") == inputs.end()) return {};
+    if (!has("caustic")) return {};
     Layers held;
     for (const char *name : {"caustic", "caustic_var", "albedo", "normal", "depth"})
         if (has(name)) held[name] = read_layer(folder, listing, name);
-    Layer &caustic = held.at("caustic");
+    Layer &caustic = held.at("caustic"), &primal = layers.at("primal");
     if (caustic.pixels.size() != primal.pixels.size()) throw std::runtime_error("caustic is not of the size of primal");
+    const bool gradients = std::find(inputs.begin(), inputs.end(), "dx") != inputs.end();
     for (size_t i = 0; i < primal.pixels.size(); i++) {
-        primal.pixels[i] -= caustic.pixels[i];
+        if (gradients)
+            primal.pixels[i] -= caustic.pixels[i];
+        else if (layers.count("primal_var") && (has("caustic_var") || caustic.pixels[i] != 0))
+            layers["primal_var"].pixels[i] += has("caustic_var") ? held["caustic_var"].pixels[i] : NAN;
         if (!std::isfinite(caustic.pixels[i])) caustic.pixels[i] = 0;
     }
-    return held;
+    return gradients ? held : Layers();
 }
 
 inline void add(Layer &image, const Layer &added) {

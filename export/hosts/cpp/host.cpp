@@ -24,7 +24,7 @@ int main(int count, char **arguments) try {
     for (const std::string &name : network.inputs)
         if (name.rfind("denoised", 0) == 0) throw std::runtime_error("the model reads OIDN's images: use ngpt-oidn-host");
     Layers layers = read_layers(arguments[2], network);
-    const Layers light = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers);
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const Layer &primal = layers.at("primal");
     Layer image(3, primal.height, primal.width);

@@ -88,7 +88,7 @@ int main(int count, char **arguments) try {
     };
     if (!reads("denoised")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
     Layers layers = read_layers(arguments[2], network);
-    const Layers light = take_out_caustic(arguments[2], network.inputs, layers.at("primal"));
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers);
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const int height = layers.at("primal").height, width = layers.at("primal").width;
     Layer primal(3, height, width), albedo = primal, normal = primal, base = primal;

@@ -8,10 +8,17 @@ const DISTANCES = [1, 2, 4, 8, 16, 32, 1, 2];
 const NEIGHBOURS = [[0, 1, 1 / 8], [1, 0, 1 / 8], [1, 1, 1 / 16], [1, -1, 1 / 16]];
 const SIGNIFICANT = 9, FARTHEST = 1e-6;
 
-/** {layers, added}: `layers` for a network that reads `inputs`, and an image to be added to its result, or null. */
+/**
+ * {layers, added}: `layers` for a network that reads `inputs`, and an image to be added to its result, or null. A
+ * network that reads no gradients sees all light, and its noise is that of both parts.
+ */
 export function withoutCaustic(layers, inputs, width, height) {
-  const {primal, caustic} = layers;
-  if (!caustic || !inputs.includes("dx") || !caustic.some(value => value !== 0)) return {layers, added: null};
+  const {primal, caustic, primal_var: noise, caustic_var: further} = layers;
+  if (!caustic || !caustic.some(value => value !== 0)) return {layers, added: null};
+  if (!inputs.includes("dx")) {
+    const whole = noise?.map((value, i) => value + (further ? further[i] : caustic[i] === 0 ? 0 : NaN));
+    return {layers: {...layers, primal_var: whole}, added: null};
+  }
   const rest = primal.map((value, i) => value - caustic[i]);
   return {layers: {...layers, primal: rest}, added: spread(layers, width, height)};
 }
