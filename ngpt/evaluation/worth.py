@@ -19,13 +19,17 @@ import csv
 import io
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Any
 
 from ngpt.evaluation.averages import mean
 from ngpt.evaluation.renders import KINDS
 
 REACH = 4.0  # how far a slope is trusted past the measured samples
-FIELDS = ("scene", "spp", "method", "sampler", "best", "error", "rival", "rival samples", "W", "C", "W/C", "mark")
+FIELDS = (
+    *("scene", "spp", "method", "sampler", "best", "error", "rival", "rival samples"),
+    *("W", "C", "W/C", "mark", "blocks"),
+)
 
 
 def samples_for(error: float, points: Sequence[tuple[float, float]]) -> tuple[float, str] | None:
@@ -36,7 +40,7 @@ def samples_for(error: float, points: Sequence[tuple[float, float]]) -> tuple[fl
     curve: list[tuple[float, float]] = []
     for m, e in sorted(points):
         curve.append((math.log(m), min(math.log(e), curve[-1][1] if curve else math.inf)))
-    falls = [(a, b) for a, b in zip(curve, curve[1:], strict=False) if b[1] < a[1] and b[0] > a[0]]
+    falls = [(a, b) for a, b in pairwise(curve) if b[1] < a[1] and b[0] > a[0]]
     if not falls:
         return None
     target, reach = math.log(error), math.log(REACH)
@@ -64,7 +68,8 @@ def worth_of_gradients(results: dict[str, Any]) -> dict[str, Any]:
     """``rows`` for each scene, number of samples and column with gradients (``FIELDS``); ``means`` of them over scenes.
 
     ``best`` marks the column of least error among those with gradients. C and W/C are None where costs were not
-    measured, as for folders of stacks. Both lists are empty where a column of either kind is missing.
+    measured, as for folders of stacks. ``blocks``, the share of blocks where gradients pay, comes with the maps
+    (``ngpt.evaluation.worthplots``). Both lists are empty where a column of either kind is missing.
     """
     rows = [row for scene in results["scenes"] for row in _scene_rows(results, scene)]
     return {"rows": rows, "means": _means(results, rows)}
@@ -150,9 +155,10 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
 def as_csv(worth: dict[str, Any]) -> str:
     """One line for each row."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, [*FIELDS, "blocks"], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: "" if row.get(key) is None else row[key] for key in writer.fieldnames} for row in worth["rows"])
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(FIELDS)
+    for row in worth["rows"]:
+        writer.writerow(["" if row.get(name) is None else row[name] for name in FIELDS])
     return text.getvalue()
 
 
@@ -179,9 +185,7 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
             others = [_marked(rows.get((best["scene"], best["spp"], name)), "W/C") for name in columns]
             values = [_marked(best, key) for key in ("W", "C", "W/C")]
             blocks = "" if best.get("blocks") is None else f"{best['blocks']:.0%}"
-            table.append(
-                [best["scene"], str(best["spp"]), best["method"], best["rival"], *values, blocks, *others]
-            )
+            table.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *values, blocks, *others])
     if len(table) > 1:
         tables["Worth of gradients, scene by scene"] = table
     return tables

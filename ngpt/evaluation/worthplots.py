@@ -142,7 +142,7 @@ def draw_worth(worth: dict[str, Any]) -> str:
         dashes = f' stroke-dasharray="{dash}"' if dash else ""
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
         for row in own:
-            name = escape(f"{scene}, {row['spp']} spp: {row['mark']}{row['W/C']:.2f}, {row['method']} and {row['rival']}")
+            name = escape(f"{scene}, {row['spp']} spp: {row['mark']}{row['W/C']:.2f}, {row['method']}, {row['rival']}")
             place = f'cx="{axes.x(row["spp"]):.1f}" cy="{axes.y(row["W/C"]):.1f}"'
             # Hollow where W is not between measured samples.
             fill = "white" if row["mark"] else color
