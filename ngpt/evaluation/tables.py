@@ -50,8 +50,8 @@ def worth_page(results: dict[str, Any]) -> str:
         f"# {results['title']}: worth of gradients",
         "",
         "W: by how many times more samples the best method without gradients needs for the error of a method with "
-        "them. C: seconds of a sample with gradients over one without, features in both, measured in turn. Gradients pay "
-        "where W/C > 1: then the method without needs W/C times the time. Reconstruction is not counted.",
+        "them. C: seconds of a sample with gradients over one without, features in both, measured in turn. Gradients "
+        "pay where W/C > 1: then the method without needs W/C times the time. Reconstruction is not counted.",
         "",
         f"Errors are {results['primary']}, medians over seeds. The best of several methods is the one of least error "
         "with gradients, and of least time for that error without. ~: outside of the measured samples, by the nearest "

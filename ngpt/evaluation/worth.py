@@ -93,11 +93,9 @@ def _scene_rows(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
     for spp in results["settings"]["spp"]:
         errors = {name: found[name][spp] for name in ours if spp in found[name]}
         for name, error in errors.items():
-            row: dict[str, Any] = {"scene": scene, "spp": spp, "method": name}
-            row |= {"sampler": results["methods"][name]["sampler"], "error": error}
-            row |= {"best": error == min(errors.values())}
             if worth := _against(error, used[spp, name], seconds[name], curves, seconds):
-                rows.append(row | worth)
+                place = {"scene": scene, "spp": spp, "method": name, "sampler": results["methods"][name]["sampler"]}
+                rows.append(place | {"best": error == min(errors.values()), "error": error} | worth)
     return rows
 
 
