@@ -121,12 +121,14 @@ def test_unbiased(renderer, name, pixels):
 @pytest.mark.parametrize("name", NAMES)
 def test_unbiased_where_there_are_holes_and_no_environment(renderer, name):
     """Where Mitsuba's ``path`` loses light (docs/rendering.md), and no sampler of ours may."""
-    try:
-        stacks = render_ours(load(renderer, leaf, (32, 32)), name, spp=32)
-    except NgptError as error:
-        pytest.skip(f"it refuses holes: {error}")
-    for layer, result in gradient_tests(stacks, references_of(renderer, leaf, (32, 32))):
-        assert result.passed, f"{layer}: {result}"
+    scene, references = load(renderer, leaf, (32, 32)), references_of(renderer, leaf, (32, 32))
+    for pixels in DISTANCES:
+        try:
+            stacks = render_ours(scene, name, spp=32, pixels=pixels)
+        except NgptError as error:
+            pytest.skip(f"it refuses holes: {error}")
+        for layer, result in gradient_tests(stacks, references, pixels=pixels):
+            assert result.passed, f"{layer} over {pixels} pixels: {result}"
 
 
 def gains(renderer, name):
