@@ -105,6 +105,31 @@ def polished(alpha):
     }
 
 
+def leaf():
+    """A thin leaf in front of nothing, lit by a lamp that the camera does not see."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _camera, _diffuse
+
+    turn = mi.ScalarTransform4f
+    white = {"type": "twosided", "nested": _diffuse(0.8, 0.8, 0.8)}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 4},
+        "sensor": _camera([0, 0, 4], [0, 0, 0], 40),
+        "lamp": {
+            "type": "rectangle",
+            "to_world": turn().look_at([0, 3, 3], [0, 0, 0], [1, 0, 0]),
+            "emitter": {"type": "area", "radiance": 10.0},
+        },
+        "leaf": {
+            "type": "rectangle",
+            "to_world": turn().scale(2),
+            "bsdf": {"type": "mask", "opacity": 0.3, "nested": white},
+        },
+    }
+
+
 def _scale(factor):
     import mitsuba as mi
 
