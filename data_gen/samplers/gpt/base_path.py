@@ -24,8 +24,8 @@ class Step:
     # Emitter sampling
     u_light: mi.Point2f
     light: mi.DirectionSample3f
-    light_weight: mi.Spectrum  # Le / p; Le V / p where emitters are not shared
-    lit: mi.Bool  # the sample is seen from x
+    light_weight: mi.Spectrum  # Le / p
+    lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
     u_lobe: mi.Float
@@ -49,6 +49,7 @@ class Step:
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
     rough: mi.Bool  # behind x
     late: mi.Bool  # behind x
+    ends_late: mi.Bool  # or behind x1 at the latest
 
 
 def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, offsets) -> tuple[Step, mi.Float]:
@@ -63,13 +64,13 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, light_weight = scene.sample_emitter_direction(x, u_light, not plan.lights.shared, lit)
-    lit &= light.pdf != 0
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
-    if plan.lights.shared:
-        lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit)
+    light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
+    lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once: materials are virtual functions, and calls to them dear.
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
+    lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets])))
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
 
@@ -92,7 +93,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     x_connectable = plan.materials.connectable(bsdf)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
-    L_bsdf, L_caustic = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0)
+    L_bsdf, L_caustic, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0), mi.Bool(False)
 
     # ------------------- The layer ``caustic`` -------------------
     if plan.caustic:
@@ -100,6 +101,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
+        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, plan.materials.sharp(x1, scene))
     step = Step(
         x=x,
         x_connectable=x_connectable,
@@ -129,6 +131,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         L_caustic=L_caustic,
         rough=rough,
         late=late,
+        ends_late=ends_late,
     )
     return step, η
 
