@@ -35,7 +35,7 @@ RETURNS = 1e-3
 
 @dataclass
 class Target:
-    """Where a chain ends: at the point ``p`` of a surface with geometric normal ``n``, or, ``far``, in direction ``n``."""
+    """Where a chain ends: at the point ``p`` of a surface with geometric normal ``n``; ``far``: in direction ``n``."""
 
     p: mi.Point3f
     n: mi.Vector3f

@@ -54,7 +54,6 @@ from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from ngpt.errors import NgptError
 
-
 _SHIFTS = ("replay", "half-vector", "manifold")
 
 

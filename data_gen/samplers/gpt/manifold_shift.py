@@ -1,7 +1,7 @@
 """The shift "manifold": light that comes to the first rough vertex through mirrors and glass, in a kernel of its own.
 
-Replay loses such light: from beside z_b, the same direction does not lead to the same small lamp. Here the offset path goes
-through the same events to the same point x_c of the lamp, by the walks of ``data_gen.paths.manifold``.
+Replay loses such light: from beside z_b, the same direction does not lead to the same small lamp. Here the offset path
+goes through the same events to the same point x_c of the lamp, by the walks of ``data_gen.paths.manifold``.
 
     z_b, z_b'   the first vertices that are left by a smooth event, after as many specular ones from the camera
     ω, ω'       directions there; k specular events further on, k = 1 .. 6, both paths meet the lamp at x_c

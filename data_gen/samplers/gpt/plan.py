@@ -52,6 +52,4 @@ def make_plan(
     half_vectors = replays and shift == "half-vector"
     caustic = caustic and replays
     manifold = caustic and shift == "manifold"
-    return Plan(
-        materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic, manifold
-    )
+    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic, manifold)
