@@ -50,6 +50,7 @@ class Shot:
     ``miss``    on the plane, the way from the target to where it arrives
     ``reach``   the length that ``miss`` compares with
     ``B0``, ``B1``   columns of B, for two orthogonal turns of ω
+    ``first``   point of the first event
     ``weight``  product of the events' f / P, and ``P`` of the probabilities with which sampling takes such events
     ``ray``     from the last event on
     """
@@ -59,6 +60,7 @@ class Shot:
     reach: mi.Float
     B0: mi.Vector2f
     B1: mi.Vector2f
+    first: mi.Point3f
     weight: mi.Spectrum
     P: mi.Float
     ray: mi.Ray3f
@@ -92,7 +94,7 @@ def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32,
     dp0, dp1 = mi.Vector3f(0), mi.Vector3f(0)
     dd0, dd1 = mi.Vector3f(turns.s), mi.Vector3f(turns.t)
     weight, P, length = mi.Spectrum(1), mi.Float(1), mi.Float(0)
-    good, left = mi.Bool(active), mi.UInt32(events)
+    good, left, first = mi.Bool(active), mi.UInt32(events), mi.Point3f(z.p)
     while dr.hint(good & (left != 0), label="chain"):
         # ------------------------ Event --------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, False, good)
@@ -108,15 +110,16 @@ def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32,
         wo = si.to_world(sample.wo)
         # A bumpy surface turns rays elsewhere than its shape would.
         good &= dr.squared_norm(wo - d) < 1e-6
+        first = dr.select(left == events, si.p, first)
         weight *= f_P
         P *= sample.pdf
         length += si.t
         ray = si.spawn_ray(wo)
         left >>= 2
-    return arrive(target, ray, length, (dp0, dp1), (dd0, dd1), weight, P, good)
+    return arrive(target, ray, length, (dp0, dp1), (dd0, dd1), first, weight, P, good)
 
 
-def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, weight, P, good) -> Shot:
+def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, weight, P, good) -> Shot:
     """The end of a shot: from the last event to the plane of the target."""
     plane = mi.Frame3f(target.n)
     cos = dr.dot(ray.d, target.n)
@@ -130,7 +133,7 @@ def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, weight, P, good) -> Sh
         columns.append(dr.select(target.far, d, move - ray.d * (dr.dot(move, target.n) / cos)))
     B0, B1, miss = (mi.Vector2f(dr.dot(v, plane.s), dr.dot(v, plane.t)) for v in (*columns, miss))
     reach = dr.select(target.far, 1, length + t)
-    return Shot(good & dr.isfinite(dr.squared_norm(miss)), miss, reach, B0, B1, weight, P, ray)
+    return Shot(good & dr.isfinite(dr.squared_norm(miss)), miss, reach, B0, B1, first, weight, P, ray)
 
 
 def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -200,10 +203,11 @@ def follow(
     Returns its direction ω', its shot, J = dω'/dω, and whether it exists: the walk has arrived, the walk back has
     returned, and nothing is between the last event and the target.
     """
-    ω1, shot, found = walk(scene, z1, ω, events, target, active & base.good)
+    # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
+    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)
-    back, _, returned = walk(scene, z, ω1, events, target, found)
+    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found)
     found &= returned & (dr.squared_norm(back - ω) < RETURNS**2)
     ray = mi.Ray3f(shot.ray)
     ray.maxt = dr.select(target.far, dr.largest(mi.Float), dr.norm(target.p - ray.o) * (1 - mi.math.ShadowEpsilon))
