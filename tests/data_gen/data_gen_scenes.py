@@ -130,6 +130,21 @@ def leaf():
     }
 
 
+def caustics():
+    """A floor below a lamp, lit through a ball of glass and by way of a mirror ball."""
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 6},
+        "sensor": _camera([0.2, 1.9, 2.6], [0, 0.35, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
+        "lamp": _light([0.2, 2.6, -0.2], [0, -1, 0], (1.2, 1.2), (6, 6, 6)),
+        "glass": _sphere([-0.3, 0.62, 0.1], 0.45, {"type": "dielectric"}),
+        "mirror": _sphere([0.6, 0.4, 0.3], 0.3, {"type": "conductor", "material": "Ag"}),
+    }
+
+
 def _scale(factor):
     import mitsuba as mi
 
