@@ -26,6 +26,7 @@ from ngpt.io.openexr import ExrImage, ExrPart, write_exr
 from ngpt.measure.gains import cases
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
+from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 from ngpt.system.writing import write_json
 
@@ -123,9 +124,14 @@ def error_of(scenes: Sequence[tuple[GradientStack, np.ndarray]], method: str, la
 
 
 def part(stack: GradientStack, layers: Sequence[str]) -> GradientStack:
-    """The stack with these layers only; the emission that samplers of gradients keep apart stays with gradients."""
-    direct = ("direct",) if "dx" in layers and "direct" in stack else ()
-    return GradientStack({name: stack[name] for name in (*layers, *direct)})
+    """The stack with these layers only; the light that samplers of gradients keep apart stays with gradients."""
+    whole = {"primal_var": variance_of_primal(stack)} if "primal_var" in layers and "dx" not in layers else {}
+    return GradientStack({name: stack[name] for name in (*layers, *apart(stack, layers))} | whole)
+
+
+def apart(stack: GradientStack, layers: Sequence[str]) -> tuple[str, ...]:
+    """The light that a stack keeps apart from its gradients, if they are among the layers."""
+    return tuple(name for name in ("direct", "caustic", "caustic_var") if "dx" in layers and name in stack)
 
 
 def renderers(scenes: Sequence[tuple[GradientStack, np.ndarray]], folder: Path) -> list[Row]:
@@ -152,11 +158,11 @@ def written(
     path: Path, stack: GradientStack, names: dict[str, tuple[str, str]], layers: Sequence[str]
 ) -> GradientStack:
     """These layers as they come back from a file with the names of a renderer."""
-    channels = {}
-    for layer in layers + (("direct",) if "dx" in layers and "direct" in stack else ()):
+    channels, held = {}, part(stack, layers)
+    for layer in held.names:
         prefix, suffixes = names[layer]
         keys = [".".join(filter(None, (prefix, suffix))) for suffix in suffixes or [""]]
-        channels |= {key: np.ascontiguousarray(stack[layer][..., i]) for i, key in enumerate(keys)}
+        channels |= {key: np.ascontiguousarray(held[layer][..., i]) for i, key in enumerate(keys)}
     write_exr(path, ExrImage([ExrPart("", {}, channels)]), overwrite=True)
     return read(path)
 

@@ -43,11 +43,6 @@ class Method:
     estimates: tuple[str, ...] = ()
     variant: str = ""
 
-    @property
-    def reads_gradients(self) -> bool:
-        """Whether it works on the light that gradients are the differences of; see ``ngpt.repair``."""
-        return "dx" in self.needs
-
 
 @dataclass(frozen=True)
 class Result:
@@ -231,13 +226,13 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
-    reads_gradients = Shipped(name).reads_gradients(**(entry.options | options)) if own else entry.reads_gradients
-    data = repair(stack, reads_gradients)
+    reads = Shipped(name).reads(**(entry.options | options)) if "weights" in entry.options else entry.needs
+    data = repair(stack, gradients="dx" in reads)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **(entry.options | options)) + data.direct
         if data.caustic is not None:
-            image += caustic.denoised(data)
+            image += caustic.denoised(data, by_oidn="denoised" in reads)
     seconds = time.perf_counter() - start
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))

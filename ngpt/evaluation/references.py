@@ -17,6 +17,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import read
 from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, exposure_mismatch
+from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 
 # What the names of two halves end with, before ".exr".
@@ -63,7 +64,7 @@ class Reference:
             return None
         if len(self.stacks) == 1:
             return reference_noise(self.stacks[0])
-        a, b = (stack["primal_var"] for stack in self.stacks)
+        a, b = (variance_of_primal(stack) for stack in self.stacks)
         return _number(np.mean((a + b) / 4 / (self.mean**2 + EPSILON)))
 
     @property
@@ -77,7 +78,7 @@ class Reference:
         noise = self.noise
         if noise is None or len(self.stacks) == 1:
             return None if noise is None else 3 * noise
-        a, b = (stack["primal_var"].astype(np.float64) for stack in self.stacks)
+        a, b = (variance_of_primal(stack).astype(np.float64) for stack in self.stacks)
         deviation = (np.sqrt(a * b) / (self.mean.astype(np.float64) ** 2 + EPSILON)).mean(axis=-1)
         return _number(3 * np.sqrt(np.sum(deviation**2)) / deviation.size)
 
@@ -98,7 +99,7 @@ class Reference:
 
 def reference_noise(reference: GradientStack) -> float:
     """What one reference's own noise adds to every relMSE: the mean of its variance / (r² + epsilon)."""
-    return float(np.mean(reference["primal_var"] / (reference["primal"] ** 2 + EPSILON)))
+    return float(np.mean(variance_of_primal(reference) / (reference["primal"] ** 2 + EPSILON)))
 
 
 def read_reference(files: Sequence[str | Path]) -> Reference:

@@ -23,6 +23,7 @@ from scipy.ndimage import uniform_filter
 
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON
+from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 
 # Of the ridge, in scenes' worth of evidence: a law starts as that of plain averaging.
@@ -59,9 +60,11 @@ def describe(stack: GradientStack) -> dict[str, float]:
     """
     stack.require("primal_var", "dx_var", "dy_var", why="advice")
     spp = float(stack.attributes.get("ngpt:spp", 1))
-    primal, variance = (np.nan_to_num(stack[n], nan=0.0, posinf=0.0) for n in ("primal", "primal_var"))
+    # Gradients are compared with what they are the differences of, which is not all light that is noise.
+    layers = stack["primal"], variance_of_primal(stack), stack["primal_var"]
+    primal, whole, variance = (np.nan_to_num(layer, nan=0.0, posinf=0.0) for layer in layers)
     mean = uniform_filter(primal.astype(np.float64), (7, 7, 1))
-    local = uniform_filter(variance.astype(np.float64), (7, 7, 1))
+    local = uniform_filter(whole.astype(np.float64), (7, 7, 1))
     relative = np.sort((local / (mean**2 + EPSILON)).mean(axis=-1), axis=None)
     noise = float(relative[: max(1, int(0.99 * relative.size))].mean()) * spp
     independent = gradient = 0.0

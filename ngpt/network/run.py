@@ -40,13 +40,14 @@ class Shipped:
             return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
         return self.also_missing()
 
-    def reads_gradients(self, weights: str, device: str, memory: int) -> bool:
-        """Whether ``run`` with these options works on what gradients are the differences of; see ``ngpt.repair``."""
+    def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
+        """What ``run`` with these options reads: layers of a stack, and what is made of them (``inputs.gather``)."""
         path = Path(weights or self.path)
         if path.suffix != ".safetensors":
             network = run_onnx.Network(path, device)
-            return "dx" in inputs.needs(network.inputs, network.base, network.optional)
-        return "dx" in self._torch(path).config_of(path, device).needs
+            return (*network.inputs, *inputs.needs(network.inputs, network.base, network.optional))
+        config = self._torch(path).config_of(path, device)
+        return (*config.layers, *config.needs)
 
     def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
         """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of.

@@ -14,8 +14,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from full_stack import full_stack
 
 from ngpt.errors import NgptError
+from ngpt.methods import denoise
 from ngpt.training.dataset import Dataset, problems, read_manifest
 
 pytest.importorskip("safetensors")
@@ -281,3 +283,28 @@ def test_a_dead_worker_is_an_error_that_says_how_to_go_on(tmp_path, monkeypatch)
 
 def die(config, job, folder, variant):
     os._exit(9)
+
+
+def lit_stack():
+    """A stack with light that gradients hold nothing of, at 2 of its 20x24 pixels not finite."""
+    stack = full_stack(20, 24)
+    light = np.zeros_like(stack["primal"])
+    light[::4, ::5] = 6
+    primal = stack["primal"] + light
+    primal[3, 4], light[10, 12] = np.nan, np.inf
+    return stack.replace(primal=primal, direct=0 * primal, caustic=light, caustic_var=light**2)
+
+
+def test_crops_keep_light_that_gradients_lack_apart():
+    """Made finite as the rest is; targets without it are those of networks that read gradients."""
+    given = lit_stack()
+    stack, bad = crops.finite(given)
+    assert bad >= 2 and all(np.isfinite(stack[name]).all() for name in stack.names)
+    same = np.isfinite(given["primal"]).all(axis=-1) & np.isfinite(given["caustic"]).all(axis=-1)
+    for name in ("primal", "caustic"):
+        assert np.allclose(stack[name][same], given[name][same], rtol=1e-5)
+    rest, light = crops.references(stack, "wcv")
+    assert light.sum(dtype=np.float64) == pytest.approx(stack["caustic"].sum(dtype=np.float64), rel=1e-3)
+    assert np.allclose(rest + light, denoise(stack, "wcv"), rtol=1e-5, atol=1e-5)
+    plain = full_stack(20, 24)
+    assert crops.references(plain, "wcv")[1] is None

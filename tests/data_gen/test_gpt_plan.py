@@ -46,8 +46,8 @@ def test_plans(renderer):
 
 def test_unknown_shift(renderer):
     # Mitsuba wraps what a plugin raises.
-    with pytest.raises(RuntimeError, match="unknown shift 'manifold'; choose one of: replay, half-vector"):
-        renderer.load_dict({"type": "gpt", "shift": "manifold"})
+    with pytest.raises(RuntimeError, match="unknown shift 'guess'; choose one of: replay, half-vector, manifold"):
+        renderer.load_dict({"type": "gpt", "shift": "guess"})
 
 
 def test_no_light_at_all(renderer):

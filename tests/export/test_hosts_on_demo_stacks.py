@@ -24,6 +24,8 @@ from hosts import (
 
 import ngpt
 from ngpt.cli import main
+from ngpt.denoisers import caustic
+from ngpt.repair import repair
 
 pytest.importorskip("onnxruntime")
 
@@ -94,7 +96,13 @@ def tell(capsys, request, image, expected, check=agree):
 @pytest.mark.slow
 def test_python(demo, capsys, request):
     stack, raw = demo
-    image = in_python(WEIGHTS / "ngpt-fast.onnx", read_layers(raw))
+    layers = read_layers(raw)
+    data = repair(ngpt.read(stack))
+    added = 0
+    if data.caustic is not None:
+        layers["primal"] = layers["primal"] - layers["caustic"]
+        added = caustic.denoised(data).transpose(2, 0, 1)
+    image = in_python(WEIGHTS / "ngpt-fast.onnx", layers) + added
     tell(capsys, request, image, denoised(stack, "ngpt-fast"))
 
 
@@ -102,7 +110,7 @@ def test_python(demo, capsys, request):
 @pytest.mark.parametrize("kind", [cpp_host, node_host])
 # The last is MiB in C++, pixels in Node. 95 MiB hold the image with ngpt-fast, which cannot cut it any smaller.
 @pytest.mark.parametrize(
-    ("method", "tile"), [("ngpt-fast", 0), ("ngpt-fast", 96), ("ngpt-colour", 0), ("ngpt-colour", 60)]
+    ("method", "tile"), [("ngpt-fast", 0), ("ngpt-fast", 96), ("ngpt-colour", 0), ("ngpt-colour", 120)]
 )
 def test_cpp_and_node(demo, host, kind, method, tile, capsys, request, tmp_path):
     stack, raw = demo

@@ -11,6 +11,7 @@ from data_gen.paths import caustic
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
+from data_gen.samplers.gpt.manifold_shift import Chain, advance
 from data_gen.samplers.gpt.plan import Plan
 
 
@@ -50,9 +51,12 @@ class Step:
     rough: mi.Bool  # behind x
     late: mi.Bool  # behind x
     ends_late: mi.Bool  # or behind x1 at the latest
+    # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
+    L_followed: mi.Spectrum  # m Le
+    chain: Chain | None  # behind x
 
 
-def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, offsets) -> tuple[Step, mi.Float]:
+def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, chain, offsets) -> tuple[Step, mi.Float]:
     """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
@@ -93,13 +97,18 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     x_connectable = plan.materials.connectable(bsdf)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
-    L_bsdf, L_caustic, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0), mi.Bool(False)
+    L_bsdf, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Bool(False)
+    L_caustic, L_followed = mi.Spectrum(0), mi.Spectrum(0)
 
     # ------------------- The layer ``caustic`` -------------------
     if plan.caustic:
         L_light, caustic_light = caustic.split(caustic.lit_late(rough, late, x_connectable), L_light)
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
+        if plan.manifold:
+            event = sample.sampled_type
+            chain, follows = advance(chain, depth, event, goes_on, x_connectable, survival, late, x1, Le)
+            caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
         ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, plan.materials.sharp(x1, scene))
     step = Step(
@@ -132,6 +141,8 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         rough=rough,
         late=late,
         ends_late=ends_late,
+        L_followed=L_followed,
+        chain=chain,
     )
     return step, η
 

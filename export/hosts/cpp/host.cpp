@@ -5,7 +5,7 @@
 // FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. MEMORY is what tiles may take, in MiB; 0 for 2048.
 // Models that read another denoiser's images run in oidn_host.cpp.
 
-#include "files.hpp"
+#include "caustic.hpp"
 
 #include <chrono>
 #include <cstdio>
@@ -23,7 +23,8 @@ int main(int count, char **arguments) try {
     Network network(arguments[1]);
     for (const std::string &name : network.inputs)
         if (name.rfind("denoised", 0) == 0) throw std::runtime_error("the model reads OIDN's images: use ngpt-oidn-host");
-    const Layers layers = read_layers(arguments[2], network);
+    Layers layers = read_layers(arguments[2], network);
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers);
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const Layer &primal = layers.at("primal");
     Layer image(3, primal.height, primal.width);
@@ -33,6 +34,7 @@ int main(int count, char **arguments) try {
         network.run(image.width, image.height, memory);
         std::printf("%.1f ms\n", std::chrono::duration<double, std::milli>(std::chrono::steady_clock::now() - start).count());
     }
+    if (!light.empty()) add(image, spread(light));
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-host: %s\n", error.what());

@@ -5,7 +5,7 @@
 // FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. MEMORY is what the network's tiles may take, in MiB, 0 for
 // 2048; OIDN makes its own. Needs OIDN 2.
 
-#include "files.hpp"
+#include "caustic.hpp"
 
 #include <OpenImageDenoise/oidn.h>
 
@@ -87,7 +87,8 @@ int main(int count, char **arguments) try {
         return std::find(network.inputs.begin(), network.inputs.end(), name) != network.inputs.end();
     };
     if (!reads("denoised")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
-    const Layers layers = read_layers(arguments[2], network);
+    Layers layers = read_layers(arguments[2], network);
+    const Layers light = take_out_caustic(arguments[2], network.inputs, layers);
     for (const auto &[name, layer] : layers) network.give(name, layer);
     const int height = layers.at("primal").height, width = layers.at("primal").width;
     Layer primal(3, height, width), albedo = primal, normal = primal, base = primal;
@@ -110,6 +111,8 @@ int main(int count, char **arguments) try {
     Layer image(3, height, width);
     network.take("image", image);
     network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
+    if (!light.empty())
+        add(image, completed(light.at("caustic"), oidn.denoised(light.at("caustic"), albedo, normal)));
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-oidn-host: %s\n", error.what());

@@ -9,6 +9,7 @@
 import {readFileSync, writeFileSync} from "node:fs";
 import {createRequire} from "node:module";
 import {join} from "node:path";
+import {withAdded, withoutCaustic} from "../javascript/caustic.mjs";
 import {Model} from "../javascript/model.mjs";
 
 const SUFFIX = /\.onnx$/;
@@ -22,19 +23,20 @@ async function main([path, folder, output, tile = "0", runs = "1"]) {
   const ort = createRequire(import.meta.url)("onnxruntime-node");
   const model = await Model.open(ort, readFileSync(path), readFileSync(path.replace(SUFFIX, ".statistics.onnx")));
   const shapes = JSON.parse(readFileSync(join(folder, "layers.json"), "utf8"));
-  const layers = {};
-  for (const name of model.inputs.filter(name => name in shapes)) {
+  const held = {};
+  for (const name of Object.keys(shapes)) {
     const bytes = readFileSync(join(folder, `${name}.f32`));
-    layers[name] = new Float32Array(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
+    held[name] = new Float32Array(bytes.buffer.slice(bytes.byteOffset, bytes.byteOffset + bytes.byteLength));
   }
   const [, , height, width] = shapes.primal.shape;
+  const {layers, added} = withoutCaustic(held, model.inputs, width, height);
   let image;
   for (let i = 0; i < Math.max(1, Number(runs)); i++) {
     const start = performance.now();
     image = await model.run(layers, width, height, Number(tile));
     console.log(`${(performance.now() - start).toFixed(1)} ms`);
   }
-  writeFileSync(output, pfm(image, width, height));
+  writeFileSync(output, pfm(withAdded(image, added), width, height));
   return 0;
 }
 

@@ -8,7 +8,7 @@ const TILED = 0x200, DEEP = 0x800, PARTS = 0x1000;
 const RGB = ["R", "G", "B"];
 const LAYERS = {
   primal: RGB, direct: RGB, dx: RGB, dy: RGB, albedo: RGB, normal: ["X", "Y", "Z"], depth: ["Z"],
-  primal_var: RGB, dx_var: RGB, dy_var: RGB,
+  primal_var: RGB, dx_var: RGB, dy_var: RGB, caustic: RGB, caustic_var: RGB,
 };
 
 /** {width, height, layers: {name: Float32Array, channel by channel}}, named as in docs/gradient-stack.md. */

@@ -1,5 +1,6 @@
-/** Runs the model beside the page, which stays alive meanwhile. Behind ONNX Runtime's own script and model.mjs. */
+/** Runs the model beside the page, which stays alive meanwhile. Behind ONNX Runtime's own script and the shared modules. */
 
+import {withAdded, withoutCaustic} from "../javascript/caustic.mjs";
 import {Model} from "../javascript/model.mjs";
 
 let open, loaded, last = Promise.resolve();
@@ -16,10 +17,12 @@ async function answer(data) {
       open = () => Model.open(ort, data.model, data.statistics, {executionProviders: ["wasm"]});
       return;
     }
-    const {turn, layers, width, height, tile} = data, start = performance.now();
+    const {turn, width, height, tile} = data, start = performance.now();
     loaded ??= await open();
     const begun = performance.now();
-    const image = await loaded.run(layers, width, height, tile, (done, all) => postMessage({turn, done, all}));
+    const {layers, added} = withoutCaustic(data.layers, loaded.inputs, width, height);
+    const made = await loaded.run(layers, width, height, tile, (done, all) => postMessage({turn, done, all}));
+    const image = withAdded(made, added);
     postMessage({turn, image, loading: begun - start, milliseconds: performance.now() - begun});
   } catch (error) {
     postMessage({turn: data.turn, error: String(error?.message ?? error)});
