@@ -50,8 +50,11 @@ def test_nothing_is_lost(renderer):
 @pytest.mark.parametrize(
     "mutant",
     [
-        lambda rough, late, found, kind, connectable: (rough, late | rough),
-        lambda rough, late, found, kind, connectable: (rough, late & ~late),
+        {"ends_late": lambda smooth, connectable, sharp_next: smooth},
+        {
+            "ends_late": lambda smooth, connectable, sharp_next: smooth & ~smooth,
+            "classes": lambda rough, late, found, kind, connectable: (rough, late & ~late),
+        },
     ],
     ids=["copies are late at once", "copies are never late"],
 )
@@ -64,7 +67,7 @@ def test_mutants_on_one_side_fail_the_z_test(renderer, mutant, monkeypatch):
 
     scene = load(renderer, glass, (32, 32))
     images = others(scene)
-    monkeypatch.setattr(offset_path, "caustic", SimpleNamespace(**vars(caustic) | {"classes": mutant}))
+    monkeypatch.setattr(offset_path, "caustic", SimpleNamespace(**vars(caustic) | mutant))
     stacks = render_ours(scene, "gpt")
     assert not all(verdict(stacks, images, name).passed for name in ("dx", "dy"))
 
