@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from copy import copy
+
 import drjit as dr
 import mitsuba as mi
 
@@ -38,9 +40,27 @@ class CameraSamples:
         self.random.schedule_state()
         dr.eval()
 
-    def rays(self, shift: tuple[int, int] = (0, 0)) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Bool]:
-        """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film."""
-        p = self.position + mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
+    def at(self, lanes: mi.UInt32) -> CameraSamples:
+        """The samples of these ``lanes`` alone, as far as rays and random numbers go."""
+
+        def gather(value):
+            return dr.gather(type(value), value, lanes) if dr.width(value) > 1 else value
+
+        some = copy(self)
+        some.random = self.random.at(lanes)
+        some.position, some.lens, some.time, some.wavelength = map(
+            gather, (self.position, self.lens, mi.Float(self.time), self.wavelength)
+        )
+        return some
+
+    def rays(self, shift=(0, 0)) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Bool]:
+        """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film.
+
+        The ``shift`` is a pair of numbers, or a Vector2f with one for each lane.
+        """
+        if not isinstance(shift, mi.Vector2f):
+            shift = mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
+        p = self.position + shift
         inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.size.x) & (p.y < self.size.y)
         uv = p / mi.Vector2f(self.size)
         ray, importance = self.sensor.sample_ray_differential(self.time, self.wavelength, uv, self.lens)

@@ -61,7 +61,8 @@ def first_nonspecular_vertex(scene, sampler, ray):
     searching = mi.Bool(True)
     while searching:
         last = mi.Ray3f(ray)
-        si = scene.ray_intersect(ray)
+        # Camera rays of one pixel go together, for which Embree has a way of its own.
+        si = scene.ray_intersect(ray, mi.RayFlags.All, vertices == 0)
         depth += si.t
         bsdf = si.bsdf(mi.RayDifferential3f(ray))
         flags = bsdf.flags()

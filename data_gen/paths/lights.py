@@ -36,27 +36,36 @@ def is_uniform(shape: mi.Shape) -> bool:
 
 @dataclass
 class LightSample:
-    """An emitter in direction ``d``, found with density ``p`` in solid angle; ``weight`` = Le V / p."""
+    """An emitter in direction ``d``, found with density ``p`` in solid angle; ``weight`` = Le / p, or Le V / p."""
 
     d: mi.Vector3f
     p: mi.Float
     delta: mi.Bool
     weight: mi.Spectrum
+    target: mi.Point3f  # where a shadow ray ends
 
 
-def sample_light(scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> LightSample:
-    """Emitter sampling at a vertex."""
-    light, weight = scene.sample_emitter_direction(si, u, True, active)
-    return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0))
+def sample_light(
+    scene: mi.Scene, si: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool, shadows: bool = True
+) -> LightSample:
+    """Emitter sampling at a vertex; without ``shadows`` with no regard for occlusion."""
+    light, weight = scene.sample_emitter_direction(si, u, shadows, active)
+    return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
+
+
+def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f: mi.Spectrum) -> mi.Spectrum:
+    """f Le V / p of a sample without V: the shadow ray is traced where there is something to be shadowed."""
+    lit = f * light.weight
+    return dr.select(scene.ray_test(si.spawn_ray_to(light.target), dr.max(lit) > 0), 0, lit)
 
 
 def replay_light(scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, lit: mi.Bool) -> LightSample:
-    """``sample_light(scene, y, u, lit)``, by way of what the same numbers gave at another vertex.
+    """``sample_light(scene, y, u, lit, False)``, by way of what the same numbers gave at another vertex.
 
-    ``base`` is the direction sample there and ``base_weight`` its Le / p, with no regard for occlusion.
+    ``base`` is the direction sample there and ``base_weight`` its Le / p.
     """
     if not lights.shared:
-        return sample_light(scene, y, u, lit)
+        return sample_light(scene, y, u, lit, False)
     far = mi.Bool(lights.far)
     if lights.far and lights.near:
         far = mi.has_flag(base.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -69,11 +78,9 @@ def replay_light(scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInter
     # Seen from the other side, an emitter is another one.
     shared = (base.pdf > 0) & (far | (ratio > 0)) & dr.isfinite(J) & (J > 0)
     anew, shared = lit & ~shared, lit & shared
-    visible = shared & ~scene.ray_test(y.spawn_ray_to(dr.select(far, y.p + d * base.dist, base.p)), shared)
-    sample = LightSample(
-        d, dr.select(shared, base.pdf / J, 0), base.delta, dr.select(visible, base_weight * J, mi.Spectrum(0))
-    )
-    return dr.if_stmt((sample,), anew, lambda _: sample_light(scene, y, u, anew), lambda sample: sample)
+    p, weight = dr.select(shared, base.pdf / J, 0), dr.select(shared, base_weight * J, mi.Spectrum(0))
+    sample = LightSample(d, p, base.delta, weight, dr.select(far, y.p + d * base.dist, base.p))
+    return dr.if_stmt((sample,), anew, lambda _: sample_light(scene, y, u, anew, False), lambda sample: sample)
 
 
 def emission(scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled) -> tuple:
@@ -105,5 +112,5 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     """
     if integrator.hide_emitters or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
-    si = scene.ray_intersect(ray, active)
+    si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
     return si.emitter(scene, active).eval(si, active)

@@ -45,6 +45,13 @@ def _stream_class(variant: str) -> type:
         def clone(self):
             return Stream(self.random)
 
+        def at(self, lanes):
+            """The streams of these lanes alone."""
+            random = mi.PCG32()
+            random.state = dr.gather(mi.UInt64, self.random.state, lanes)
+            random.inc = dr.gather(mi.UInt64, self.random.inc, lanes)
+            return Stream(random)
+
         def schedule_state(self):
             dr.schedule(self.random)
 

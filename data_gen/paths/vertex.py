@@ -62,6 +62,12 @@ class Materials:
         rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
         return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
 
+    def sharp(self, si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
+        """Whether a path can leave vertex ``si`` by mirror, glass or sharp gloss alone, and no emitter is there."""
+        bsdf = si.bsdf()
+        dark = si.emitter(scene) == None  # noqa: E711 - a comparison of arrays of pointers
+        return si.is_valid() & dark & ~self.connectable(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
 
 def dr_number(bsdf: mi.BSDF) -> int:
     """The number by which Dr.Jit's arrays of pointers know a material."""

@@ -141,7 +141,8 @@ for _sampler in (
         _refused_by_gpt,
         _notes_on_gpt,
         {
-            "shift": "before paths join: replay, or half-vector, which copies that of smooth events",
+            "shift": "before paths join: replay; half-vector, which copies that of smooth events; or manifold, which "
+            "follows some of the light of 'caustic' to its lamps",
             "reuse": "true: the primal is the mean over base paths and the offset paths of neighbours",
             "roughness_threshold": "the microfacet roughness above which materials are connectable",
             "caustic": "false: light over rough surfaces and then mirrors or glass is in the gradients, as noise",

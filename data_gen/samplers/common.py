@@ -1,7 +1,10 @@
-"""What our integrators share as Mitsuba plugins."""
+"""What our samplers share: Mitsuba's own estimates, and what makes an integrator a plugin."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import drjit as dr
 import mitsuba as mi
 import numpy as np
 
@@ -10,6 +13,22 @@ from data_gen.passes import SamplePass, render_passes
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
+
+
+def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
+    """(sampler, ray, medium, active) -> what the integrator estimates: itself, or ``prb`` where ``path`` is biased.
+
+    ``path`` returns 0 for a path that has escaped after holes alone, were it lit by emitter sampling where the material
+    of a mask is there in part; but for scenes with an environment.
+    """
+    holes = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
+    depths = path_depths(integrator) if integrator.class_name() == "PathIntegrator" else {}
+    if holes and depths and not scene.environment() and not integrator.hide_emitters:
+        prb = mi.load_dict({"type": "prb", **depths})
+        return lambda sampler, ray, medium, active: prb.sample(
+            dr.ADMode.Primal, scene, sampler, ray, None, None, active
+        )[0]
+    return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

@@ -25,7 +25,7 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import GradientIntegrator
+from data_gen.samplers.common import GradientIntegrator, radiance
 from data_gen.scenes.load import reference_integrator
 
 
@@ -49,21 +49,22 @@ class GPTBasic(GradientIntegrator):
         return self.nested.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
-        return lambda camera, film: self.sample_pass(scene, camera, film)
+        estimate = radiance(scene, self.nested)
+        return lambda camera, film: self.sample_pass(scene, estimate, camera, film)
 
-    def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
+    def sample_pass(self, scene, estimate, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path for each camera sample and shifts it to the four neighbours of its pixel."""
-        L, Le, _ = self.radiance(scene, camera, (0, 0))
+        L, Le, _ = self.radiance(scene, estimate, camera, (0, 0))
         film.put("primal", L + Le)
         film.put("direct", Le)
         usable = dr.isfinite(dr.sum(L))
         for name, shift in SHIFTS.items():
-            L_shifted, _, inside = self.radiance(scene, camera, shift)
+            L_shifted, _, inside = self.radiance(scene, estimate, camera, shift)
             film.put(name, L_shifted - L, inside & usable)
         ray, _, _ = camera.rays()
         film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
 
-    def radiance(self, scene, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
+    def radiance(self, scene, estimate, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
         """L(u, p + shift) without, and with only, the emission seen directly; and whether p + shift is on the film.
 
         Direct emission has little noise of its own, but its edges would be the strongest gradients of the image.
@@ -71,7 +72,7 @@ class GPTBasic(GradientIntegrator):
         ray, importance, inside = camera.rays(shift)
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.
-        L, _, _ = self.nested.sample(scene, camera.random.clone(), ray, medium, inside)
+        L = estimate(camera.random.clone(), ray, medium, inside)
         Le = emission_seen(scene, self.nested, medium, ray, inside)
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
         dr.eval(L, Le, inside)

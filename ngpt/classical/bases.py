@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical import controlvariates, poisson, weighted
+from ngpt.classical.energy import keep_energy
 from ngpt.classical.variances import auto_alpha
 from ngpt.errors import NgptError
 from ngpt.repair import Repaired
@@ -49,6 +50,11 @@ def _with_variances(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], n
     return lambda data: solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
 
 
+def _keeping_energy(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
+    solve = _with_variances(solver)
+    return lambda data: keep_energy(solve(data), data.image)
+
+
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
     if not isinstance(alpha, str):
@@ -69,9 +75,14 @@ CLASSICAL = {
     "l2": Classical(_GRADIENTS, _l2, {"alpha": "auto"}),
     "l1": Classical(_GRADIENTS, _l1, {"alpha": poisson.DEFAULT_ALPHA}),
     "cv": Classical(_GRADIENTS, _cv, {}),
-    "wcv": Classical(_ALL, _with_variances(controlvariates.wcv), {}),
-    "wl2": Classical(_ALL, _with_variances(weighted.wl2), {}),
+    "wcv": Classical(_ALL, _keeping_energy(controlvariates.wcv), {}),
+    "wl2": Classical(_ALL, _keeping_energy(weighted.wl2), {}),
 }
 
-# Those a network can start from: they cost less than itself.
-BASES = {name: CLASSICAL[name] for name in ("l2", "cv", "wcv")}
+# Those a network can start from: they cost less than itself. Of wcv the sweeps alone, which see no more of the image
+# than a tile has.
+BASES = {
+    "l2": CLASSICAL["l2"],
+    "cv": CLASSICAL["cv"],
+    "wcv": Classical(_ALL, _with_variances(controlvariates.wcv), {}),
+}

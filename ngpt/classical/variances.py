@@ -2,9 +2,18 @@
 
 Given are sample variances of pixel means, from as few as two samples: too noisy to be used pixel by pixel, zero where
 all samples missed the light, and, like the values, larger where a sample hit it. Weights made of them as they are would
-believe the pixels that saw nothing, which darkens the image. So they are summed over colours (a colour is weighted as
-one vector), averaged over a neighbourhood, and bounded from below in proportion to their mean. All of this follows the
-exposure of the image: k times the image, with k² times the variances, has the same weights but for the factor k⁻².
+believe the pixels that saw nothing.
+
+Of the primal that darkens the image: its variances are averaged over a neighbourhood.
+
+Of a difference it only smooths it. But few differences hold most of the variance: those of light that no shift follows.
+An average over neighbours would hand their variance to clean ones, and make them look better than they are. So a
+difference has its own variance where that is large, and otherwise a typical one of its neighbourhood, the mean of
+fourth roots to the fourth power, which outliers do not rule.
+
+All are summed over colours (a colour is weighted as one vector), and bounded from below in proportion to their mean.
+All of this follows the exposure of the image: k times the image, with k² times the variances, has the same weights but
+for the factor k⁻².
 """
 
 import math
@@ -15,7 +24,14 @@ from ngpt.classical.arrays import Array, by_rows, cast, detach, empty, module, t
 from ngpt.classical.leastsquares import robust_mean, sum_of
 
 # What is added to every variance, as a share of the mean over primal and differences.
-FLOOR = 1e-3
+FLOOR = 3e-3
+
+# How many times the typical variance around it a difference has at least. The mean of fourth roots lies below the mean,
+# two to four times where noise is even; 1 believes lucky differences, 10 makes outliers of none.
+TYPICAL = 3
+
+# What counts as no variance, so that derivatives of roots are finite.
+_NONE = 1e-200
 
 # What a count of values that are there, a mean, is divided by at least.
 FEW = 1e-9
@@ -55,12 +71,14 @@ def smooth_variances(
 ) -> tuple[Array, Array]:
     """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
 
-    Each is averaged twice over 3 x 3 pixels, over the values that are there: those that are not finite or negative are
-    missing. The result is divided by the mean of all three layers (a robust one), and ``FLOOR`` is added; without any
-    noise it is 1 everywhere. Differences that are not ``trusted``, and those that do not exist, have infinite variance.
+    Those of the primal are averaged twice over 3 x 3 pixels, over the values that are there: those that are not finite
+    or negative are missing. Those of differences are at least ``TYPICAL`` times their neighbourhood's, the fourth power
+    of such an average of their fourth roots. The result is divided by the mean of all three layers (a robust one), and
+    ``FLOOR`` is added; without any noise it is 1 everywhere. Differences that are not ``trusted``, and those that do
+    not exist, have infinite variance.
     """
     xp = module(primal_var)
-    layers = [_smoothed(layer) for layer in (primal_var, dx_var[:, :-1], dy_var[:-1])]
+    layers = [_smoothed(primal_var), *(_smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
     p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
     differences = xp.stack([p, p])
@@ -95,8 +113,11 @@ def _over_colours(variance: Array) -> tuple[Array, Array]:
     return xp.where(good, total, 0), good
 
 
-def _smoothed(variance: Array) -> Array:
-    """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none."""
+def _smoothed(variance: Array, outliers: bool = False) -> Array:
+    """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none.
+
+    With ``outliers``, means of fourth roots, and a sum that is larger than what comes of them stays as it is.
+    """
     xp, height = module(variance), len(variance)
 
     def rows(first: int, last: int) -> tuple:
@@ -104,11 +125,16 @@ def _smoothed(variance: Array) -> Array:
         total, good = _over_colours(variance[top:bottom])
         count = cast(good, variance.dtype)
         own = slice(first - top, last - top)
-        sums = sum_of(total[own]), sum_of(count[own])
+        raw, sums = total, (sum_of(total[own]), sum_of(count[own]))
+        if outliers:
+            total = xp.where(good, xp.sqrt(xp.sqrt(total.clip(_NONE, None))), 0)
         for _ in range(2):
             total, count = _box(total), _box(count)
+        smooth = total / count.clip(FEW, None)
+        if outliers:
+            smooth = xp.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
         # No variance is negative: what is missing.
-        return xp.where(count > 0, total / count.clip(FEW, None), -1)[own], *sums
+        return xp.where(count > 0, smooth, -1)[own], *sums
 
     smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=xp.float64))
     mean = sum(total for total, _ in bands) / max(sum(count for _, count in bands), 1)

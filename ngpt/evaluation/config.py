@@ -57,6 +57,7 @@ class Config:
     images: str = "first"
     elpips: dict[str, str] = field(default_factory=dict)
     references: dict[str, Any] = field(default_factory=dict)
+    groups: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -84,6 +85,9 @@ class Config:
         for name, files in self.references.items():
             if not isinstance(files, str) and (not isinstance(files, list) or [type(f) for f in files] != [str, str]):
                 raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two halves")
+        for name, scenes in self.groups.items():
+            if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):
+                raise NgptError(f"evaluation: groups.{name} = {scenes!r}: must be a list of scenes' names")
         parts = [file_part(column.name) for column in self.columns()]
         if repeated := next((part for i, part in enumerate(parts) if part in parts[:i]), ""):
             raise NgptError(f"evaluation: two columns would be called '{repeated}'; name the variant otherwise")

@@ -11,7 +11,7 @@ from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
 
 # Blue where gradients have less variance than differences of pixels, grey where as much, orange where more.
-_COLOURS = colour_table(("0b3a75", "2f7fd6", "777777", "d9772b", "ffe6c8")[::-1], 255)
+COLOURS = colour_table(("0b3a75", "2f7fd6", "777777", "d9772b", "ffe6c8")[::-1], 255)
 RANGE = 6  # powers of two at either end
 SCALE = 4  # of the picture
 # 3x5 pixels a character, row by row.
@@ -83,4 +83,4 @@ def _glyph(character: str) -> np.ndarray:
 
 
 def _colours(values: np.ndarray) -> np.ndarray:
-    return coloured((values + RANGE) / (2 * RANGE), _COLOURS)
+    return coloured((values + RANGE) / (2 * RANGE), COLOURS)

@@ -1,4 +1,4 @@
-"""What the folder of results holds: results.json, results.csv, results.md and plots, all from the cells."""
+"""What the folder of results holds: results.json, results.csv, results.md, worth.* and plots, all from the cells."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from typing import Any
 
 from ngpt.evaluation.averages import mean, median, summary
 from ngpt.evaluation.frontier import Point, draw, pareto
-from ngpt.evaluation.tables import tables
+from ngpt.evaluation.tables import tables, worth_page
+from ngpt.evaluation.worth import as_csv as worth_csv
+from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.evaluation.worthplots import draw_worth, write_map
 from ngpt.system.writing import write_json, write_text
 
 _SECONDS = ("render", "reconstruct", "total")
@@ -28,9 +31,33 @@ def write_results(results: dict[str, Any], out: Path) -> None:
             doubt = results["scenes"][scene]["reference"]["doubt"] if scene else None
             write_text(out / f"plots/frontier-{name}.svg", draw(points, title, results["primary"], doubt))
             results["plots"]["frontier"][name] = f"plots/frontier-{name}.svg"
+    _write_worth(results, out)
     write_json(out / "results.json", results)
     write_text(out / "results.csv", as_csv(results))
     write_text(out / "results.md", tables(results))
+
+
+def _write_worth(results: dict[str, Any], out: Path) -> None:
+    """Adds ``worth`` to the results and writes its files; none where columns with or without gradients are missing."""
+    worth = results["worth"] = worth_of_gradients(results)
+    if not worth["rows"]:
+        return
+    plots = results["plots"]["worth"] = {}
+    if any(row["best"] and row["W/C"] for row in worth["rows"]):
+        write_text(out / "plots/worth.svg", draw_worth(worth))
+        plots["samples"] = "plots/worth.svg"
+    for scene in dict.fromkeys(row["scene"] for row in worth["rows"]):
+        entry = results["scenes"][scene]
+        if "worth" not in entry:
+            entry["worth"] = write_map(results, scene, out)
+        if entry["worth"]:
+            plots[scene] = entry["worth"]["map"]
+            for row in worth["rows"]:
+                if row["best"] and row["scene"] == scene:
+                    row["blocks"] = entry["worth"]["blocks"].get(str(row["spp"]))
+    worth["tables"] = worth_tables(results)
+    write_text(out / "worth.csv", worth_csv(worth))
+    write_text(out / "worth.md", worth_page(results))
 
 
 def shared_scenes(results: dict[str, Any]) -> list[str]:

@@ -8,6 +8,7 @@ import numpy as np
 
 from ngpt.evaluation.averages import mean
 from ngpt.evaluation.renders import KINDS
+from ngpt.evaluation.worth import REACH
 
 
 def tables(results: dict[str, Any]) -> str:
@@ -39,14 +40,38 @@ def tables(results: dict[str, Any]) -> str:
         lines += [_title_of_others(results), "", *_others(results, others), ""]
     for name in dict.fromkeys((primary, "FLIP")):
         lines += _duels(results, name)
-    lines += _absences(results)
+    lines += [*_absences(results), _origin(results)]
+    return "\n".join(lines) + "\n"
+
+
+def worth_page(results: dict[str, Any]) -> str:
+    """worth.md: what gradients are worth over what they cost, and what the words mean."""
+    lines = [
+        f"# {results['title']}: worth of gradients",
+        "",
+        "W: by how many times more samples the best method without gradients needs for the error of a method with "
+        "them. C: seconds of a sample with gradients over one without, features in both, measured in turn. Gradients "
+        "pay where W/C > 1: then the method without needs W/C times the time. Reconstruction is not counted.",
+        "",
+        f"Errors are {results['primary']}, medians over seeds. The best of several methods is the one of least error "
+        "with gradients, and of least time for that error without. ~: outside of the measured samples, by the nearest "
+        f"slope. < and >: no nearer than a factor of {REACH:g} outside, where the slope is not followed. blocks: the "
+        "share of the picture's blocks with less error at equal time (plots/worth-SCENE.svg). In means over scenes, "
+        "the number of scenes is in brackets.",
+        "",
+    ]
+    for title, rows in results["worth"]["tables"].items():
+        lines += [f"{title}:", "", *_table(rows[0], rows[1:], 1), ""]
+    return "\n".join([*lines, _origin(results)]) + "\n"
+
+
+def _origin(results: dict[str, Any]) -> str:
     facts = results["metadata"]
     versions = ", ".join(f"{name} {value}" for name, value in facts["versions"].items() if value)
-    lines.append(
+    return (
         f"By `{results['command']}` on {results['date']}, {facts['threads']} threads of {facts['cpu']}, "
         f"commit {facts['commit']}; {versions}."
     )
-    return "\n".join(lines) + "\n"
 
 
 def _doubtful(results: dict[str, Any]) -> str:

@@ -134,6 +134,8 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
     absent = {(cell["scene"], cell["method"], cell["absent"]) for cell in results["cells"] if cell["absent"]} | {
         (name, "all", scene["absent"]) for name, scene in results["scenes"].items() if scene["absent"]
     }
+    worth = results.get("worth", {}).get("tables", {})
+    tables |= {f"{title} (worth.md explains)": rows for title, rows in worth.items()}
     if _several_samplers(results):
         tables |= _costs(results)
     if absent:

@@ -105,6 +105,46 @@ def polished(alpha):
     }
 
 
+def leaf():
+    """A thin leaf in front of nothing, lit by a lamp that the camera does not see."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _camera, _diffuse
+
+    turn = mi.ScalarTransform4f
+    white = {"type": "twosided", "nested": _diffuse(0.8, 0.8, 0.8)}
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 4},
+        "sensor": _camera([0, 0, 4], [0, 0, 0], 40),
+        "lamp": {
+            "type": "rectangle",
+            "to_world": turn().look_at([0, 3, 3], [0, 0, 0], [1, 0, 0]),
+            "emitter": {"type": "area", "radiance": 10.0},
+        },
+        "leaf": {
+            "type": "rectangle",
+            "to_world": turn().scale(2),
+            "bsdf": {"type": "mask", "opacity": 0.3, "nested": white},
+        },
+    }
+
+
+def caustics():
+    """A floor below a lamp, lit through a ball of glass and by way of a mirror ball."""
+    from data_gen.scenes.builtin import _camera, _diffuse, _light, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 6},
+        "sensor": _camera([0.2, 1.9, 2.6], [0, 0.35, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
+        "lamp": _light([0.2, 2.6, -0.2], [0, -1, 0], (1.2, 1.2), (6, 6, 6)),
+        "glass": _sphere([-0.3, 0.62, 0.1], 0.45, {"type": "dielectric"}),
+        "mirror": _sphere([0.6, 0.4, 0.3], 0.3, {"type": "conductor", "material": "Ag"}),
+    }
+
+
 def _scale(factor):
     import mitsuba as mi
 

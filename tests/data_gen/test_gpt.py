@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 from data_gen_scenes import fog, furnace, glass, hidden_lamp, one_sided, plenty, polished
-from unbiased import gradient_tests, load, render_ours, render_references
+from unbiased import DISTANCES, FAR, gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
@@ -17,8 +17,8 @@ from ngpt.testing import z_test
 SCENES = ["diffuse", "glossy", "environment", "lens", glass, hidden_lamp, plenty]
 
 
-def verdicts(stacks, references):
-    return {name: result.passed for name, result in gradient_tests(stacks, references)}
+def verdicts(stacks, references, pixels=1):
+    return {name: result.passed for name, result in gradient_tests(stacks, references, pixels=pixels)}
 
 
 @pytest.mark.parametrize("scene", SCENES[1:])  # the first is the one of all samplers' law (test_samplers.py)
@@ -26,8 +26,9 @@ def test_unbiased(renderer, scene):
     scene = load(renderer, scene, (32, 32))
     references = render_references(renderer, scene, spp=128)
     assert references.mean() > 0.01  # black images agree all too well
-    for name, result in gradient_tests(render_ours(scene, "gpt"), references):
-        assert result.passed, f"{name}: {result}"
+    for pixels in DISTANCES:
+        for name, result in gradient_tests(render_ours(scene, "gpt", pixels=pixels), references, pixels=pixels):
+            assert result.passed, f"{name} over {pixels} pixels: {result}"
 
 
 @pytest.mark.slow
@@ -85,6 +86,44 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     monkeypatch.setattr(module, function, partial(mutant, renderer, dr) if callable(mutant) else mutant)
     passed = verdicts(render_ours(scene, "gpt"), references)
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+@pytest.mark.parametrize("mutant", ["emission at the joint", "light at the joint"])
+def test_mutants_that_only_far_shifts_see(renderer, mutant, monkeypatch):
+    """Weights that are nearly right between neighbours: the z-test passes over one pixel, and fails over eight."""
+    from data_gen.paths import shift
+    from data_gen.samplers.gpt import offset_path
+
+    weight, emission = shift.gradient_weight, offset_path.shared_emission
+    scene = load(renderer, "glossy", (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    if mutant == "emission at the joint":
+        # What is found at the shared vertex has the density of emitter sampling that the base path knows.
+        def of_the_base(scene, lights, x1, Le, p, *geometry):
+            return emission(scene, lights, x1, Le, p, *geometry)[0], p
+
+        monkeypatch.setattr(offset_path, "shared_emission", of_the_base)
+    else:
+        # What is sampled there has the weight 1/2, whatever the densities of the paths that came.
+        half = renderer.Float(1)
+        monkeypatch.setattr(shift, "gradient_weight", lambda r, good: half if good is True else weight(r, good))
+    near, far = (verdicts(render_ours(scene, "gpt", pixels=n), references, n) for n in DISTANCES)
+    assert near == {"primal": True, "dx": True, "dy": True}
+    assert far["primal"] and not (far["dx"] and far["dy"])
+
+
+def test_far_shifts_leave_out_what_leaves_the_image(renderer):
+    """The last eight columns have no pixel to differ from; before them there is no hole, and nothing else has moved."""
+    from data_gen.film import SHIFTS
+    from data_gen.render import render_stack
+
+    scene, table = load(renderer, "diffuse", (20, 12)), dict(SHIFTS)
+    near, far = render_ours(scene, "gpt", batches=1)[0], render_ours(scene, "gpt", batches=1, pixels=FAR)[0]
+    assert not far["dx"][:, -FAR:].any() and not far["dy"][-FAR:].any()
+    assert (far["dx"][:, :-FAR].any(axis=-1)).mean() > 0.95 and (far["dy"][:-FAR].any(axis=-1)).mean() > 0.95
+    assert np.array_equal(near["direct"], far["direct"]) and np.array_equal(near["albedo"], far["albedo"])
+    # The table is what it was, and so are the bits.
+    assert table == SHIFTS and np.array_equal(near["dx"], render_stack(scene, 64, 0, "gpt")["dx"])
 
 
 def one_direction(film, layer):

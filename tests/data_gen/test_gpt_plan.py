@@ -46,8 +46,8 @@ def test_plans(renderer):
 
 def test_unknown_shift(renderer):
     # Mitsuba wraps what a plugin raises.
-    with pytest.raises(RuntimeError, match="unknown shift 'manifold'; choose one of: replay, half-vector"):
-        renderer.load_dict({"type": "gpt", "shift": "manifold"})
+    with pytest.raises(RuntimeError, match="unknown shift 'guess'; choose one of: replay, half-vector, manifold"):
+        renderer.load_dict({"type": "gpt", "shift": "guess"})
 
 
 def test_no_light_at_all(renderer):
@@ -124,7 +124,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     """Taken over from another vertex, an emitter has the direction, density and weight that it has here."""
     import drjit as dr
 
-    from data_gen.paths.lights import Lights, emission, replay_light, sample_light, shared_emission
+    from data_gen.paths.lights import Lights, emission, replay_light, sample_light, shadowed, shared_emission
     from data_gen.paths.vertex import seen_from
 
     mi, lamp = renderer, dict(LAMPS[name])
@@ -149,6 +149,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     x, y, u, yes = vertex(), vertex(), random.next_2d(), mi.Bool(True)
     base, weight = scene.sample_emitter_direction(x, u, False, yes)
     shared, own = replay_light(scene, lights, base, weight, u, y, yes), sample_light(scene, y, u, yes)
+    shared.weight = shadowed(scene, y, shared, shared.weight)
     found = dr.max(own.weight) > 0
     assert dr.count(found)[0] > 500
     assert mostly((dr.max(shared.weight) > 0) == found)

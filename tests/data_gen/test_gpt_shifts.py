@@ -58,7 +58,7 @@ def museum():
 class Steps:
     """Random steps of base paths, and their shifts from random vertices: ``there`` and ``back`` again."""
 
-    def __init__(self, mi, shift, threshold=0.05):
+    def __init__(self, mi, shift, threshold=0.05, caustic=True):
         import drjit as dr
 
         from data_gen.samplers.gpt import offset_path
@@ -66,7 +66,7 @@ class Steps:
 
         self.mi, self.dr = mi, dr
         self.scene = mi.load_dict(museum())
-        self.plan = make_plan(self.scene, threshold, -1, 1000, shift, False)
+        self.plan = make_plan(self.scene, threshold, -1, 1000, shift, False, caustic)
         assert self.plan.replays
         self.random = mi.load_dict({"type": "independent"})
         self.random.seed(7, LANES)
@@ -90,8 +90,8 @@ class Steps:
         from data_gen.samplers.gpt.base_path import base_step
 
         mi, β = self.mi, self.mi.Spectrum(1)
-        step, _ = base_step(self.scene, self.plan, self.u.clone(), x, β, mi.Float(1), mi.UInt32(1), mi.Bool(True), [])
-        return step
+        state = (β, mi.Float(1), mi.UInt32(1), mi.Bool(True), mi.Bool(False), mi.Bool(False))
+        return base_step(self.scene, self.plan, self.u.clone(), x, *state, [])[0]
 
     def offset_at(self, ray):
         """An offset path that has come along ``ray``."""
@@ -107,6 +107,7 @@ class Steps:
 
     def reverse_step(self):
         """The step of the offset path, as if it had been the base path's."""
+        from data_gen.paths.caustic import ends_late
         from data_gen.paths.shift import reconnects
         from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 
@@ -123,8 +124,10 @@ class Steps:
         x1 = dr.select(self.joins, seen_from(step.x1, there.ray.d), self.hits(there))
         x1.t = dr.select(self.joins & step.x1.is_valid(), dr.norm(step.x1.p - y.p), x1.t)
         self.f_p = dr.select(given, f / p, own.f_p)
+        late = ends_late(mi.Bool(True), y_connectable, self.plan.materials.sharp(x1, self.scene))
         return replace(
             own,
+            ends_late=dr.select(given, late & mi.Bool(self.plan.caustic), own.ends_late),
             wo=dr.select(given, wo, own.wo),
             η=dr.select(given, step.η, own.η),
             kind=dr.select(given, SMOOTH, own.kind),
@@ -147,9 +150,9 @@ class Steps:
 
 
 @pytest.mark.parametrize("shift", ["replay", "half-vector"])
-@pytest.mark.parametrize("threshold", [0.05, 10.0])
-def test_the_shift_of_the_shift_is_the_path(renderer, shift, threshold):
-    steps = Steps(renderer, shift, threshold)
+@pytest.mark.parametrize(("threshold", "caustic"), [(0.05, True), (0.05, False), (10.0, True)])
+def test_the_shift_of_the_shift_is_the_path(renderer, shift, threshold, caustic):
+    steps = Steps(renderer, shift, threshold, caustic)
     taken, undone, _ = round_trips(steps)
     assert taken.sum() > 0.1 * LANES
     assert undone[taken].mean() > LEVEL
@@ -201,8 +204,26 @@ def test_round_trips_see_wrong_rules(renderer, monkeypatch):
     for name, mutant in mutants_of_rules(renderer, dr):
         with monkeypatch.context() as patch:
             patch.setattr(shift, name, mutant)
-            taken, undone, _ = round_trips(Steps(renderer, "replay"))
+            taken, undone, _ = round_trips(Steps(renderer, "replay", caustic=False))
         assert undone[taken].mean() < LEVEL, name
+
+
+def test_paths_whose_light_will_be_caustic_are_rejected_from_both_sides(renderer, monkeypatch):
+    from data_gen.samplers.gpt import offset_path
+
+    steps = Steps(renderer, "replay")
+    ends = np.array(steps.step.ends_late & steps.step.goes_on)
+    assert ends.sum() > 100 and not np.array(steps.there.r > 0)[ends].any()
+    # A mutant that looks at shifted copies alone
+    step_apart = offset_path.step_apart
+    never = renderer.Bool(False)
+    monkeypatch.setattr(
+        offset_path,
+        "step_apart",
+        lambda scene, plan, step, y: step_apart(scene, plan, replace(step, ends_late=never), y),
+    )
+    taken, undone, _ = round_trips(Steps(renderer, "replay"))
+    assert undone[taken].mean() < LEVEL
 
 
 def directions(mi, dr, n, seed, above=None):

@@ -2,54 +2,34 @@
 
 import numpy as np
 import pytest
-from unbiased import render_ours, render_references
+from data_gen_scenes import leaf
+from unbiased import load, render_ours, render_references, right_integrator
 
 from ngpt.testing import z_test
-
-LEAF = {
-    "type": "rectangle",
-    "bsdf": {
-        "type": "mask",
-        "opacity": 0.3,
-        "nested": {"type": "twosided", "nested": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.8}}},
-    },
-}
-
-
-def leaf(mi, integrator, **more):
-    """A thin leaf in front of nothing, lit by a lamp that the camera does not see."""
-    turn = mi.ScalarTransform4f
-    camera = {"type": "perspective", "fov": 40, "to_world": turn().look_at([0, 0, 4], [0, 0, 0], [0, 1, 0])}
-    lamp = {"type": "rectangle", "to_world": turn().look_at([0, 3, 3], [0, 0, 0], [1, 0, 0])}
-    scene = {
-        "type": "scene",
-        "integrator": {"type": integrator, "max_depth": 4},
-        "sensor": camera | {"film": {"type": "hdrfilm", "width": 16, "height": 16, "rfilter": {"type": "box"}}},
-        "lamp": lamp | {"emitter": {"type": "area", "radiance": 10.0}},
-        "leaf": LEAF | {"to_world": turn().scale(2)},
-    }
-    return mi.load_dict(scene | more)
 
 
 def test_light_on_what_has_holes_is_not_lost(renderer):
     """Mitsuba's ``path`` gives it up when the path goes on through a hole and meets nothing; ``prb`` does not."""
-    scene = leaf(renderer, "path")
-    right = render_references(renderer, leaf(renderer, "prb"))
-    for sampler in ("primal", "gpt"):
+    scene = load(renderer, leaf, (16, 16))
+    right = render_references(renderer, scene)
+    assert right_integrator(renderer, scene).class_name() != "PathIntegrator"
+    for sampler in ("primal", "gpt", "gpt-basic"):
         ours = np.stack([stack["primal"] for stack in render_ours(scene, sampler)])
         assert z_test(ours, right).passed, sampler
-    # The day this fails, ``data_gen.samplers.primal.radiance`` may go.
-    assert render_references(renderer, scene, batches=4).mean() < 0.5 * right.mean()
+    # The day this fails, ``data_gen.samplers.common.radiance`` may go, and ``right_integrator`` with it.
+    wrong = np.array(renderer.render(scene, integrator=renderer.load_dict({"type": "path", "max_depth": 4}), spp=256))
+    assert wrong.mean() < 0.5 * right.mean()
 
 
 @pytest.mark.parametrize("more", [{"sky": {"type": "constant", "radiance": 0.1}}, {"leaf": {"type": "sphere"}}])
 def test_elsewhere_it_is_the_integrator_itself(renderer, more):
     """With an environment, and without holes: the very same numbers as ``path`` gives."""
-    from data_gen.samplers.primal import radiance
+    from data_gen.samplers.common import radiance
     from data_gen.scenes.load import reference_integrator
 
-    scene = leaf(renderer, "path", **more)
+    scene = load(renderer, lambda: leaf() | more, (16, 16))
     integrator = reference_integrator(scene)
+    assert right_integrator(renderer, scene).class_name() == "PathIntegrator"
 
     class Called(Exception):
         pass
@@ -67,4 +47,4 @@ def test_elsewhere_it_is_the_integrator_itself(renderer, more):
             raise Called
 
     with pytest.raises(Called):
-        radiance(scene, Own())(None, None, None)
+        radiance(scene, Own())(None, None, None, True)

@@ -11,6 +11,7 @@ from data_gen.paths import caustic
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
+from data_gen.samplers.gpt.manifold_shift import Chain, advance
 from data_gen.samplers.gpt.plan import Plan
 
 
@@ -24,8 +25,8 @@ class Step:
     # Emitter sampling
     u_light: mi.Point2f
     light: mi.DirectionSample3f
-    light_weight: mi.Spectrum  # Le / p; Le V / p where emitters are not shared
-    lit: mi.Bool  # the sample is seen from x
+    light_weight: mi.Spectrum  # Le / p
+    lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
     u_lobe: mi.Float
@@ -49,9 +50,13 @@ class Step:
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
     rough: mi.Bool  # behind x
     late: mi.Bool  # behind x
+    ends_late: mi.Bool  # or behind x1 at the latest
+    # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
+    L_followed: mi.Spectrum  # m Le
+    chain: Chain | None  # behind x
 
 
-def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, offsets) -> tuple[Step, mi.Float]:
+def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, chain, offsets) -> tuple[Step, mi.Float]:
     """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
@@ -63,13 +68,13 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    light, light_weight = scene.sample_emitter_direction(x, u_light, not plan.lights.shared, lit)
-    lit &= light.pdf != 0
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
-    if plan.lights.shared:
-        lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit)
+    light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
+    lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once: materials are virtual functions, and calls to them dear.
     f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
+    lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets])))
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
 
@@ -92,14 +97,20 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
     x_connectable = plan.materials.connectable(bsdf)
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
-    L_bsdf, L_caustic = Le * mis_weight(sample.pdf, p_light), mi.Spectrum(0)
+    L_bsdf, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Bool(False)
+    L_caustic, L_followed = mi.Spectrum(0), mi.Spectrum(0)
 
     # ------------------- The layer ``caustic`` -------------------
     if plan.caustic:
         L_light, caustic_light = caustic.split(caustic.lit_late(rough, late, x_connectable), L_light)
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
+        if plan.manifold:
+            event = sample.sampled_type
+            chain, follows = advance(chain, depth, event, goes_on, x_connectable, survival, late, x1, Le)
+            caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
+        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, plan.materials.sharp(x1, scene))
     step = Step(
         x=x,
         x_connectable=x_connectable,
@@ -129,6 +140,9 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, of
         L_caustic=L_caustic,
         rough=rough,
         late=late,
+        ends_late=ends_late,
+        L_followed=L_followed,
+        chain=chain,
     )
     return step, η
 

@@ -49,9 +49,12 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.base_path import base_step
+from data_gen.samplers.gpt.manifold_shift import add_followed, no_chain
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from ngpt.errors import NgptError
+
+_SHIFTS = ("replay", "half-vector", "manifold")
 
 
 class GPT(GradientIntegrator):
@@ -64,7 +67,9 @@ class GPT(GradientIntegrator):
     ``hide_emitters``        false
     ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
     ``shift``                "replay" before paths join, or "half-vector": that of smooth events is copied, others are
-                             replayed, which is rarely better
+                             replayed, which is rarely better; "manifold": light that comes to the first rough vertex
+                             through mirrors and glass is not in the layer ``caustic``, but followed to its lamp by
+                             walks: see ``manifold_shift``
     ``reuse``                false; true makes the primal the mean over base paths and the offset paths of neighbours.
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
     ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
@@ -85,8 +90,10 @@ class GPT(GradientIntegrator):
         self.reuse = props.get("reuse", False)
         self.diagnostics = props.get("diagnostics", False)
         self.caustic = props.get("caustic", True)
-        if self.shift not in ("replay", "half-vector"):
-            raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: replay, half-vector")
+        if self.shift not in _SHIFTS:
+            raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: {', '.join(_SHIFTS)}")
+        if self.shift == "manifold" and (self.reuse or not self.caustic):
+            raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone, by Mitsuba's ``path``."""
@@ -117,7 +124,7 @@ class GPT(GradientIntegrator):
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        L, Le, L_caustic, offsets = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
+        L, Le, L_caustic, offsets, chain = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (L, Le, L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
 
@@ -132,7 +139,9 @@ class GPT(GradientIntegrator):
         if self.diagnostics:
             values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
         # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside)
+        dr.eval(values, Δ, inside, chain)
+        if plan.manifold:
+            Δ = add_followed(scene, plan, self.first_hit, camera, list(SHIFTS.values()), chain, Δ)
         for name, value in values.items():
             film.put(name, value)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
@@ -152,42 +161,46 @@ class GPT(GradientIntegrator):
         for offset_ray, offset_importance, inside in shifted:
             hit = self.first_hit(scene, offset_ray)
             offsets.append(start(plan, x, importance, offset_ray, hit, offset_importance, inside))
+        chain = no_chain(dr.width(hit.t)) if plan.manifold else None
         if plan.max_depth < 2:
-            return dr.zeros(mi.Spectrum, dr.width(hit.t)), Le, dr.zeros(mi.Spectrum, dr.width(hit.t)), offsets
+            none = dr.zeros(mi.Spectrum, dr.width(hit.t))
+            return none, Le, none, offsets, chain
 
         # --------------------- The first step ------------------------
         # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
         β = dr.select(x.is_valid(), importance, 0)
         false = mi.Bool(False)
-        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, false, false, offsets)
+        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, false, false, chain, offsets)
         # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
         L = β * step.L_light + step.β1 * step.L_bsdf
         L_caustic = β * step.L_caustic if plan.caustic else step.L_caustic
         offsets = first_steps(scene, plan, step, offsets)
-        L, L_caustic, offsets = self.walk(scene, plan, random, step, η, L, L_caustic, offsets)
-        return L, Le, L_caustic, offsets
+        L, L_caustic, offsets, chain = self.walk(scene, plan, random, step, η, L, L_caustic, offsets)
+        return L, Le, L_caustic, offsets, chain
 
     @dr.syntax
     def walk(self, scene, plan, random, step, η, L, L_caustic, offsets):
         """The rest of all paths past their first ``step``."""
         # ---------------------- Loop state ---------------------------
         x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
-        rough, late = step.rough, step.late
+        rough, late, chain = step.rough, step.late, step.chain
         depth = mi.UInt32(2)
         # As long as the base path lives, or a ghost has company
         active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         while dr.hint(active, label="gpt"):
             # The base path first: an offset path can only join a vertex that is known.
-            step, η = base_step(scene, plan, random, x, β, η, depth, seen, rough, late, offsets)
+            step, η = base_step(scene, plan, random, x, β, η, depth, seen, rough, late, chain, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
             if dr.hint(plan.caustic, mode="scalar"):
                 L_caustic += β * step.L_caustic
+            if dr.hint(plan.manifold, mode="scalar"):
+                L += step.β1 * step.L_followed
             offsets = later_steps(scene, plan, step, offsets)
             x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
-            rough, late = step.rough, step.late
+            rough, late, chain = step.rough, step.late, step.chain
             depth += 1
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
-        return L, L_caustic, offsets
+        return L, L_caustic, offsets, chain
 
     def first_hit(self, scene, ray) -> mi.PreliminaryIntersection3f:
         """Where a camera ray leads, through lamps that hide from the camera."""

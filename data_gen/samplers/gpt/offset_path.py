@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import caustic, shift
-from data_gen.paths.lights import emission, replay_light, shared_emission
+from data_gen.paths.lights import emission, replay_light, shadowed, shared_emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
 from data_gen.samplers.gpt.base_path import Step, light_mis
@@ -143,7 +143,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
     f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
     # Each path has its own m: from y, the emitter is found with other densities than from x.
-    L_light = f * light.weight * light_mis(light.delta, light.p, p)
+    L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
     if plan.caustic:
         L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), connectable), L_light)
     # Never rejected: an emitter that y does not see is a sample of value 0, and the reverse shift knows it as such.
@@ -154,7 +154,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     # ------------- BSDF sampling: reconnect, or part -------------
     joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
     # Beside a ghost as well, which walks but does not go on
-    parts = step.walks & ~joins
+    parts = step.walks & ~joins & ~step.ends_late
     none = mi.Bool(False)
     # What neither does is rejected: β' = 0, r = 0.
     move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none, path.rough)
@@ -183,7 +183,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         # Rejected or at its end, it has nothing to set against the rest of the base path.
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
-        failed=path.failed | (step.goes_on & ~step.late & (r1 == 0)),
+        failed=path.failed | (step.goes_on & ~step.ends_late & (r1 == 0)),
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
         rough=move.rough,
@@ -197,13 +197,14 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
     x1 = step.x1
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
-    # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
-    occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)))
 
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
     J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
     f, p = evaluate(bsdf, y, y.to_local(direction))
+    # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
+    # Where p = 0 that is so already.
+    occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)), p > 0)
 
     # ---------------------- Emission at x1 -----------------------
     # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
@@ -262,10 +263,11 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
         kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
     )
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
+    # A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
-        allowed &= ~late & ~step.late
+        allowed &= ~(late | caustic.ends_late(kind == SMOOTH, connectable, plan.materials.sharp(y1, scene)))
     return Move(
         ray=ray,
         hit=hit,

@@ -17,6 +17,7 @@ class Plan:
     ``replays``       offset paths may stay apart for more than a step: there are mirrors, glass, holes or polish
     ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     ``caustic``       light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
+    ``manifold``      some of that light is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
     ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
     """
 
@@ -28,6 +29,7 @@ class Plan:
     half_vectors: bool
     hide_emitters: bool
     caustic: bool
+    manifold: bool
 
     @property
     def hides(self) -> bool:
@@ -48,6 +50,6 @@ def make_plan(
     # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
     replays = not materials.all_connectable
     half_vectors = replays and shift == "half-vector"
-    return Plan(
-        materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic and replays
-    )
+    caustic = caustic and replays
+    manifold = caustic and shift == "manifold"
+    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic, manifold)

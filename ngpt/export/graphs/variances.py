@@ -1,23 +1,30 @@
 """After ``ngpt.classical.variances``: variances made fit for weights. Channels: of the primal, of dx, of dy."""
 
 from ngpt.classical.leastsquares import CLIP
-from ngpt.classical.variances import FEW
+from ngpt.classical.variances import FEW, TYPICAL
 from ngpt.export.builder import FLOAT, Value, channels, op, repeat
 from ngpt.export.graphs.repair import finite
 
 
 def smoothed(primal: Value, primal_var: Value, dx_var: Value, dy_var: Value) -> tuple[Value, Value]:
-    """Twice the mean over 3x3 values that are known, where there are none the mean of all; and ``inside``."""
+    """Twice the mean over 3x3 values that are known, where there are none the mean of all; and ``inside``.
+
+    Of differences, means of fourth roots, and what is larger than ``TYPICAL`` times their fourth power stays as it is.
+    """
     there = inside(primal)
     (vp, gp), (vx, gx), (vy, gy) = (_over_colours(layer) for layer in (primal_var, dx_var, dy_var))
     known = op.Concat(gp, gx, gy, axis=1) * there
     values = op.Concat(vp, vx, vy, axis=1) * known
     sums, counts = (op.ReduceSum(x, [2, 3], keepdims=1) for x in (values, known))
     typical = sums / op.Max(counts, 1.0)
+    averaged = op.Concat(channels(values, 0, 1), op.Sqrt(op.Sqrt(channels(values, 1, 3))), axis=1)
     # Nothing may pass through the column and the row that do not exist.
-    v, n = (_box(_box(x) * there) for x in (values, known))
+    v, n = (_box(_box(x) * there) for x in (averaged, known))
+    mean = v / op.Max(n, FEW)
+    roots = channels(mean, 1, 3)
+    robust = op.Max(op.Mul(roots * roots, roots * roots) * float(TYPICAL), channels(values, 1, 3))
     # A count is at least a ninth of a ninth; rounding may leave less.
-    return op.Where(op.Greater(n, 1e-3), v / op.Max(n, FEW), typical), there
+    return op.Where(op.Greater(n, 1e-3), op.Concat(channels(mean, 0, 1), robust, axis=1), typical), there
 
 
 def inside(primal: Value) -> Value:

@@ -1,0 +1,180 @@
+"""The shift "manifold": light that comes to the first rough vertex through mirrors and glass, in a kernel of its own.
+
+Replay loses such light: from beside z_b, the same direction does not lead to the same small lamp. Here the offset path
+goes through the same events to the same point x_c of the lamp, by the walks of ``data_gen.paths.manifold``.
+
+    z_b, z_b'   the first vertices that are left by a smooth event, after as many specular ones from the camera
+    ω, ω'       directions there; k specular events further on, k = 1 .. 6, both paths meet the lamp at x_c
+    F           product of the reflectances of the k events, P that of the probabilities to take them
+    b, b'       f(x) / p(x) and f(y) |J| / p(x); p, p' densities of ω at z_b, ω' at z_b'
+    r           p' P' J / (p P)
+    Δ           2 (b' - b) / (1 + r), or -2 b where no walk leads there and back
+
+Up to z_b' the offset path replays the base path's random numbers, with r = 1. As the light is that of one technique
+(no emitter sampling finds a lamp behind glass), and a class of paths by itself, it is shifted apart from all other
+light, of which the kernel of ``gpt`` knows nothing here. That kernel leaves one record for each lane; such paths are
+rare, so this one runs on the few lanes that have one, four times as wide, one for each direction.
+
+[Hua et al. 2019, sections 3.4 and 3.5]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.manifold import MAX_EVENTS, Target, add_event, event, follow, shoot
+from data_gen.paths.shift import gradient_weight
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import SMOOTH, evaluate, event_kind, seen_from
+from data_gen.samplers.gpt.plan import Plan
+
+# States of a chain, in its highest bits: no rough vertex so far; one, with the events behind it; none that is followed.
+_BEFORE, _OPEN, _LOST = 0, 1 << 31, 1 << 30
+_EVENT_BITS = 2 * MAX_EVENTS
+_EVENTS = (1 << _EVENT_BITS) - 1
+# As in ``data_gen.passes``: rays of lanes side by side are traced together.
+_PACKET = 16
+
+
+@dataclass
+class Chain:
+    """What a base path remembers of the way it has come.
+
+    ``record``    steps before z_b and, in the lowest bits, the events behind it; 0 while nothing is found there
+    ``survival``  product of the factors of Russian roulette, up to where it is found
+    """
+
+    state: mi.UInt32
+    record: mi.UInt32
+    survival: mi.Float
+
+
+def no_chain(lanes: int) -> Chain:
+    return Chain(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes))
+
+
+def advance(chain: Chain, depth, sampled_type, goes_on, connectable, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
+    """The chain behind the ``depth``-th vertex, and whether it ends at ``x1``, where it finds ``Le``.
+
+    Only ``late`` light is followed: a lamp behind panes alone is no worse off with replay.
+    """
+    # --------------------- One more event ------------------------
+    code = event(sampled_type)
+    before, open_ = chain.state == _BEFORE, chain.state >= _OPEN
+    longer, fits = add_event(chain.state & _EVENTS, code)
+    state = dr.select(before & (code == 0) & connectable, mi.UInt32(_OPEN), _LOST)
+    state = dr.select(before & (code != 0), _BEFORE, state)
+    state = dr.select(open_ & (code != 0) & fits, longer | _OPEN, state)
+    state = dr.select(goes_on, state, _LOST)
+
+    # -------------------------- Its end --------------------------
+    # A lamp that is a mirror too could be met again further on: a lane has one record.
+    sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
+    ends = late & (state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
+    events = state & _EVENTS
+    k = (33 - dr.lzcnt(events)) >> 1
+    record = dr.select(ends, ((depth - 1 - k) << _EVENT_BITS) | events, chain.record)
+    # Nothing that comes later belongs to the record.
+    survival = dr.select(chain.record == 0, chain.survival * survival, chain.survival)
+    return Chain(state, record, survival), ends
+
+
+def add_followed(scene, plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Chain, Δ: list) -> list:
+    """``Δ``, colours of all lanes for each of the ``shifts``, with the samples of all recorded paths added.
+
+    ``first_hit`` is where a camera ray leads. All arguments are evaluated.
+    """
+    lanes, exists = in_packets(np.array(dr.compress(chain.record != 0)), camera)
+    if not len(lanes):
+        return Δ
+    # One lane for each offset path, so that those of a base path are in one packet
+    n = len(shifts)
+    wide, found = mi.UInt32(np.repeat(lanes, n)), mi.Bool(np.repeat(exists, n))
+    number = dr.arange(mi.UInt32, n * len(lanes)) % n
+    shift = dr.gather(mi.Vector2f, mi.Vector2f(*np.array(shifts, np.float32).T), number)
+    word, survival = dr.gather(mi.UInt32, chain.record, wide), dr.gather(mi.Float, chain.survival, wide)
+    samples = followed(scene, plan, first_hit, camera.at(wide), shift, word, survival, found)
+    dr.eval(samples)
+    return [with_samples(total, samples, mi.UInt32(lanes), mi.Bool(exists), n, i) for i, total in enumerate(Δ)]
+
+
+def with_samples(total: mi.Color3f, samples: mi.Color3f, lanes, exists, n: int, i: int) -> mi.Color3f:
+    """``total`` with every ``n``-th of the ``samples``, from the ``i``-th on, added to ``lanes`` of it."""
+    own = dr.gather(mi.Color3f, samples, dr.arange(mi.UInt32, dr.width(lanes)) * n + dr.opaque(mi.UInt32, i))
+    channels = [mi.Float(channel) for channel in total]
+    for channel, value in zip(channels, own, strict=True):
+        dr.scatter_add(channel, value, lanes, exists)
+    return mi.Color3f(*channels)
+
+
+def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
+    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.
+
+    The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
+    """
+    _, counts = np.unique(lanes // (int(dr.prod(camera.size)) * camera.block), return_counts=True)
+    padded = -(-counts // _PACKET) * _PACKET
+    place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
+    spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)
+    spread[place], exists[place] = lanes, True
+    return spread, exists
+
+
+def followed(scene, plan: Plan, first_hit, camera: CameraSamples, shift, word, survival, active) -> mi.Color3f:
+    """Δ of the light that each lane has recorded, for the offset path displaced by ``shift`` pixels."""
+    # -------------------- To z_b and to z_b' ---------------------
+    events, steps = word & _EVENTS, word >> _EVENT_BITS
+    camera_ray, importance, _ = camera.rays()
+    ray1, importance1, inside = camera.rays(shift)
+    random, random1 = camera.random.clone(), camera.random.clone()
+    z, β, active = specular_steps(scene, first_hit, camera_ray, importance, random, steps, active)
+    z1, β1, exists = specular_steps(scene, first_hit, ray1, importance1, random1, steps, active & inside)
+
+    # ----------------------- The base path -----------------------
+    _, u_lobe, u_direction, _ = draw(random)
+    sample, f_p = z.bsdf().sample(mi.BSDFContext(), z, u_lobe, u_direction, active)
+    active &= (sample.pdf > 0) & (event_kind(sample.sampled_type) == SMOOTH)
+    ω = z.to_world(sample.wo)
+    ray = shoot(scene, z, ω, events, Target(z.p, mi.Vector3f(ω), mi.Bool(True)), active).ray
+    x_c = scene.ray_intersect(ray, active)
+    target = Target(x_c.p, dr.select(x_c.is_valid(), mi.Vector3f(x_c.n), ray.d), ~x_c.is_valid())
+    base = shoot(scene, z, ω, events, target, active)
+    emitter = x_c.emitter(scene)
+    b = β * f_p * base.weight * survival * emitter.eval(x_c, active)
+
+    # ---------------------- The offset path ----------------------
+    ω1, shot, J, exists = follow(scene, z, ω, base, z1, events, target, exists & active)
+    f1, p1 = evaluate(z1.bsdf(), z1, z1.to_local(ω1), exists)
+    J *= shot.P / (sample.pdf * base.P)
+    b1 = β1 * f1 * shot.weight * (J * survival) * emitter.eval(seen_from(x_c, shot.ray.d), exists)
+    r = p1 * J
+    # The reverse shift begins where the offset path may: it needs the same kind of vertex.
+    exists &= plan.materials.connectable(z1.bsdf()) & (p1 > 0) & dr.isfinite(r) & dr.isfinite(dr.sum(b1))
+    Δ = gradient_weight(r, exists) * (dr.select(exists, b1, 0) - b)
+    return to_rgb(dr.select(active & dr.isfinite(dr.sum(b)), Δ, 0), camera_ray.wavelengths)
+
+
+def draw(random) -> tuple:
+    """The random numbers of one step, in the order of ``base_step()``."""
+    return random.next_2d(), random.next_1d(), random.next_2d(), random.next_1d()
+
+
+@dr.syntax
+def specular_steps(scene, first_hit, ray, β, random, steps, active) -> tuple:
+    """The vertex that a replay reaches after so many specular steps, the throughput, and whether it gets there."""
+    z, β = first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray)), mi.Spectrum(β)
+    good, i = active & z.is_valid(), mi.UInt32(0)
+    while dr.hint(good & (i < steps), label="specular steps"):
+        _, u_lobe, u_direction, _ = draw(random)
+        sample, f_p = z.bsdf().sample(mi.BSDFContext(), z, u_lobe, u_direction, good)
+        good &= (sample.pdf > 0) & (event(sample.sampled_type) != 0)
+        β *= f_p
+        z = scene.ray_intersect(z.spawn_ray(z.to_world(sample.wo)), good)
+        good &= z.is_valid()
+        i += 1
+    return z, β, good

@@ -1,0 +1,137 @@
+"""Outliers of gradients: what they may do to their neighbours, and what weights may do to the energy."""
+
+import numpy as np
+import pytest
+from solvers import noisy_stack
+
+from ngpt.classical.bases import BASES, CLASSICAL
+from ngpt.classical.energy import MOST, keep_energy
+from ngpt.classical.gradients import forward_differences
+from ngpt.classical.variances import TYPICAL, smooth_variances
+from ngpt.measure.metrics import relmse
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+WEIGHTED = ("wcv", "wl2")
+
+
+def stack_of(primal, dx, dy, variances):
+    names = ("primal_var", "dx_var", "dy_var")
+    return GradientStack.from_arrays(primal=primal, dx=dx, dy=dy).replace(**dict(zip(names, variances, strict=True)))
+
+
+def solved(name, *layers):
+    return CLASSICAL[name](repair(stack_of(*layers)))
+
+
+def even(height, width, noise=0.05, seed=0):
+    """(truth, primal, dx, dy, variances) with the same noise everywhere, a tenth of it in the differences."""
+    random = np.random.default_rng(seed)
+    truth = (1 + 0.2 * np.sin(np.arange(width) / 9)[None, :, None] + np.zeros((height, 1, 3))).astype(np.float32)
+    layers, variances = [], []
+    for clean, share in ((truth, 1.0), *((d, 0.1) for d in forward_differences(truth))):
+        deviation = share * noise
+        layers.append((clean + deviation * random.standard_normal(truth.shape)).astype(np.float32))
+        variances.append((deviation**2 * random.gamma(4, 0.25, truth.shape)).astype(np.float32))
+    return truth, *layers, tuple(variances)
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_outliers_that_their_variances_tell_of_are_nearly_left_out(name):
+    """One difference in fifty, one in nearly every block of 7x7, has a hundred times the noise."""
+    truth, primal, *gradients, variances = even(48, 64)
+    random = np.random.default_rng(3)
+    wrong, noisy, without = [], [variances[0]], []
+    for gradient, variance in zip(gradients, variances[1:], strict=True):
+        out = random.random((48, 64, 1)) < 0.02
+        wrong.append(np.where(out, gradient + 0.5 * random.standard_normal(out.shape), gradient).astype(np.float32))
+        noisy.append(np.where(out, np.float32(0.25), variance))
+        without.append(np.where(out, np.float32(np.nan), gradient))
+    error = relmse(solved(name, primal, *wrong, noisy), truth)
+    assert error < 1.5 * relmse(solved(name, primal, *without, variances), truth)
+    assert error < 0.05 * relmse(primal, truth)
+
+
+def test_the_variance_of_an_outlier_is_its_own():
+    """A thousandfold variance stays where it is; that of the neighbours hardly grows."""
+    random = np.random.default_rng(0)
+    variances = [random.gamma(4, 0.25, (20, 30, 3)) for _ in range(3)]
+    _, before = smooth_variances(*variances)
+    variances[1][9, 12] *= 1000
+    _, after = smooth_variances(*variances)
+    ratio = after[0, 0, :, :-1] / before[0, 0, :, :-1] * (before[0, 0, 0, 0] / after[0, 0, 0, 0])
+    assert ratio[9, 12] > 100
+    ratio[9, 12] = 1
+    # An average over 25 values would be 40 times as large.
+    assert ratio.max() < 4 and ratio.min() > 0.9
+
+
+def test_a_difference_is_trusted_no_more_where_its_variance_grows():
+    random = np.random.default_rng(1)
+    variances = [random.gamma(1, 1, (12, 14, 3)) for _ in range(3)]
+    last = 0.0
+    for factor in (0, 0.1, 1, 10, 1e3, 1e6):
+        grown = [v.copy() for v in variances]
+        grown[2][5, 6] *= factor
+        p, (_, y) = smooth_variances(*grown)
+        now = y[0, 5, 6] / p[0, 0, 0]
+        assert now >= last * (1 - 1e-6)
+        last = now
+
+
+def test_no_difference_is_believed_for_its_luck():
+    """One whose samples all missed the light has the variance of those around it."""
+    variances = [np.ones((9, 11, 3)) for _ in range(3)]
+    variances[1][4, 5] = 0
+    _, (x, _) = smooth_variances(*variances)
+    assert x[0, 4, 5] > 0.5 * x[0, 0, 0]
+    assert x[0, 0, 0] == pytest.approx(TYPICAL * smooth_variances(*variances)[0][0, 0, 0], rel=0.01)
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_energy_is_kept_where_few_samples_carry_the_light(name):
+    """Pixels that a bright sample hit have a large variance: their weights lose what they found."""
+    random = np.random.default_rng(0)
+    n, size = 8, (64, 96, 1)
+    hits = random.binomial(n, 0.04, size)
+    value = 20.0
+    primal = np.repeat(0.2 + value * hits / n, 3, -1).astype(np.float32)
+    share = hits / n
+    variance = np.repeat(value**2 * share * (1 - share) / (n - 1), 3, -1).astype(np.float32) + 1e-4
+    gradients = [(0.3 * random.standard_normal((*size[:2], 1)) * np.ones(3)).astype(np.float32) for _ in range(2)]
+    noise = np.full_like(primal, 0.09)
+    data = repair(stack_of(primal, *gradients, (variance, noise, noise)))
+    assert CLASSICAL[name](data).mean() == pytest.approx(primal.mean(), rel=0.01)
+    if name == "wcv":
+        assert BASES[name](data).mean() < 0.99 * primal.mean(), "the test has nothing to give back"
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+def test_a_constant_image_stays(name):
+    _, primal, dx, dy, variances = even(20, 31)
+    constant, nothing = np.full_like(primal, 3), np.zeros_like(dx)
+    assert np.allclose(solved(name, constant, nothing, nothing, variances), 3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("name", WEIGHTED)
+@pytest.mark.parametrize("k", [2.0**-10, 2.0**10])
+def test_the_result_follows_the_exposure(name, k):
+    _, primal, dx, dy, variances = noisy_stack(33, 47)
+    primal = np.abs(primal)
+    image = solved(name, primal, dx, dy, variances)
+    scaled = solved(name, k * primal, k * dx, k * dy, [k * k * v for v in variances])
+    assert np.allclose(scaled, k * image, rtol=1e-3, atol=1e-4 * k)
+
+
+def test_what_keeps_the_energy_is_smooth_bounded_and_nothing_where_images_agree():
+    random = np.random.default_rng(0)
+    image = random.gamma(2, 1, (40, 50, 3)).astype(np.float32)
+    assert np.array_equal(keep_energy(image, image), image)
+    assert np.allclose(keep_energy(0.5 * image, image), image, rtol=1e-5)
+    assert not keep_energy(0 * image, image).any()
+    spike = image.copy()
+    spike[3, 3] = 1e12
+    kept = keep_energy(image, spike)
+    assert np.isfinite(kept).all() and kept.max() <= MOST * image.max() * 1.001
+    factor = (keep_energy(image, image * (1 + np.arange(50) / 50)[None, :, None]) / image)[..., 0]
+    assert np.abs(np.diff(factor, axis=1)).max() < 0.05

@@ -1,0 +1,167 @@
+"""The shift "manifold" of ``gpt`` is unbiased, the light it follows leaves the layer, and all else stays."""
+
+import numpy as np
+import pytest
+from data_gen_scenes import caustics, glass
+from unbiased import gradient_tests, load, render_ours, render_references
+
+from ngpt.errors import NgptError
+
+
+def under_the_sky():
+    """The same objects under a sky, seen in a mirror, one of them lacquered and one a bubble."""
+    from data_gen.scenes.builtin import _diffuse, _rgb, _sphere, _wall
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {
+        "sky": {"type": "constant", "radiance": _rgb(0.8, 0.9, 1.0)},
+        "wall": _wall([0, 0.8, -1.2], [0, 0, 1], (4, 2), {"type": "conductor", "material": "Al"}),
+        "bubble": _sphere([0, 0.4, 0.9], 0.2, {"type": "thindielectric"}),
+        "plastic": _sphere([-0.9, 0.25, 0.8], 0.25, {"type": "plastic", "diffuse_reflectance": _rgb(0.1, 0.3, 0.1)}),
+        "post": _sphere([0.9, 0.2, -0.5], 0.2, _diffuse(0.2, 0.2, 0.6)),
+    }
+
+
+@pytest.mark.parametrize("scene", [caustics, under_the_sky, glass])
+def test_unbiased(renderer, scene):
+    scene = load(renderer, scene, (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    for name, result in gradient_tests(render_ours(scene, "gpt", shift="manifold"), references):
+        assert result.passed, f"{name}: {result}"
+
+
+def inverted(mi, follow):
+    def mutant(*args):
+        ω, shot, J, found = follow(*args)
+        return ω, shot, 1 / J, found
+
+    return mutant
+
+
+@pytest.mark.parametrize(
+    ("function", "mutate"),
+    [
+        ("follow", inverted),
+        ("gradient_weight", lambda mi, _: lambda r, good: mi.Float(1)),
+        ("shoot", lambda mi, shoot: lambda *args: _tinted(shoot(*args))),
+    ],
+    ids=["determinant inverted", "rejected walks count half", "colour of the base path alone"],
+)
+def test_mutants_fail_the_z_test(renderer, function, mutate, monkeypatch):
+    from data_gen.samplers.gpt import manifold_shift
+
+    scene = load(renderer, caustics, (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    monkeypatch.setattr(manifold_shift, function, mutate(renderer, getattr(manifold_shift, function)))
+    tests = gradient_tests(render_ours(scene, "gpt", shift="manifold"), references)
+    passed = {name: result.passed for name, result in tests}
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+def _tinted(shot):
+    shot.weight *= 2
+    return shot
+
+
+def test_light_moves_from_the_layer_to_the_gradients(renderer):
+    """The same paths: the image is the same, and the light in it; most of the layer's has a copy now."""
+    from data_gen.render import render_stack
+
+    scene = load(renderer, caustics, (32, 32))
+    layer, followed = (render_stack(scene, 64, 3, "gpt", shift=shift) for shift in ("replay", "manifold"))
+    assert np.allclose(layer["primal"], followed["primal"], rtol=1e-5, atol=1e-6)
+    assert followed["caustic"].mean() < 0.3 * layer["caustic"].mean()
+    assert (followed["caustic"] <= layer["caustic"] * (1 + 1e-5) + 1e-6).all()
+    assert layer["primal_var"].mean() < followed["primal_var"].mean()
+
+
+def test_less_noise_than_replay(renderer):
+    """A small lamp in a curved mirror, wide enough for a pixel: replay misses it, walks do not."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.builtin import _light
+
+    def small_lamp():
+        scene = caustics()
+        del scene["glass"]
+        return scene | {"lamp": _light([0.2, 2.6, -0.2], [0, -1, 0], (0.15, 0.15), (400, 400, 400))}
+
+    scene = load(renderer, small_lamp, (48, 48))
+    plain, followed = (
+        render_stack(scene, 128, 3, "gpt", **options) for options in ({"caustic": False}, {"shift": "manifold"})
+    )
+    assert followed["caustic"].mean() < 0.1 * (plain["primal"] - plain["direct"]).mean()
+    for name in ("dx_var", "dy_var"):
+        assert followed[name].mean() < 0.5 * plain[name].mean()
+
+
+def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypatch):
+    """Where all walks are refused, the samples are -2 b: those of a lane say again what its primal holds."""
+    from data_gen.paths.manifold import follow
+    from data_gen.samplers.gpt import integrator, manifold_shift
+
+    light = {}
+
+    def refused(*args):
+        ω, shot, J, found = follow(*args)
+        return ω, shot, J, found & False
+
+    def kept(scene, plan, first_hit, camera, shifts, chain, Δ):
+        before = [renderer.Color3f(d) for d in Δ]
+        after = manifold_shift.add_followed(scene, plan, first_hit, camera, shifts, chain, Δ)
+        light["recorded"] = np.array(chain.record) != 0
+        light["samples"] = np.stack([np.array(b - a).T for a, b in zip(before, after, strict=True)])
+        return after
+
+    put = integrator.GradientFilm.put
+
+    def remember(film, name, value, active=True):
+        light.setdefault(name, np.array(value).T)
+        put(film, name, value, active)
+
+    monkeypatch.setattr(manifold_shift, "follow", refused)
+    monkeypatch.setattr(integrator, "add_followed", kept)
+    monkeypatch.setattr(integrator.GradientFilm, "put", remember)
+    scene = load(renderer, caustics, (32, 32))
+    render_ours(scene, "gpt", batches=1, shift="manifold")
+    samples, recorded, rest = light["samples"], light["recorded"], light.pop("caustic")
+    render_ours(scene, "gpt", batches=1, shift="replay")
+    followed = light["caustic"] - rest
+    assert recorded.sum() > 100 and not followed[~recorded].any() and not samples[:, ~recorded].any()
+    for own in samples:
+        assert np.allclose(own[recorded], -2 * followed[recorded], rtol=1e-3, atol=1e-5)
+
+
+def test_same_seed_same_bits_whatever_the_passes(renderer, monkeypatch):
+    from data_gen import passes
+    from data_gen.render import render_stack
+
+    scene = load(renderer, caustics, (32, 32))
+    whole = render_stack(scene, 64, 5, "gpt", shift="manifold")
+    monkeypatch.setattr(passes, "_FIRST_LANES", 1)
+    monkeypatch.setattr(passes, "_PASS_SECONDS", 0.0)
+    split = render_stack(scene, 64, 5, "gpt", shift="manifold")
+    for name in whole.names:
+        assert np.array_equal(whole[name], split[name]), name
+
+
+def test_scenes_without_mirrors_have_the_same_kernels(renderer):
+    import drjit as dr
+
+    from data_gen.render import render_stack
+
+    def kernels(**options):
+        render_stack(scene, 1, 0, "gpt", **options)
+        with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+            dr.kernel_history_clear()
+            render_stack(scene, 1, 0, "gpt", **options)
+            return [kernel["hash"] for kernel in dr.kernel_history() if "hash" in kernel]
+
+    scene = load(renderer, "diffuse", (8, 8))
+    assert kernels() and kernels() == kernels(shift="manifold")
+
+
+def test_what_does_not_go_together(renderer):
+    for options in ({"reuse": True}, {"caustic": False}):
+        with pytest.raises((NgptError, RuntimeError), match="'manifold' needs the layer 'caustic'"):
+            renderer.load_dict({"type": "gpt", "shift": "manifold", **options})

@@ -1,0 +1,193 @@
+"""W, C and the maps: curves and stacks whose worth is known."""
+
+import csv
+import xml.etree.ElementTree as ElementTree
+
+import numpy as np
+import pytest
+from folders import read, smooth_image, write_halves
+
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.evaluation.run import evaluate
+from ngpt.evaluation.worth import REACH, samples_for, worth_of_gradients, worth_tables
+from ngpt.evaluation.worthplots import block_errors, block_size, draw_map, log_ratio, share_that_pays
+from ngpt.report.evaluation import write_evaluation_report
+from ngpt.stack import GradientStack
+from ngpt.system.console import Console
+
+QUIET = Console(quiet=True)
+LAW = [(n, 0.3 * n**-0.7) for n in (8, 32, 128)]  # error over samples
+WORTH = 3.0
+CONFIG = """
+scenes = ["{folder}"]
+spp = [4, 16, 64]
+seeds = 2
+methods = ["ours", "ours-worse", "primal", "theirs-worse"]
+metrics = ["relMSE"]
+primary = "relMSE"
+
+[variants.ours]
+method = "primal"
+stack = "gradients"
+sampler = "gpt"
+
+[variants.ours-worse]
+method = "primal"
+stack = "gradients"
+sampler = "slow"
+
+[variants.theirs-worse]
+method = "primal"
+stack = "features"
+"""
+
+
+@pytest.mark.parametrize(
+    ("samples", "mark"), [(8, ""), (20, ""), (32, ""), (128, ""), (200, "~"), (127 * REACH, "~"), (4, "~"), (2.1, "~")]
+)
+def test_a_power_law_is_read_exactly(samples, mark):
+    found, how = samples_for(0.3 * samples**-0.7, LAW)
+    assert found == pytest.approx(samples, rel=1e-6)
+    assert how == mark or samples in (8, 128)  # the ends, up to rounding
+
+
+def test_a_slope_is_followed_for_a_factor_and_no_further():
+    assert samples_for(1e-9, LAW) == (pytest.approx(128 * REACH), ">")
+    assert samples_for(1e9, LAW) == (pytest.approx(8 / REACH), "<")
+
+
+def test_a_curve_that_rises_has_the_error_it_had_before():
+    # Noise put the second point above the first: more samples do no harm, so the first crossing counts.
+    points = [(1, 1.0), (4, 2.0), (16, 0.25)]
+    assert samples_for(0.5, points) == (pytest.approx(8), "")
+    # It stays at 0.25 until 64 at least: what comes below is sought from there on, by the last slope that falls.
+    found, mark = samples_for(0.125, [*points, (64, 0.3)])
+    assert (found, mark) == (pytest.approx(64 * 2), "~")
+    assert samples_for(0.2, [(1, 0.5), (4, 0.6)]) is None and samples_for(0.2, [(1, 0.5)]) is None
+
+
+def write_room(folder, rng):
+    """Noise in all pixels: with gradients of a third of the variance of that without, for the same samples."""
+    folder.mkdir()
+    clean = smooth_image()
+    for n in (4, 16, 64):
+        for seed in range(2):
+            for kind, variance in (
+                ("gradients-gpt", 0.25 / n / WORTH),
+                ("gradients-slow", 0.5 / n / WORTH),
+                ("features", 1.0 / n),
+                ("path", 0.25 / n),
+            ):
+                noisy = clean + rng.normal(0, variance**0.5, clean.shape)
+                layers = {"primal": noisy, "primal_var": np.full_like(clean, variance)}
+                if kind.startswith("gradients"):
+                    layers |= {name: np.zeros_like(clean) for name in ("dx", "dy")}
+                    layers |= {name: np.ones_like(clean) for name in ("dx_var", "dy_var")}
+                stack = GradientStack.from_arrays(attributes={"ngpt:seconds": 0.1 * n, "ngpt:spp": n}, **layers)
+                ngpt.write(folder / f"{kind}-{n}-{seed}.exr", stack)
+    write_halves(folder, rng, 0.05)
+
+
+@pytest.fixture
+def room(tmp_path, rng):
+    write_room(tmp_path / "room", rng)
+    return tmp_path, CONFIG.format(folder=tmp_path / "room")
+
+
+def test_stacks_of_known_worth(room):
+    folder, text = room
+    results = evaluate(read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", QUIET, "the command")
+    best = [row for row in results["worth"]["rows"] if row["best"]]
+    assert [(row["spp"], row["method"], row["rival"]) for row in best] == [(n, "ours", "primal") for n in (4, 16, 64)]
+    assert [row["W"] for row in best] == pytest.approx([WORTH] * 3, rel=0.15)
+    assert [row["mark"] for row in best] == ["", "", "~"]  # three times 64 samples were not measured
+    worse = [row["W"] for row in results["worth"]["rows"] if row["method"] == "ours-worse"]
+    assert worse == pytest.approx([WORTH / 2] * 3, rel=0.15)
+    # Nobody measured what samples of these stacks cost.
+    assert all(row["C"] is None and row["W/C"] is None for row in results["worth"]["rows"])
+    # At equal time, which without costs are equal samples, nearly all blocks are better.
+    assert all(row["blocks"] > 0.5 for row in best)
+    with open(folder / "out" / "worth.csv", newline="") as file:
+        lines = list(csv.DictReader(file))
+    assert [float(line["W"]) for line in lines if line["best"] == "True"] == [row["W"] for row in best]
+    page = (folder / "out" / "worth.md").read_text()
+    assert f"| room | 16 | ours | primal | {best[1]['W']:.2f} |" in page and "the command" in page
+    assert f"| rooms (1) | 64 | ~{best[2]['W']:.2f} |" in page
+    ElementTree.parse(folder / "out" / results["plots"]["worth"]["room"])
+    report = write_evaluation_report(folder / "out", folder / "report.html").read_text()
+    assert "Worth of gradients, scene by scene" in report and "worth: room" in report
+
+
+def test_costs_make_the_difference(room):
+    """C is of what the two columns are given, and the rival is the one that is done first."""
+    folder, text = room
+    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    results["scenes"]["room"]["cost"] = {
+        "gradients": {"median": 0.03, "sampler": "gpt"},  # the usual one here: "gpt" is found under this name
+        "gradients slow": {"median": 0.06, "sampler": "slow"},
+        "features": {"median": 0.015, "sampler": "primal"},
+        "path": {"median": 0.01, "sampler": "primal"},
+    }
+    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(results)["rows"]}
+    assert rows["ours", 16]["C"] == pytest.approx(3.0) and rows["ours", 16]["W/C"] == pytest.approx(1.0, rel=0.15)
+    assert rows["ours-worse", 16]["C"] == pytest.approx(6.0)
+    # "theirs-worse" needs 4 times the samples of "primal"; if each cost a tenth, it would be the first all the same.
+    results["scenes"]["room"]["cost"]["features"]["median"] = 0.001
+    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(results)["rows"]}
+    assert rows["ours", 4]["rival"] == "theirs-worse" and rows["ours", 4]["C"] == pytest.approx(30.0)
+    assert rows["ours", 4]["W"] == pytest.approx(4 * WORTH, rel=0.2)
+
+
+def test_means_over_scenes_are_geometric_and_carry_marks(room):
+    folder, text = room
+    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
+    rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
+    from ngpt.evaluation.worth import _means
+
+    (best,) = [mean for mean in _means(results, rows) if mean["method"] is None]
+    assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")
+    assert (best["W"], best["C"], best["W/C"]) == pytest.approx((2.0, 2.0, 1.0))
+    results["worth"] = {"rows": rows, "means": _means(results, rows)}
+    table = next(iter(worth_tables(results).values()))
+    assert table[1][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]
+
+
+def test_without_both_kinds_of_methods_nothing_is_written(room):
+    folder, text = room
+    text = text.replace(', "primal", "theirs-worse"]', "]")
+    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    assert results["worth"] == {"rows": [], "means": []}
+    assert not list((folder / "out").glob("worth*")) and not list((folder / "out" / "plots").glob("worth*"))
+    write_evaluation_report(folder / "out", folder / "report.html")
+
+
+def test_groups_are_lists_of_names(tmp_path):
+    with pytest.raises(NgptError, match=r"groups\.rooms = 'room': must be a list of scenes' names"):
+        read('scenes = ["diffuse"]\n[groups]\nrooms = "room"\n', tmp_path)
+
+
+def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
+    image, truth = np.ones((20, 33, 3)), np.ones((20, 33, 3))
+    image[:8, :8] = 1.5
+    errors = block_errors(image, truth, block=8)
+    assert errors.shape == (3, 5)
+    assert errors[0, 0] == pytest.approx(64 * 0.25 / 1.001) and errors.sum() == pytest.approx(errors[0, 0])
+    # The noise of a reference counts, that of two halves does not.
+    halves = truth + rng.normal(0, 0.1, (2, *truth.shape))
+    one, two = (block_errors(image, *reference, block=8)[1:, :4].mean() for reference in (halves[:1], halves))
+    assert one == pytest.approx(48 * 0.1**2, rel=0.2) and abs(two) < 0.2 * one
+    assert block_size(100) == 8 and block_size(1280) == 32
+
+
+def test_colours_say_where_gradients_pay():
+    ours, theirs = np.array([[1.0, 2.0, -1.0, 1.0, -1.0]]), np.array([[2.0, 1.0, 1.0, -1.0, -1.0]])
+    ratio = log_ratio(ours, theirs)
+    assert ratio[0, :4].tolist() == [1.0, -1.0, np.inf, -np.inf] and np.isnan(ratio[0, 4])
+    assert share_that_pays(ratio) == 0.5 and share_that_pays(np.full((2, 2), np.nan)) is None
+    svg = ElementTree.fromstring(draw_map([("4 spp", ratio), ("16 spp", ratio)], "room"))
+    fills = [e.get("fill") for e in svg.iter("{http://www.w3.org/2000/svg}rect") if e.get("shape-rendering")]
+    assert len(fills) == 10
+    pays, hurts, unknown = (tuple(int(fills[i][j : j + 2], 16) for j in (1, 3, 5)) for i in (0, 1, 4))
+    assert pays[2] > pays[0] and hurts[0] > hurts[2] and unknown == (255, 0, 255)
