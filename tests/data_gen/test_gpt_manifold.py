@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from data_gen_scenes import caustics, glass
-from unbiased import gradient_tests, load, render_ours, render_references
+from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
 
@@ -27,8 +27,10 @@ def under_the_sky():
 def test_unbiased(renderer, scene):
     scene = load(renderer, scene, (32, 32))
     references = render_references(renderer, scene, spp=128)
-    for name, result in gradient_tests(render_ours(scene, "gpt", shift="manifold"), references):
-        assert result.passed, f"{name}: {result}"
+    for pixels in DISTANCES:
+        stacks = render_ours(scene, "gpt", pixels=pixels, shift="manifold")
+        for name, result in gradient_tests(stacks, references, pixels=pixels):
+            assert result.passed, f"{name} over {pixels} pixels: {result}"
 
 
 def inverted(mi, follow):
