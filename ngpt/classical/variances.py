@@ -26,8 +26,8 @@ from ngpt.classical.leastsquares import robust_mean, sum_of
 # What is added to every variance, as a share of the mean over primal and differences.
 FLOOR = 3e-3
 
-# How many times the typical variance around it a difference has at least. The mean of fourth roots lies below the mean,
-# two to four times where noise is even; 1 believes lucky differences, 10 makes outliers of none.
+# How many times the typical variance around it a difference has at least: the mean of fourth roots lies below the mean.
+# Of 2, 3 and 4 wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
 # What counts as no variance, so that derivatives of roots are finite.

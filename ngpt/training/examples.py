@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch.utils.data import Dataset as TorchDataset
 
+from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
 from ngpt.io.exr import read
 from ngpt.network import features, padding
@@ -70,17 +71,29 @@ class StackCrop:
 
     @property
     def reference_caustic(self) -> np.ndarray:
-        """Zeros if the stacks have no such layer; raises NgptError if the reference or some of them lack it."""
+        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
+
+        Raises NgptError if only some of the stacks have it.
+        """
         reference = read(str(self._reference))
         if all(self._caustic) and "caustic" in reference:
             return reference["caustic"]
         if not self._lit:
             return np.zeros_like(reference["primal"])
-        lacking = self._reference if all(self._caustic) else self._stacks[self._caustic.index(False)]
-        raise NgptError(
-            f"{lacking}: has no layer 'caustic', but other files of {self.scene} have: their gradients hold nothing of "
-            "that light, so a target must be without it; render all of them with --sampler gpt"
-        )
+        if not all(self._caustic):
+            raise NgptError(
+                f"{self._stacks[self._caustic.index(False)]}: has no layer 'caustic', but other stacks of {self.scene} "
+                "have: their gradients hold nothing of that light, so they have no target in common; render all alike"
+            )
+        stacks = [read(str(path)) for path in self._stacks]
+        shares = np.divide(self.spp, sum(self.spp)) if all(self.spp) else np.full(len(stacks), 1 / len(stacks))
+        light = sum(share * stack["caustic"] for share, stack in zip(shares, stacks, strict=True))
+        layers = {"caustic": light, "primal": reference["primal"]}
+        if all("caustic_var" in stack for stack in stacks):
+            noise = [share**2 * stack["caustic_var"] for share, stack in zip(shares, stacks, strict=True)]
+            layers["caustic_var"] = np.sum(noise, axis=0)
+        features = {name: stacks[0][name] for name in ("albedo", "normal", "depth") if name in stacks[0]}
+        return caustic.denoised(repair(GradientStack(layers | features)))
 
 
 class StackFolder(Sequence[StackCrop]):

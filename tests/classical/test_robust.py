@@ -108,7 +108,7 @@ def test_energy_is_kept_where_few_samples_carry_the_light(name):
 
 @pytest.mark.parametrize("name", WEIGHTED)
 def test_a_constant_image_stays(name):
-    _, primal, dx, dy, variances = even(20, 31)
+    _, primal, dx, _, variances = even(20, 31)
     constant, nothing = np.full_like(primal, 3), np.zeros_like(dx)
     assert np.allclose(solved(name, constant, nothing, nothing, variances), 3, rtol=1e-6)
 
