@@ -13,7 +13,7 @@ def make_plan(scene, **options):
     from data_gen.samplers.gpt import plan
 
     defaults = {"roughness_threshold": 0.05, "max_depth": 8, "rr_depth": 5, "shift": "replay"}
-    return plan.make_plan(scene, **defaults | {"hide_emitters": False} | options)
+    return plan.make_plan(scene, **defaults | {"hide_emitters": False, "caustic": True} | options)
 
 
 def render(scene, spp=16, size=None, **options):
@@ -149,7 +149,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     x, y, u, yes = vertex(), vertex(), random.next_2d(), mi.Bool(True)
     base, weight = scene.sample_emitter_direction(x, u, False, yes)
     shared, own = replay_light(scene, lights, base, weight, u, y, yes), sample_light(scene, y, u, yes)
-    shared.weight = shadowed(scene, y, shared, shared.weight)
+    shared.weight = shadowed(scene, y, shared, mi.Spectrum(1))
     found = dr.max(own.weight) > 0
     assert dr.count(found)[0] > 500
     assert mostly((dr.max(shared.weight) > 0) == found)

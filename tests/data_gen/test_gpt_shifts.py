@@ -90,7 +90,7 @@ class Steps:
         from data_gen.samplers.gpt.base_path import base_step
 
         mi, β = self.mi, self.mi.Spectrum(1)
-        state = (β, mi.Float(1), mi.UInt32(1), mi.Bool(True), mi.Bool(False), mi.Bool(False))
+        state = (β, mi.Float(1), mi.UInt32(1), mi.Bool(True), mi.Bool(False), mi.Bool(False), None)
         return base_step(self.scene, self.plan, self.u.clone(), x, *state, [])[0]
 
     def offset_at(self, ray):
