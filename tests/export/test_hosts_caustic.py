@@ -83,12 +83,6 @@ int main() {
     const bool none = take_out_caustic("raw", {"primal", "albedo"}, all).empty();
     std::ofstream("noise.f32", std::ios::binary)
         .write(reinterpret_cast<const char *>(all["primal_var"].pixels.data()), primal.pixels.size() * sizeof(float));
-    // With an image of another denoiser, here one that darkens: as much light, too.
-    Layer dark = added;
-    for (float &x : dark.pixels) x *= 0.5f;
-    const Layer image = completed(read_layer("raw", listing, "caustic"), dark);
-    std::ofstream("completed.f32", std::ios::binary)
-        .write(reinterpret_cast<const char *>(image.pixels.data()), image.pixels.size() * sizeof(float));
     return none && all["primal"].pixels == raw.at("primal").pixels ? 0 : 1;
 }
 """
@@ -109,7 +103,7 @@ def test_javascript(raw):
     check(stack, folder)
 
 
-def test_cpp(raw, monkeypatch):
+def test_cpp(raw):
     if shutil.which("g++") is None:
         pytest.skip("g++ is not installed")
     stack, folder = raw
@@ -130,7 +124,3 @@ def test_cpp(raw, monkeypatch):
     )
     run("./main", folder=folder.parent)
     check(stack, folder)
-    made = np.fromfile(folder.parent / "completed.f32", "<f4").reshape(3, *SIZE).transpose(1, 2, 0)
-    monkeypatch.setattr(caustic, "oidn", lambda data, *_: 0.5 * caustic.denoised(repair(stack)))
-    expected = caustic.denoised(repair(stack), by_oidn=True)
-    assert np.abs(made - expected).max() < 1e-4 * expected.max()

@@ -81,41 +81,6 @@ inline Layer spread(const Layers &held) {
     return light;
 }
 
-// The mean of 65 x 65 pixels; beyond the border the image is mirrored, so that no light is lost there.
-inline Layer averaged(const Layer &image) {
-    Layer result = image;
-    const auto along = [&](int lines, int length, ptrdiff_t line, ptrdiff_t step) {
-        const auto mirrored = [=](int i) {
-            i = (i % (2 * length) + 2 * length) % (2 * length);
-            return ptrdiff_t(i < length ? i : 2 * length - 1 - i) * step;
-        };
-        std::vector<float> row(length);
-        for (int c = 0; c < image.channels; c++)
-            for (int l = 0; l < lines; l++) {
-                float *pixels = result.pixels.data() + c * image.plane() + l * line;
-                double sum = 0;
-                for (int i = -32; i <= 32; i++) sum += pixels[mirrored(i)];
-                for (int i = 0; i < length; i++) {
-                    row[i] = sum / 65;
-                    sum += double(pixels[mirrored(i + 33)]) - pixels[mirrored(i - 32)];
-                }
-                for (int i = 0; i < length; i++) pixels[i * step] = row[i];
-            }
-    };
-    along(image.height, image.width, image.width, 1);
-    along(image.width, image.height, 1, image.width);
-    return result;
-}
-
-// OIDN's image of the light, and what it left out, averaged widely.
-inline Layer completed(const Layer &caustic, const Layer &denoised) {
-    Layer rest = caustic, result = denoised;
-    for (size_t i = 0; i < rest.pixels.size(); i++) rest.pixels[i] -= denoised.pixels[i];
-    rest = averaged(averaged(rest));
-    for (size_t i = 0; i < rest.pixels.size(); i++) result.pixels[i] += rest.pixels[i];
-    return result;
-}
-
 // If the folder holds such light, takes it out of `primal` for a network that reads gradients, and returns it and the
 // features beside it. Any other network sees all light; its noise is that of both parts.
 inline Layers take_out_caustic(const std::string &folder, const std::vector<std::string> &inputs, Layers &layers) {

@@ -111,8 +111,17 @@ int main(int count, char **arguments) try {
     Layer image(3, height, width);
     network.take("image", image);
     network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
-    if (!light.empty())
-        add(image, completed(light.at("caustic"), oidn.denoised(light.at("caustic"), albedo, normal)));
+    if (!light.empty()) {
+        // The mean of OIDN's image of the light alone, and of what its image of all has beyond that of the rest
+        const Layer &caustic = light.at("caustic");
+        Layer all = primal;
+        add(all, caustic);
+        const Layer with = oidn.denoised(all, albedo, normal), without = oidn.denoised(primal, albedo, normal);
+        Layer half = oidn.denoised(caustic, albedo, normal);
+        for (size_t i = 0; i < half.pixels.size(); i++)
+            half.pixels[i] = 0.5f * (half.pixels[i] + with.pixels[i] - without.pixels[i]);
+        add(image, half);
+    }
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-oidn-host: %s\n", error.what());
