@@ -55,7 +55,8 @@ def _by_oidn(data: Repaired) -> np.ndarray:
     assert data.caustic is not None
     alone = image_of(data.caustic, np.zeros_like(data.direct))
     beyond = image_of(data.image + data.caustic, data.direct) - image_of(data.image, data.direct)
-    return (alone + beyond) / 2
+    # OIDN may see less in a place for more light in another; there is no negative light.
+    return np.maximum(alone + beyond, 0) / 2
 
 
 def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> np.ndarray:

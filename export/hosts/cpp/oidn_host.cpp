@@ -119,7 +119,7 @@ int main(int count, char **arguments) try {
         const Layer with = oidn.denoised(all, albedo, normal), without = oidn.denoised(primal, albedo, normal);
         Layer half = oidn.denoised(caustic, albedo, normal);
         for (size_t i = 0; i < half.pixels.size(); i++)
-            half.pixels[i] = 0.5f * (half.pixels[i] + with.pixels[i] - without.pixels[i]);
+            half.pixels[i] = 0.5f * std::max(half.pixels[i] + with.pixels[i] - without.pixels[i], 0.0f);
         add(image, half);
     }
     write_pfm(arguments[3], image);
