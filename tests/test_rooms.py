@@ -30,7 +30,7 @@ ngpt.report
 ngpt.measure
 ngpt.training
 ngpt.export
-data_gen data_gen.llvm
+data_gen data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths
 data_gen.passes

@@ -8,6 +8,8 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
+from data_gen.scenes import grids
+
 
 def _transform():
     return mi.ScalarTransform4f()
@@ -150,6 +152,100 @@ def lens() -> dict:
     }
 
 
+def _volume(box: tuple, medium: dict) -> dict:
+    """A box from the corner ``box[0]`` to ``box[1]`` that nobody sees but for the medium in it."""
+    low, high = np.array(box, float)
+    to_world = _transform().translate(list((low + high) / 2)).scale(list((high - low) / 2))
+    return {"type": "cube", "to_world": to_world, "bsdf": {"type": "null"}, "interior": medium}
+
+
+def _grid_medium(grid: np.ndarray, box: tuple, sigma_t: float, albedo: dict, g: float) -> dict:
+    """A medium whose extinction is ``grid`` times ``sigma_t``, per metre, within ``box``."""
+    low, high = np.array(box, float)
+    to_world = _transform().translate(list(low)).scale(list(high - low))
+    return {
+        "type": "heterogeneous",
+        "sigma_t": {"type": "gridvolume", "grid": mi.VolumeGrid(grid[..., None]), "to_world": to_world, "raw": True},
+        "albedo": {"type": "constvolume", "value": albedo},
+        "scale": sigma_t,
+        "phase": {"type": "hg", "g": g},
+    }
+
+
+def haze() -> dict:
+    """A spot from outside shines through a barred window into haze: beams, and shadows in the air around the camera."""
+    tiles = {"type": "checkerboard", "color0": _rgb(0.16, 0.15, 0.14), "color1": _rgb(0.45, 0.43, 0.4)}
+    tiles["to_uv"] = _transform().scale([4, 8, 1])
+    air = {"type": "homogeneous", "albedo": _rgb(0.95, 0.95, 0.95), "sigma_t": 0.2, "phase": {"type": "hg", "g": 0.3}}
+    camera = _camera([0, 1.15, 4.2], [0, 1.1, 0], 50)
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 12, "rr_depth": 5},
+        "air": air | {"id": "air"},
+        "sensor": camera | {"medium": {"type": "ref", "id": "air"}},
+        **_room(4.5, {"type": "diffuse", "reflectance": tiles}),
+        "front": _wall([0, 1.2, 4.5], [0, 0, -1], (3, 2.4), _diffuse(0.5, 0.48, 0.45)),
+        "lamp": _light([0.3, 2.38, 1.5], [0, -1, 0], (1.2, 1.2), (1.5, 1.7, 2.0)),
+        "spot": {
+            "type": "spot",
+            "to_world": _transform().look_at(origin=[-3.3, 3.2, -0.7], target=[0.45, 0.5, 0.15], up=[0, 1, 0]),
+            "intensity": _rgb(170, 135, 95),
+            "cutoff_angle": 16,
+            "beam_width": 15,
+        },
+        "ball": _sphere([0.45, 0.75, 0.1], 0.28, {"type": "roughconductor", "material": "Cu", "alpha": 0.3}),
+        "stand": _box([0.45, 0.24, 0.1], [0.4, 0.48, 0.4], 12, _diffuse(0.6, 0.58, 0.55)),
+        "block": _box([-0.75, 0.4, 0.6], [0.5, 0.8, 0.5], 25, _diffuse(0.65, 0.55, 0.25)),
+    }
+    # The wall around a window from 0.9 m to 0.15 m behind the middle of the room, 1.5 m to 2.2 m above the floor.
+    red = _diffuse(0.62, 0.2, 0.13)
+    del scene["left"]
+    for name, (low, high, front, back) in {
+        "under": (0, 1.5, 4.5, -1.5),
+        "over": (2.2, 2.4, 4.5, -1.5),
+        "behind": (1.5, 2.2, -0.9, -1.5),
+        "before": (1.5, 2.2, 4.5, 0.15),
+        "bar0": (1.5, 2.2, -0.48, -0.57),
+        "bar1": (1.5, 2.2, -0.18, -0.27),
+    }.items():
+        center = [-1.5, (low + high) / 2, (front + back) / 2]
+        scene[f"left_{name}"] = _wall(center, [1, 0, 0], (front - back, high - low), red)
+    return scene
+
+
+def smoke() -> dict:
+    """Smoke that rises from a bowl before coloured walls: thin and dense parts, and a shadow of its own."""
+    box = ([-0.6, 0.42, -0.6], [0.6, 2.2, 0.6])
+    grid = grids.plume(np.random.default_rng(0))
+    albedo = _rgb(0.75, 0.8, 0.86)
+    tiles = {"type": "checkerboard", "color0": _rgb(0.3, 0.28, 0.25), "color1": _rgb(0.7, 0.68, 0.62)}
+    tiles["to_uv"] = _transform().scale([4, 4, 1])
+    return {
+        "type": "scene",
+        "integrator": {"type": "volpath", "max_depth": 8, "rr_depth": 4},
+        "sensor": _camera([0, 1.25, 3.9], [0, 1.15, 0], 50),
+        **_room(1.5, {"type": "diffuse", "reflectance": tiles}),
+        "lamp": _light([0.9, 2.2, -0.5], [-0.3, -1, 0], (0.7, 0.7), (18, 15, 11)),
+        "bowl": _box([0, 0.2, 0], [0.5, 0.4, 0.5], 30, {"type": "roughconductor", "material": "Cu", "alpha": 0.2}),
+        "ball": _sphere([-0.85, 0.3, 0.4], 0.3, _diffuse(0.3, 0.42, 0.6)),
+        "low": _box([0.8, 0.25, 0.45], [0.5, 0.5, 0.5], -18, _diffuse(0.65, 0.55, 0.25)),
+        "smoke": _volume(box, _grid_medium(grid, box, 4, albedo, 0.2)),
+    }
+
+
+def cloud() -> dict:
+    """A small cloud over a ball and a block in the open: light that scatters many times, before nothing but sky."""
+    box = ([-1.3, 1.2, -0.8], [1.3, 2.7, 0.8])
+    grid = grids.cloud(np.random.default_rng(2))
+    scene = environment()
+    del scene["copper"]
+    return scene | {
+        "integrator": {"type": "volpath", "max_depth": 24, "rr_depth": 8},
+        "sensor": _camera([0.3, 0.5, 5.4], [0, 1.25, 0], 42),
+        "cloud": _volume(box, _grid_medium(grid, box, 9, _rgb(0.99, 0.99, 0.99), 0.5)),
+    }
+
+
 def _sky(height: int, width: int) -> np.ndarray:
     """A latitude-longitude sky, (height, width, 3) float32: blue gradient, dim ground, and a sun of a few texels."""
     elevation = np.pi / 2 - (np.arange(height) + 0.5) / height * np.pi
@@ -162,4 +258,6 @@ def _sky(height: int, width: int) -> np.ndarray:
     return image
 
 
-SCENES = {"diffuse": diffuse, "glossy": glossy, "environment": environment, "lens": lens}
+SURFACES = {"diffuse": diffuse, "glossy": glossy, "environment": environment, "lens": lens}
+MEDIA = {"haze": haze, "smoke": smoke, "cloud": cloud}
+SCENES = SURFACES | MEDIA

@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--output", default="demo", metavar="DIR", help="folder for all that is made (default: demo)"
     )
     parser.add_argument(
-        "--scene", action="append", metavar="NAME", help="built-in scene; may be repeated (default: all)"
+        "--scene", action="append", metavar="NAME", help="built-in scene; may be repeated (default: all without media)"
     )
     parser.add_argument("--spp", type=positive, default=16, help="paths per pixel of the stacks (default: 16)")
     parser.add_argument("--reference-spp", type=positive, default=2048, help="of the references (default: 2048)")
@@ -44,9 +44,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
     use_variant(args.variant or DEFAULT_VARIANT)
     import mitsuba as mi
 
-    from data_gen.scenes.builtin import SCENES
+    from data_gen.scenes.builtin import SCENES, SURFACES
 
-    names = args.scene or list(SCENES)
+    names = args.scene or list(SURFACES)
     for name in names:
         if name not in SCENES:
             raise NgptError(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")

@@ -11,8 +11,10 @@ from pathlib import Path
 
 # Of the library: rooms that decide no image and no number.
 _PRESENTATION = ("cli", "evaluation", "export", "report", "system")
+# What the built-in scenes are made of.
+_BUILT_IN = ("scenes/builtin.py", "scenes/grids.py")
 # Of data_gen: files that render nothing. A scene has a key of its own; a procedural one is a scene file by then.
-_NOT_RENDERING = ("__main__.py", "costs.py", "inspect.py", "dataset", "scenes/builtin.py", "scenes/procedural")
+_NOT_RENDERING = ("__main__.py", "costs.py", "inspect.py", "dataset", *_BUILT_IN, "scenes/procedural")
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 
@@ -58,7 +60,7 @@ def scene_hash(scene: str) -> str:
     """Of a scene's file and the files it names, those included in turn; of a built-in scene its name and their code."""
     digest = hashlib.sha256()
     if not Path(scene).is_file():
-        digest.update(f"{scene}\n{_code(_data_gen() / 'scenes' / 'builtin.py')}".encode())
+        digest.update("\n".join([scene, *(_code(_data_gen() / file) for file in _BUILT_IN)]).encode())
         return digest.hexdigest()
     queue, seen = [Path(scene)], set()
     while queue:

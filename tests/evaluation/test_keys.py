@@ -55,6 +55,9 @@ def test_a_changed_colour_of_a_built_in_scene_is_another_key_of_built_in_scenes(
     replace(tree / "scenes" / "builtin.py", "_diffuse(0.3, 0.42, 0.6)", "_diffuse(0.3, 0.42, 0.7)")
     after = [key_of(scene, tmp_path) for scene in scenes]
     assert after[0] != before[0] and after[1] == before[1]
+    replace(tree / "scenes" / "grids.py", "(1 - height) / 0.4", "(1 - height) / 0.3")
+    last = [key_of(scene, tmp_path) for scene in scenes]
+    assert last[0] not in (before[0], after[0]) and last[1] == before[1]
 
 
 def test_another_version_of_mitsuba_is_another_key(tree, tmp_path, monkeypatch):

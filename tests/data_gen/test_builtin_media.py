@@ -1,0 +1,97 @@
+"""Built-in scenes with media, and the grids that smoke and clouds are made of."""
+
+import numpy as np
+import pytest
+
+from data_gen.scenes import grids
+
+MEDIA = ("haze", "smoke", "cloud")
+
+
+@pytest.mark.parametrize("name", MEDIA)
+def test_a_built_in_scene_with_media_renders(renderer, name):
+    """By the sampler that `auto` takes, and by volpathmis alike."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.facts import scene_facts
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(name, (24, 16))
+    facts = scene_facts(scene)
+    assert facts.integrator.lower().startswith("vol") and facts.media
+    stack = render_stack(scene, 16)
+    assert "dx" in stack and all(np.isfinite(stack[layer]).all() for layer in stack.names)
+    assert np.mean(stack["primal"].max(axis=-1) > 0) > 0.9
+    assert stack.attributes["ngpt:discarded"] == 0
+    mis = renderer.load_dict({"type": "volpathmis", "max_depth": 12})
+    other = np.array(renderer.render(scene, integrator=mis, spp=32))
+    assert np.median(other) == pytest.approx(np.median(stack["primal"]), rel=0.35)
+
+
+@pytest.mark.parametrize("name", MEDIA)
+def test_media_matter_to_the_image(renderer, name):
+    """What the scene would look like without them is another image."""
+    from data_gen.scenes.builtin import SCENES
+    from data_gen.scenes.load import set_film_size
+
+    def image(scene):
+        scene = renderer.load_dict(scene)
+        set_film_size(scene, (24, 16))
+        return np.array(renderer.render(scene, spp=64)).mean(axis=-1)
+
+    full, empty = SCENES[name](), SCENES[name]()
+    empty["sensor"].pop("medium", None)
+    empty.pop(name, None)
+    ratio = image(full) / np.maximum(image(empty), 1e-3)
+    assert np.mean(np.abs(ratio - 1) > 0.15) > 0.05
+
+
+def test_inspection_tells_of_media(renderer):
+    from data_gen.inspect import inspect_scene
+
+    for name in MEDIA:
+        told = inspect_scene(name)
+        assert told["media"] and told["plugins"]["medium"]
+    assert inspect_scene("haze")["plugins"]["emitter"]["spot"] == 1
+
+
+def test_the_demo_leaves_media_out_by_default(renderer):
+    from data_gen.scenes import builtin
+
+    assert list(builtin.SURFACES) == ["diffuse", "glossy", "environment", "lens"]
+    assert tuple(builtin.MEDIA) == MEDIA and {**builtin.SURFACES, **builtin.MEDIA} == builtin.SCENES
+
+
+@pytest.mark.parametrize("make", [grids.plume, grids.cloud])
+@pytest.mark.parametrize("seed", range(6))
+def test_grids_come_from_their_seed_and_end_before_their_box(make, seed):
+    grid = make(np.random.default_rng(seed))
+    assert grid.dtype == np.float32 and np.array_equal(grid, make(np.random.default_rng(seed)))
+    assert not np.array_equal(grid, make(np.random.default_rng(seed + 100)))
+    assert grid.min() == 0 and grid.max() == 1 and 0.02 < grid.mean() < 0.4
+    inner = np.zeros_like(grid)
+    inner[1:-1, 1:-1, 1:-1] = grid[1:-1, 1:-1, 1:-1]
+    assert np.array_equal(grid, inner)
+
+
+def test_smoke_rises_from_the_floor():
+    grid = grids.plume(np.random.default_rng(3))
+    wide = [(level.max(axis=0) > 0.2).sum() for level in grid.swapaxes(0, 1)]  # of each height
+    assert 0 < wide[2] < wide[24] and not grid[:, -1].any()
+
+
+def test_noise_has_the_spectrum_asked_for():
+    """Amplitudes over two octaves, averaged over directions."""
+    field = grids.noise(np.random.default_rng(0), (32, 32, 32), 2.0)
+    assert field.mean() == pytest.approx(0, abs=1e-9) and field.std() == pytest.approx(1)
+    power = np.abs(np.fft.fftn(field)) ** 2
+    axes = np.meshgrid(*[np.fft.fftfreq(32) * 32] * 3, indexing="ij")
+    frequency = np.sqrt(sum(axis**2 for axis in axes))
+    near = [power[np.abs(frequency - k) < 0.5].mean() for k in (2, 8)]
+    assert np.log2(near[0] / near[1]) / 2 / 2 == pytest.approx(2, abs=0.25)
+
+
+def test_mitsuba_reads_the_volumes_that_are_written(renderer, tmp_path):
+    grid = np.random.default_rng(1).random((3, 4, 5), np.float32)
+    grids.write_vol(tmp_path / "a.vol", grid)
+    read = renderer.VolumeGrid(str(tmp_path / "a.vol"))
+    assert np.array_equal(np.array(read).reshape(grid.shape), grid)
