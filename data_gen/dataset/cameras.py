@@ -23,6 +23,7 @@ ATTEMPTS = 64
 CHOICES = 5  # views that one is chosen from
 GRID = 24  # rays across a view that is judged
 FEWEST_EDGES = 0.04
+MOST_BOUNDARIES = 8  # of media that one ray is followed through
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class Surroundings:
         self.start, self.up, self.fov = matrix[:3, 3], matrix[:3, 1], float(np.ravel(sensor["x_fov"])[0])
         bounds = scene.bbox()
         self.reach = float(np.linalg.norm(np.array(bounds.max) - np.array(bounds.min)))
+        self.boundaries = any(is_boundary(shape.bsdf()) for shape in scene.shapes() if shape.bsdf())
         distance = self.cast(np.tile(self.start, (4096, 1)), directions(np.random.default_rng(0), 4096))[0]
         hits = distance[np.isfinite(distance)]
         if not len(hits):
@@ -79,18 +81,29 @@ class Surroundings:
         self.seen = self.points(scene.sensors()[0])
 
     def points(self, sensor: mi.Sensor) -> np.ndarray:
-        """(n, 3) what the sensor sees, through a grid of its film; where that is nothing, n is 0."""
+        """(n, 3) where rays through a grid of the sensor's film end, or meet a medium; n is 0 where none do."""
         origins, towards = grid_rays(sensor)
-        distance = self.cast(origins, towards)[0]
+        distance = self.cast(origins, towards, boundaries=True)[0]
         hit = np.isfinite(distance)
         return origins[hit] + distance[hit, None] * towards[hit]
 
-    def cast(self, origins: np.ndarray, towards: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing."""
+    def cast(
+        self, origins: np.ndarray, towards: np.ndarray, boundaries: bool = False
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Distances (n,), Inf where nothing is hit; normals (n, 3); identities of what is hit (n,), 0 for nothing.
+
+        ``boundaries`` of media, which nobody sees, count only where asked for.
+        """
         ray = mi.Ray3f(mi.Point3f(origins.T), mi.Vector3f(towards.T))
         si = self.scene.ray_intersect(ray)
+        passed = mi.Float(0)
+        for _ in range(MOST_BOUNDARIES if self.boundaries and not boundaries else 0):
+            behind = si.is_valid() & is_boundary(si.bsdf())
+            passed += dr.select(behind, si.t, 0)
+            ray = dr.select(behind, si.spawn_ray(ray.d), ray)
+            si = dr.select(behind, self.scene.ray_intersect(ray, behind), si)
         identity = dr.reinterpret_array(mi.UInt32, si.shape)
-        return np.array(si.t), np.array(si.n).T, np.array(identity)
+        return np.array(si.t + passed), np.array(si.n).T, np.array(identity)
 
     def position(self, rng: np.random.Generator) -> np.ndarray:
         """A point of free space: uniform in the hand-made box where there is one, else at the end of a walk."""
@@ -101,9 +114,15 @@ class Surroundings:
         for towards in directions(rng, STEPS):
             towards = towards - 0.5 * (towards @ self.up) * self.up
             towards /= np.linalg.norm(towards)
-            distance = float(self.cast(point[None], towards[None])[0][0])
+            # Neither into a medium nor out of one: the camera says once for all which it is in.
+            distance = float(self.cast(point[None], towards[None], boundaries=True)[0][0])
             point = point + rng.uniform(0.05, 0.8) * min(distance, 1.5 * self.scale) * towards
         return point
+
+
+def is_boundary(bsdf: mi.BSDF | mi.BSDFPtr):
+    """Whether the material is that of a boundary of media, which lets all light through."""
+    return bsdf.flags() & int(mi.BSDFFlags.All) == int(mi.BSDFFlags.Null)
 
 
 def directions(rng: np.random.Generator, count: int) -> np.ndarray:

@@ -37,6 +37,7 @@ class Config:
     reference_spp: int = 256
     reference_method: str = "wcv"
     scenes: int = 0
+    varied: bool = False
     crops: int = 4
     files: tuple[Files, ...] = ()
 
@@ -51,6 +52,8 @@ class Config:
         ):
             if bad:
                 raise NgptError(f"data configuration: {text}")
+        if self.sampler == "auto":
+            return
         if not find(self.sampler).gradients and "dx" in METHODS[self.reference_method].needs:
             raise NgptError(
                 f"data configuration: reference_method '{self.reference_method}' needs gradients, and sampler "

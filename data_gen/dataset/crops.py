@@ -83,7 +83,7 @@ def scene_seed(config: Config, name: str) -> tuple[int, int]:
 def made_scene(config: Config, name: str, folder: Path) -> Path:
     from data_gen.scenes.procedural.scenes import make_scene
 
-    return make_scene(scene_seed(config, name), folder)
+    return make_scene(scene_seed(config, name), folder, config.varied)
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:

@@ -14,7 +14,8 @@ from xml.etree import ElementTree as xml
 import numpy as np
 
 from data_gen.scenes.procedural import things
-from data_gen.scenes.procedural.materials import ROLES, SLOTS, Palette, inside, plugin
+from data_gen.scenes.procedural.materials import SLOTS, Palette, inside, plugin
+from data_gen.scenes.procedural.media import Media, some_media
 from data_gen.scenes.procedural.meshes import (
     Mesh,
     box,
@@ -22,66 +23,24 @@ from data_gen.scenes.procedural.meshes import (
     lathe,
     merge,
     quads,
-    rotation,
     sphere,
     wall,
     write_ply,
 )
+from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour, sky, write_pfm
+from data_gen.scenes.procedural.variety import add_sights, further_sights
 from ngpt.report.display import to_srgb8
 from ngpt.report.png import encode_png
 
 MAX_DEPTH = 12
-
-SIZES = {"wall": (0.7, 4), "floor": (0.4, 3), "paper": (0.15, 0.6)}
-
-
-class Stage:
-    """A scene while it is made: parts by slot, lights, and where things stand."""
-
-    def __init__(self, rng: np.random.Generator):
-        self.rng = rng
-        self.meshes: dict[str, list[Mesh]] = {}
-        self.standing: list[tuple[float, float, float]] = []
-        self.sky = False
-        self.spots: list[xml.Element] = []
-        # Every role is played by one slot at a time; few slots make a scene of one mind, many a jumble.
-        self.cast = {role: rng.permutation(slots)[: rng.integers(1, len(slots) + 1)] for role, slots in ROLES.items()}
-
-    def add(self, parts: list[things.Part]) -> None:
-        for role, mesh in parts:
-            slot = str(self.rng.choice(self.cast[role]))
-            if role != "leaf":
-                # Metres that the picture covers.
-                low, high = SIZES.get(role, (0.1, 1.5))
-                size = np.exp(self.rng.uniform(np.log(low), np.log(high)))
-                turn = rotation([0, 0, 1], float(self.rng.choice([0, 0, 0, 0.25, 0.5])) * np.pi)[:2, :2]
-                mesh = replace(mesh, uvs=mesh.uvs @ turn / size)
-            self.meshes.setdefault(slot, []).append(mesh)
-
-    def stand(self, parts: list[things.Part], area: tuple[float, float], angle: float | None = None) -> bool:
-        """Puts a thing on the floor, x and z within ``area`` / 2, where nothing stands; False if there is no room."""
-        reach = max(np.hypot(*mesh.vertices[:, [0, 2]].T).max() for _, mesh in parts)
-        for _ in range(20):
-            x, z = (self.rng.uniform(-0.5, 0.5, 2)) * np.maximum(np.array(area) - 2 * reach, 0)
-            if all(np.hypot(x - a, z - b) > 0.85 * (reach + r) for a, b, r in self.standing):
-                self.standing.append((x, z, reach))
-                turn = self.rng.uniform(0, 2 * np.pi) if angle is None else angle
-                self.add(things.placed(parts, [x, 0, z], turn))
-                return True
-        return False
-
-    def free_spot(self, area: tuple[float, float]) -> np.ndarray:
-        """The place on the floor, of 200 tried, that is farthest from what stands there, (x, z)."""
-        spots = self.rng.uniform(-0.45, 0.45, (200, 2)) * area
-        gaps = [min([np.hypot(*(spot - [x, z])) - r for x, z, r in self.standing], default=1.0) for spot in spots]
-        return spots[int(np.argmax(gaps))]
 
 
 def room(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     """Four walls, furniture, and light from lamps, windows or both."""
     rng = stage.rng
     width, depth, height = rng.uniform(3, 8), rng.uniform(3, 8), rng.uniform(2.3, 3.6)
+    stage.area, stage.height, stage.closed = (width, depth), height, True
     x, z = width / 2, depth / 2
     stage.add([("floor", quads([[[-x, 0, z], [x, 0, z], [x, 0, -z], [-x, 0, -z]]]))])
     stage.add([("wall", quads([[[-x, height, -z], [x, height, -z], [x, height, z], [-x, height, z]]]))])
@@ -189,7 +148,8 @@ def open_set(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
     """Things on a ground without walls, under a sky or between the lamps of a studio."""
     rng = stage.rng
     small = rng.random() < 0.4
-    area = (1.6, 1.6) if small else (7.0, 7.0)
+    area = stage.area = (1.6, 1.6) if small else (7.0, 7.0)
+    stage.height = 1.2 if small else 2.6
     stage.add([("floor", quads([[[-60, 0, 60], [60, 0, 60], [60, 0, -60], [-60, 0, -60]]]))])
     if small:
         stage.add(things.clutter(rng, *area, int(rng.integers(6, 22))))
@@ -216,12 +176,20 @@ def open_set(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
 LAYOUTS = {"room": room, "open": open_set}
 
 
-def make_scene(seed: int | tuple[int, ...], folder: Path) -> Path:
-    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files."""
+def make_scene(seed: int | tuple[int, ...], folder: Path, varied: bool = False) -> Path:
+    """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files.
+
+    A ``varied`` scene has more to it in about two cases of three: see ``data_gen.scenes.procedural.variety``.
+    """
     rng = np.random.default_rng(seed)
     layout = "room" if rng.random() < 0.7 else "open"
     stage = Stage(rng)
     origin, target = LAYOUTS[layout](stage)
+    sights, further = further_sights(seed) if varied else (frozenset(), rng)
+    # Nothing more comes to stand where the camera is.
+    stage.standing.append((origin[0], origin[2], 0.6))
+    bulbs = add_sights(stage, sights, further)
+    media = some_media(stage, further, folder) if "media" in sights else Media()
 
     def save(image: np.ndarray, raw: bool) -> str:
         image = image if image.ndim == 3 else np.repeat(image[..., None], 3, axis=-1)
@@ -231,8 +199,9 @@ def make_scene(seed: int | tuple[int, ...], folder: Path) -> Path:
         return name
 
     root = xml.Element("scene", version="3.0.0")
-    root.append(plugin("integrator", "path", max_depth=MAX_DEPTH, rr_depth=5))
-    root.append(_camera(rng, origin, target))
+    integrator = "volpath" if media.elements else "path"
+    root.append(plugin("integrator", integrator, max_depth=MAX_DEPTH, rr_depth=5))
+    root.append(inside(_camera(rng, origin, target), *media.camera))
     palette = Palette(rng, save)
     for slot in SLOTS:
         # Far below, where nobody looks: what holds the place of a material that this scene has no use for.
@@ -249,6 +218,11 @@ def make_scene(seed: int | tuple[int, ...], folder: Path) -> Path:
             shape = _shape(folder, name, replace(lamps, faces=lamps.faces[part]), black)
             tint = colour(rng, 0.75, 1, 0.5)
             root.append(inside(shape, plugin("emitter", "area", radiance=light * tint)))
+    for i, lamp in enumerate(bulbs):
+        black = plugin("bsdf", "diffuse", reflectance=(0.0, 0.0, 0.0))
+        shape = _shape(folder, f"bulb{i}", lamp.mesh, black)
+        root.append(inside(shape, plugin("emitter", "area", radiance=lamp.radiance)))
+    root.extend(media.elements)
     if stage.sky:
         write_pfm(folder / "sky.pfm", np.float32(np.exp(rng.normal(0, 1))) * sky(rng))
         root.append(plugin("emitter", "envmap", filename="sky.pfm"))
@@ -277,15 +251,16 @@ def _surface(mesh: Mesh) -> float:
 
 
 def main() -> int:
-    if len(sys.argv) != 3 or not sys.argv[1].isdigit():
-        print("usage: python -m data_gen.scenes.procedural.scenes SEED FOLDER", file=sys.stderr)
+    words = [word for word in sys.argv[1:] if word != "--varied"]
+    if len(words) != 2 or not words[0].isdigit():
+        print("usage: python -m data_gen.scenes.procedural.scenes SEED FOLDER [--varied]", file=sys.stderr)
         return 2
-    folder = Path(sys.argv[2])
+    folder = Path(words[1])
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         print(f"{folder}: exists and is not an empty folder; give a new one", file=sys.stderr)
         return 2
     folder.mkdir(parents=True, exist_ok=True)
-    print(make_scene(int(sys.argv[1]), folder))
+    print(make_scene(int(words[0]), folder, varied="--varied" in sys.argv))
     return 0
 
 
