@@ -128,7 +128,8 @@ def start(config: Config, folder: Path, planned: int) -> None:
         if not (folder / MANIFEST).exists():
             empty = {"format": FORMAT, "version": VERSION, "config": as_json(config), "planned": planned, "shards": []}
             write_json(folder / MANIFEST, empty)
-        theirs = read_manifest(folder)["config"]
+        # An entry that was not there yet when the set was begun has its default.
+        theirs = as_json(Config(scenes=1)) | read_manifest(folder)["config"]
     ours = json.loads(json.dumps(as_json(config)))
     different = [key for key in ours if theirs.get(key) != ours[key]]
     if different:

@@ -1,0 +1,194 @@
+"""What some varied scenes have and others have not: as often as is said, from the seed alone, beside the same scene."""
+
+import subprocess
+import sys
+import zlib
+from dataclasses import replace
+from pathlib import Path
+from xml.etree import ElementTree as xml
+
+import numpy as np
+import pytest
+
+pytest.importorskip("mitsuba")
+
+from data_gen.dataset import jobs
+from data_gen.dataset.config import Config, read_config
+from data_gen.scenes.procedural import media, variety
+from data_gen.scenes.procedural.scenes import make_scene
+from data_gen.scenes.procedural.stage import Stage
+from ngpt.errors import NgptError
+from ngpt.system.writing import write_json
+from ngpt.training.dataset import MANIFEST, read_manifest
+
+ROOT = Path(__file__).parents[2]
+RENDERED = """
+import sys, mitsuba as mi, numpy as np
+mi.set_variant("scalar_rgb")
+for path in sys.argv[1:]:
+    scene = mi.load_file(path)
+    film = mi.traverse(scene.sensors()[0])
+    film["film.size"] = [16, 9]
+    film.update()
+    mi.set_log_level(mi.LogLevel.Error)
+    image = np.array(mi.render(scene, spp=4))
+    # Bump maps give Mitsuba some samples that are not finite, with and without media; our films leave them out.
+    print(path, bool(np.isfinite(image).mean() > 0.9 and np.nanmedian(image) > 0))
+"""
+
+
+def files(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def made(tmp_path: Path, name: str, seed, varied: bool = True) -> dict[str, bytes]:
+    (tmp_path / name).mkdir()
+    make_scene(seed, tmp_path / name, varied)
+    return files(tmp_path / name)
+
+
+def only(monkeypatch, *sights: str, kind: str = "") -> None:
+    monkeypatch.setattr(variety, "SHARES", {name: float(name in sights) for name in variety.SHARES})
+    if kind:
+        # As often as before by number, so that the same random numbers are left for what comes after.
+        monkeypatch.setattr(media, "KINDS", dict.fromkeys(media.KINDS, media.KINDS[kind]))
+
+
+def test_each_sight_comes_as_often_as_is_said():
+    found = [variety.further_sights((11, i))[0] for i in range(3000)]
+    for name, share in variety.SHARES.items():
+        count = sum(name in sights for sights in found)
+        assert abs(count - share * 3000) < 4 * np.sqrt(3000 * share * (1 - share)), name
+    assert 0.1 <= variety.SHARES["media"] <= 0.2
+    # Each for itself: both together as often as chance has it.
+    both = sum({"hair", "fine"} <= sights for sights in found) / 3000
+    assert both == pytest.approx(variety.SHARES["hair"] * variety.SHARES["fine"], abs=0.02)
+
+
+def test_scenes_are_those_of_before(tmp_path):
+    """Training sets are made of names and seeds: a changed scene would be another set under the same name."""
+    text = made(tmp_path, "a", 7, varied=False)["scene.xml"]
+    assert zlib.crc32(text) == 0x77A5293
+
+
+def test_a_varied_scene_that_nothing_falls_to_is_the_plain_one(tmp_path):
+    seed = next(i for i in range(100) if not variety.further_sights(i)[0])
+    assert made(tmp_path, "a", seed) == made(tmp_path, "b", seed, varied=False)
+
+
+def test_sights_come_on_top_of_the_same_scene(tmp_path, monkeypatch):
+    plain = made(tmp_path, "plain", 3, varied=False)
+    only(monkeypatch, "hair", "bulbs", "caustic", "media")
+    full, again = made(tmp_path, "full", 3), made(tmp_path, "again", 3)
+    assert full == again
+    assert all(full[name] == data for name, data in plain.items() if name.endswith((".png", ".pfm")))
+    assert {f"bulb{i}.ply" for i in range(variety.EMITTERS)} <= full.keys() - plain.keys()
+    cameras = [xml.fromstring(scene["scene.xml"]).find("sensor/transform/lookat").attrib for scene in (plain, full)]
+    assert cameras[0] == cameras[1]
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_small_lamps_are_10_to_50_and_small(seed, monkeypatch):
+    stage = Stage(np.random.default_rng(seed))
+    lamps = variety.bulbs(stage, [])
+    assert len(lamps) == variety.EMITTERS and all((lamp.radiance > 0).all() for lamp in lamps)
+    spheres = sum(len(lamp.mesh.vertices) for lamp in lamps) / len(variety.sphere(0.01, 8).vertices)
+    assert 10 <= spheres <= 50
+    other = variety.caustic(stage)
+    assert len(variety.bulbs(stage, other)) == variety.EMITTERS
+
+
+def test_hair_is_as_thin_as_hair():
+    rng = np.random.default_rng(2)
+    for parts in (variety.strands.wires(rng, (4, 4), 2.4), variety.strands.tuft(rng), variety.strands.net(rng)):
+        mesh = parts[0][1]
+        corners = mesh.vertices[mesh.faces]
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=-1)
+        assert np.isfinite(mesh.normals).all() and len(mesh.faces) < 60_000
+        assert np.median(edges.min(axis=1)) < 0.004  # metres round the tube
+
+
+def test_fine_pictures_repeat_more_often(monkeypatch):
+    stage = Stage(np.random.default_rng(0))
+    stage.add([("floor", variety.box([4, 0.1, 4]))])
+    before = {slot: np.ptp(meshes[0].uvs) for slot, meshes in stage.meshes.items()}
+    variety.fine_pictures(stage)
+    assert all(np.ptp(stage.meshes[slot][0].uvs) >= 3 * size for slot, size in before.items())
+
+
+def test_fog_dims_light_across_the_place_by_what_is_said(tmp_path):
+    depths = []
+    for seed in range(40):
+        stage = Stage(np.random.default_rng(seed))
+        stage.area, stage.closed = (6.0, 4.0), True
+        air = media.fog(stage, np.random.default_rng(seed), tmp_path).elements[0]
+        scale = float(air.find("float[@name='scale']").get("value"))
+        depths.append(6 * scale * np.mean([float(x) for x in air.find("rgb[@name='sigma_t']").get("value").split()]))
+    assert 0.15 < min(depths) < 0.4 and 1.2 < max(depths) < 2.5
+
+
+def test_each_kind_renders(tmp_path, monkeypatch):
+    """In Mitsuba's scalar variant, which compiles no kernel."""
+    paths = []
+    cases = [("hair", ""), ("bulbs", ""), ("caustic", ""), ("fine", ""), *(("media", kind) for kind in media.KINDS)]
+    for number, (sight, kind) in enumerate(cases):
+        folder = tmp_path / f"{sight}{kind}"
+        folder.mkdir()
+        only(monkeypatch, sight, kind=kind)
+        paths.append(str(make_scene((4, number), folder, varied=True)))
+        text = (folder / "scene.xml").read_text()
+        assert ('"volpath"' in text) == ("<medium" in text) == (sight == "media")
+    command = [sys.executable, "-c", RENDERED, *paths]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
+    assert [line for line in told if line.startswith(str(tmp_path))] == [f"{path} True" for path in paths]
+
+
+@pytest.mark.parametrize("kind", ["fog", "smoke"])
+def test_cameras_are_found_in_media_and_see_through_their_boundaries(renderer, tmp_path, monkeypatch, kind):
+    from data_gen.dataset.cameras import Surroundings, find_view
+    from data_gen.scenes.load import load_scene
+
+    only(monkeypatch, "media", kind=kind)
+    scene = load_scene(str(make_scene((2, 1), tmp_path, varied=True)))
+    around, rng = Surroundings(scene), np.random.default_rng(0)
+    boxes = [shape.bbox() for shape in scene.shapes() if shape.is_medium_transition()]
+    assert around.boundaries and boxes
+    for _ in range(3):
+        origin = np.array(find_view(around, rng, 32, 20, 0.005).origin)
+        within = [np.all(origin > np.array(box.min)) and np.all(origin < np.array(box.max)) for box in boxes]
+        # The camera's medium is that of its ray's start: in fog always, and never in smoke.
+        assert all(within) if kind == "fog" else not any(within)
+    towards = np.tile([0.0, 0.0, 1.0], (1, 1))
+    outside = np.array([[0.0, 0.5, -30.0]])
+    assert around.cast(outside, towards, boundaries=True)[0] <= around.cast(outside, towards)[0]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", list(media.KINDS))
+def test_crops_of_scenes_with_media(renderer, tmp_path, monkeypatch, kind):
+    """By the sampler that `auto` takes; every layer is finite."""
+    from data_gen.dataset import crops
+    from ngpt.training.shards import Shard
+
+    only(monkeypatch, "media", kind=kind)
+    config = Config(size=16, inputs=1, spp=(2, 4), sampler="auto", scenes=1, varied=True, crops=1, reference_spp=8)
+    (tmp_path / "shards").mkdir()
+    crops.make_shard(config, config.plan()[0], str(tmp_path), "llvm_ad_rgb")
+    shard = Shard(tmp_path / config.plan()[0].file)
+    assert not shard.record["failures"] and "dx" in shard.names
+
+
+def test_a_set_begun_before_there_was_an_entry_goes_on(tmp_path):
+    config = Config(scenes=2)
+    jobs.start(config, tmp_path, 8)
+    manifest = read_manifest(tmp_path)
+    del manifest["config"]["varied"]
+    write_json(tmp_path / MANIFEST, manifest)
+    jobs.start(config, tmp_path, 8)
+    with pytest.raises(NgptError, match="varied differ"):
+        jobs.start(replace(config, varied=True), tmp_path, 8)
+
+
+def test_the_configuration_of_varied_scenes():
+    config = read_config(ROOT / "configs" / "data-varied.toml")
+    assert config.varied and config.sampler == "auto"
