@@ -11,6 +11,9 @@ from data_gen.paths.spectrum import reflectance_to_rgb
 MAX_SPECULAR_VERTICES = 32
 
 
+# Of a ray through a medium whose density varies, from where to where there is any.
+MEDIUM_STEPS = 8
+
 # Materials that turn the shading frame; Mitsuba tells of the turn only through its `aov` integrator.
 _TURNS_NORMALS = ("BumpMap", "NormalMap")
 
@@ -18,13 +21,17 @@ _TURNS_NORMALS = ("BumpMap", "NormalMap")
 def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.Color3f | mi.Float]:
     """One sample of every feature layer along a camera ray, in the conventions of the gradient stack.
 
-    ``albedo``  reflectance in [0, 1], tinted by the mirrors and the glass it is seen through
+    ``albedo``  reflectance in [0, 1], tinted by the mirrors and the glass it is seen through; media dim it, and add
+                their own albedo by as much as they dim
     ``normal``  unit shading normal in camera space, +x right, +y up, +z toward the viewer, on the side seen
     ``depth``   path length from the camera in world units
-    All are zero where the path escapes. Media are not seen: the surfaces behind them are. Bump and normal maps count
-    where they are a shape's outermost material; Mitsuba keeps those inside others (``twosided``, ``mask``) to itself.
+    All are zero where the path escapes, but for the albedo of media. Normal and depth are those of the surfaces behind
+    media. Bump and normal maps count where they are a shape's outermost material; Mitsuba keeps those inside others
+    (``twosided``, ``mask``) to itself.
     """
-    si, last, depth, reflectance = first_nonspecular_vertex(scene, sampler, ray)
+    si, last, depth, reflectance, scattered = first_nonspecular_vertex(
+        scene, sampler, ray, *in_media(scene, sensor.get_medium())
+    )
     found = si.is_valid()
     normal = si.sh_frame.n
     if any(shape.bsdf() is not None and shape.bsdf().class_name() in _TURNS_NORMALS for shape in scene.shapes()):
@@ -35,20 +42,64 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     # A Mitsuba camera looks along its +z with +x to the left of the image.
     local = dr.normalize(sensor.world_transform().inverse() @ mi.Normal3f(normal))
     normal = mi.Color3f(-local.x, local.y, -local.z)
-    albedo = reflectance_to_rgb(reflectance, ray.wavelengths)
+    albedo = reflectance_to_rgb(dr.select(found, reflectance, 0) + scattered, ray.wavelengths)
     return {
-        "albedo": dr.select(found, albedo, 0),
+        "albedo": albedo,
         "normal": dr.select(found, normal, 0),
         "depth": dr.select(found, depth, 0),
     }
 
 
+def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
+    """The ``medium`` that the camera is in, and the steps to take in media: 0 where the scene has none."""
+    media = [medium]
+    for shape in scene.shapes():
+        if shape.is_medium_transition():
+            media += [shape.interior_medium(), shape.exterior_medium()]
+    media = [medium for medium in media if medium is not None]
+    if not media:
+        return None, 0
+    # One step through a medium of one density is exact.
+    return mi.MediumPtr(medium), 1 if all(medium.is_homogeneous() for medium in media) else MEDIUM_STEPS
+
+
 @dr.syntax
-def first_nonspecular_vertex(scene, sampler, ray):
+def through_medium(medium, ray, length, sampler, steps: int):
+    """The transmittance of a ``medium`` (none: 1) along ``ray`` up to ``length``, and the albedo it scatters there.
+
+    The albedo is that of single scattering, weighted by what the medium takes of the light on each of the ``steps``.
+    """
+    transmittance = mi.unpolarized_spectrum(mi.Spectrum(1))
+    albedo = mi.unpolarized_spectrum(mi.Spectrum(0))
+    # Where the density of a grid is not 0; all of a ray in a medium without bounds.
+    inside = medium != None  # noqa: E711 - a comparison of arrays of pointers
+    hit, first, end = medium.intersect_aabb(ray)
+    first, end = dr.maximum(first, 0), dr.minimum(end, length)
+    inside &= hit & (end > first)
+    step = (end - first) / steps
+    mei = dr.zeros(mi.MediumInteraction3f)
+    mei.wavelengths, mei.medium, mei.wi, mei.sh_frame = ray.wavelengths, medium, -ray.d, mi.Frame3f(-ray.d)
+    jitter = sampler.next_1d(inside)
+    i = mi.UInt32(0)
+    while inside & (i < steps):
+        mei.t = first + (i + jitter) * step
+        mei.p = ray(mei.t)
+        scattering, _, extinction = medium.get_scattering_coefficients(mei, inside)
+        passed = dr.exp(-mi.unpolarized_spectrum(extinction) * step)
+        own = mi.unpolarized_spectrum(scattering) / mi.unpolarized_spectrum(extinction)
+        albedo += transmittance * (1 - passed) * dr.select(extinction > 0, own, 0)
+        transmittance *= passed
+        i += 1
+    return transmittance, albedo
+
+
+@dr.syntax
+def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
     """Follows ``ray`` through mirrors, clear glass and the holes of masks to the first vertex that scatters smoothly.
 
     Returns the surface interaction there (invalid where the path escapes or the chain is too long), the ray that led
-    there from the vertex before, the path length up to it, and a sample of its reflectance times that of the chain.
+    there from the vertex before, the path length up to it, a sample of its reflectance times that of the chain, and the
+    albedo of the media on the way. ``medium`` and ``steps`` are those of ``in_media``.
     """
     ray = mi.Ray3f(ray)
     last = mi.Ray3f(ray)
@@ -56,6 +107,7 @@ def first_nonspecular_vertex(scene, sampler, ray):
     depth = mi.Float(0)
     tint = mi.unpolarized_spectrum(mi.Spectrum(1))
     reflectance = mi.Spectrum(0)
+    scattered = mi.unpolarized_spectrum(mi.Spectrum(0))
     vertices = mi.UInt32(0)
     found = mi.Bool(False)
     searching = mi.Bool(True)
@@ -64,6 +116,12 @@ def first_nonspecular_vertex(scene, sampler, ray):
         # Camera rays of one pixel go together, for which Embree has a way of its own.
         si = scene.ray_intersect(ray, mi.RayFlags.All, vertices == 0)
         depth += si.t
+        if dr.hint(steps > 0, mode="scalar"):
+            # Light that escapes has come from far, but not from so far that float32 has no number for it.
+            length = dr.minimum(si.t, 1e9)
+            passed, albedo = through_medium(medium, ray, length, sampler, steps)
+            scattered += tint * albedo
+            tint *= passed
         bsdf = si.bsdf(mi.RayDifferential3f(ray))
         flags = bsdf.flags()
         # eval_diffuse_reflectance() is free of noise, but means nothing without a diffuse component. The weight of a
@@ -82,5 +140,7 @@ def first_nonspecular_vertex(scene, sampler, ray):
         vertices += 1
         searching = sampled & ~found & (vertices < MAX_SPECULAR_VERTICES) & (dr.max(tint) > 0)
         ray = si.spawn_ray(si.to_world(sample.wo))
+        if dr.hint(steps > 0, mode="scalar"):
+            medium = dr.select(si.is_medium_transition(), si.target_medium(ray.d), medium)
     si.t = dr.select(found, si.t, dr.inf)
-    return si, last, depth, reflectance
+    return si, last, depth, reflectance, scattered

@@ -171,3 +171,89 @@ def test_a_hall_of_mirrors_ends(renderer):
     room = {"type": "sphere", "radius": 50, "flip_normals": True, "bsdf": {"type": "conductor", "material": "none"}}
     stack = features_of(renderer, room=room, size=(8, 8))
     assert not stack["albedo"].any() and not stack["depth"].any()
+
+
+def slab(mi, medium, depth=0.8):
+    """A box with a medium, ``depth`` deep along the view, that fills the picture at z = 0."""
+    return {
+        "type": "cube",
+        "to_world": mi.ScalarTransform4f().scale([4, 4, depth / 2]),
+        "bsdf": {"type": "null"},
+        "interior": medium,
+    }
+
+
+def haze(sigma_t=1.5, albedo=(0.9, 0.6, 0.3)):
+    return {"type": "homogeneous", "sigma_t": sigma_t, "albedo": {"type": "rgb", "value": list(albedo)}}
+
+
+def grid(mi, density, depth=0.8):
+    """A medium whose density along the view is that of the list, made of the same stuff as ``haze``."""
+    cells = np.float32(density)[:, None, None, None] * np.ones((1, 2, 2, 1), np.float32)
+    to_world = mi.ScalarTransform4f().translate([-4, -4, -depth / 2]).scale([8, 8, depth])
+    return {
+        "type": "heterogeneous",
+        "sigma_t": {
+            "type": "gridvolume",
+            "grid": mi.VolumeGrid(cells),
+            "to_world": to_world,
+            "raw": True,
+            "filter_type": "nearest",
+        },
+        "albedo": {"type": "constvolume", "value": {"type": "rgb", "value": [0.9, 0.6, 0.3]}},
+        "scale": 1.5,
+    }
+
+
+def test_media_dim_the_albedo_behind_them_and_add_their_own(renderer):
+    mi = renderer
+    wall, passed = plane(mi, -2, diffuse(0.2, 0.5, 0.8)), np.exp(-1.5 * 0.8)
+    expected = passed * np.array([0.2, 0.5, 0.8]) + (1 - passed) * np.array([0.9, 0.6, 0.3])
+    stack = features_of(mi, wall=wall, slab=slab(mi, haze()), size=(9, 9))
+    assert np.allclose(stack["albedo"][4, 4], expected, atol=0.01)
+    # The surfaces behind keep their own place.
+    assert np.allclose(stack["normal"], [0, 0, 1], atol=1e-5)
+    assert stack["depth"][4, 4, 0] == pytest.approx(7, abs=0.05)
+    # Before nothing, what is left is the medium's part.
+    alone = features_of(mi, slab=slab(mi, haze()), size=(9, 9))
+    assert np.allclose(alone["albedo"][4, 4], (1 - passed) * np.array([0.9, 0.6, 0.3]), atol=0.01)
+    assert not alone["normal"].any() and not alone["depth"].any()
+
+
+def test_the_density_of_a_grid_counts_along_the_ray(renderer):
+    mi = renderer
+    wall = plane(mi, -2, diffuse(0.2, 0.5, 0.8))
+    for density in ([1, 1, 1, 1], [0.2, 1, 0.5, 0]):
+        passed = np.exp(-1.5 * 0.8 * np.mean(density))
+        expected = passed * np.array([0.2, 0.5, 0.8]) + (1 - passed) * np.array([0.9, 0.6, 0.3])
+        stack = features_of(mi, wall=wall, slab=slab(mi, grid(mi, density)), size=(9, 9), spp=64)
+        assert np.allclose(stack["albedo"][4, 4], expected, atol=0.02)
+
+
+def test_the_camera_may_stand_in_a_medium(renderer):
+    mi = renderer
+    camera = {
+        "type": "perspective",
+        "fov": 1,
+        "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]),
+        "medium": {"type": "ref", "id": "air"},
+    }
+    wall = plane(mi, 0, diffuse(0.2, 0.5, 0.8))
+    stack = features_of(mi, size=(5, 5), air=haze(0.2) | {"id": "air"}, sensor=camera, wall=wall)
+    passed = np.exp(-0.2 * 5)
+    assert np.allclose(
+        stack["albedo"], passed * np.array([0.2, 0.5, 0.8]) + (1 - passed) * np.array([0.9, 0.6, 0.3]), atol=0.01
+    )
+    # Endless before nothing: the medium is all there is.
+    endless = features_of(mi, size=(5, 5), air=haze(0.2) | {"id": "air"}, sensor=camera)
+    assert np.allclose(endless["albedo"], [0.9, 0.6, 0.3], atol=1e-3) and not endless["depth"].any()
+
+
+def test_media_in_glass_are_tinted_by_the_glass(renderer):
+    mi = renderer
+    red = {"type": "rgb", "value": [0.9, 0.4, 0.2]}
+    ball = sphere({"type": "dielectric", "specular_transmittance": red, "int_ior": 1.0001}, radius=1.0)
+    stack = features_of(mi, ball=ball | {"interior": haze(2.0)}, wall=plane(mi, -3, diffuse(1, 1, 1)), size=(9, 9))
+    passed = np.exp(-2 * 2.0)
+    expected = np.array([0.9, 0.4, 0.2]) * (1 - passed) * [0.9, 0.6, 0.3] + passed * np.array([0.9, 0.4, 0.2]) ** 2
+    assert np.allclose(stack["albedo"][4, 4], expected, atol=0.02)
