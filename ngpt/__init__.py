@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from ngpt.merging import merge
     from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.stack import GradientStack
+    from ngpt.uncertainty import reconstruct_with_error
 
 __all__ = [
     "METHODS",
@@ -34,6 +35,7 @@ __all__ = [
     "read",
     "read_image",
     "reconstruct",
+    "reconstruct_with_error",
     "write",
 ]
 
@@ -42,6 +44,7 @@ __all__ = [
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "denoiser")
 _HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
+_HOMES["reconstruct_with_error"] = "uncertainty"
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 

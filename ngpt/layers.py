@@ -38,6 +38,7 @@ LAYERS: dict[str, Layer] = {
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),
+        Layer("error", RGB, True, "in results: estimated standard error of the reconstruction"),
     )
 }
 

@@ -56,6 +56,7 @@ class Result:
     ``weights``    the file of the network that ran, None for methods without one
     ``options``    those that are not the method's defaults, weights left out
     ``estimated``  layers that the stack lacks and the method estimated
+    ``error``      (H, W, 3) float32, the standard error of the image where it was asked for (``ngpt.uncertainty``)
     """
 
     image: np.ndarray
@@ -66,6 +67,7 @@ class Result:
     weights: Identity | None = None
     options: dict[str, Any] = field(default_factory=dict)
     estimated: tuple[str, ...] = ()
+    error: np.ndarray | None = None
 
     @property
     def attributes(self) -> dict[str, Any]:

@@ -25,6 +25,7 @@ ngpt.classical
 ngpt.denoisers
 ngpt.network
 ngpt.methods
+ngpt.uncertainty ngpt.lightgroups
 ngpt.denoiser
 ngpt.report
 ngpt.measure

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ngpt import lightgroups
 from ngpt.cli.arguments import (
     RESULT_SUFFIX,
     add_files,
@@ -30,6 +31,7 @@ from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
+from ngpt.uncertainty import reconstruct_with_error
 from ngpt.version import __version__
 
 # The options of methods that are numbers; they may be "auto" as well.
@@ -65,6 +67,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help=f"an option of the method; may be repeated. With their defaults: {_options()}",
     )
+    parser.add_argument(
+        "--error",
+        action="store_true",
+        help="write a layer 'error' too: the standard error of each pixel; twice the time",
+    )
+    names = ", ".join(f"{pattern} ({renderer})" for renderer, pattern in lightgroups.PATTERNS.items())
+    parser.add_argument(
+        "--groups", action="store_true", help=f"denoise light groups too, so that they add up to the result: {names}"
+    )
+    parser.add_argument(
+        "--group",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="a light group of another name, * for any letters; may be repeated",
+    )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
     add_layers(parser)
@@ -98,7 +116,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     frames = overlapped(
         pairs,
         partial(read_frame, args=args, files=files),
-        partial(compute_frame, method=args.method, options=options, reference=reference),
+        partial(compute_frame, args=args, options=options, reference=reference),
         partial(write_frame, overwrite=args.force),
     )
     reports = []
@@ -135,6 +153,7 @@ class Frame(NamedTuple):
     stack: GradientStack | None
     result: Result | None = None
     metrics: dict[str, float] | None = None
+    groups: tuple[str, ...] = ()
 
 
 def read_frame(pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str]) -> Frame:
@@ -145,17 +164,24 @@ def read_frame(pair: tuple[Path, Path], args: argparse.Namespace, files: dict[st
     return Frame(source, target, read(source, dict(args.layer), args.untrusted, files))
 
 
-def compute_frame(frame: Frame, method: str, options: dict, reference: np.ndarray | None) -> Frame:
-    if frame.stack is None:
+def compute_frame(frame: Frame, args: argparse.Namespace, options: dict, reference: np.ndarray | None) -> Frame:
+    stack = frame.stack
+    if stack is None:
         return frame
-    result = reconstruct(frame.stack, method, **options)
+    groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
+    result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
     metrics = compare(result.image, reference) if reference is not None else None
-    return frame._replace(result=result, metrics=metrics)
+    if groups:
+        parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
+        stack = lightgroups.with_groups(stack, parts)
+    if result.error is not None:
+        stack = stack.replace(error=result.error)
+    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups))
 
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics = frame
+    source, target, stack, result, metrics, groups = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if stack is None or result is None:
         return report | {"skipped": True}
@@ -171,6 +197,8 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "height": stack.height,
         "repaired": result.repaired,
         "untrusted": result.untrusted,
+        "standard error": result.error is not None,
+        "groups": list(groups),
     }
     return report | ({"metrics": metrics} if metrics else {})
 
@@ -211,6 +239,8 @@ def describe(report: dict) -> str:
     text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
         text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if report["groups"]:
+        text += f", light groups {', '.join(report['groups'])}"
     if "metrics" in report:
         text += f", relMSE {report['metrics']['relMSE']:.5g}"
     return text

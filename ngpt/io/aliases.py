@@ -26,9 +26,10 @@ class Alias(NamedTuple):
 # moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
 # V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
-    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic")),
+    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic", "error")),
     Alias("direct", "ngpt", "direct", "only beside dx or dy: elsewhere `direct` is direct lighting"),
     Alias("caustic", "ngpt", "caustic", "only beside dx, dy or caustic_var: elsewhere it may be any light"),
+    Alias("error", "ngpt", "error", "in results: of the reconstruction"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),
     Alias("primal", "RenderMan", "Ci"),
@@ -224,6 +225,17 @@ def propose(parts: Sequence[tuple[str, Sequence[str]]], found: Resolution) -> di
                 proposed[name] = group.name
                 break
     return proposed
+
+
+def layers_of_light(parts: Sequence[tuple[str, Sequence[str]]], found: Resolution) -> dict[str, Found]:
+    """The layers of colour that are none of the contract: name -> where they are."""
+    taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
+    light = {}
+    for group in _group(parts):
+        channels = _complete(LAYERS["primal"], group)
+        if group.name and channels and not {(group.part, channel) for channel in channels} & taken:
+            light[group.name] = Found(group.part, channels, group.name)
+    return light
 
 
 def _group(parts: Sequence[tuple[str, Sequence[str]]]) -> list[_Group]:

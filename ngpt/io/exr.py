@@ -15,6 +15,7 @@ import OpenEXR
 
 from ngpt.errors import NgptError
 from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
+from ngpt.io.aliases import layers_of_light as find_light
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.layers import LAYERS, RGB
@@ -27,10 +28,12 @@ __all__ = [
     "ExrImage",
     "ExrPart",
     "StackSource",
+    "layers_of_light",
     "pass_through",
     "read",
     "read_exr",
     "read_image",
+    "replace_layers_of_light",
     "with_channels",
     "write",
     "write_exr",
@@ -149,7 +152,8 @@ def write(
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` alone is written as float R G B.
 
     ``attributes`` go into the header beside those of the stack: ``Result.attributes`` say what made a result. What a
-    stack that is itself a result says of its own making (``MADE_BY``) is left out of the new result.
+    stack that is itself a result says of its own making (``MADE_BY``) is left out of the new result, and so is the
+    layer ``error`` that was read with it. One that was put in its place (``like=stack.replace(error=...)``) is written.
     """
     if structural := _STRUCTURE & (attributes or {}).keys():
         raise NgptError(f"{path}: attribute '{min(structural)}' is OpenEXR's own; give it another name")
@@ -164,7 +168,9 @@ def write(
                 f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {like.path} is "
                 f"{like.width}x{like.height}; results are written at the size of their stack"
             )
-        result, main = _with_result(*_image_of(like, str(path))[:2], pixels), 0
+        found, resolution, _ = _image_of(like, str(path))
+        _leave_out_old_error(like, found)
+        result, main = _with_result(found, resolution, pixels), 0
         for name in MADE_BY:
             result.parts[0].header.pop(name, None)
     else:
@@ -200,6 +206,31 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
         for name, channel in part.channels.items()
         if (i, name) not in known
     }
+
+
+def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
+    """The layers of colour that a stack carries along beside those of the contract: name -> (H, W, 3) float32."""
+    return {name: _gather(part, names) for name, (part, names) in _light(stack).items()}
+
+
+def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
+    """The stack with others in place of some of its ``layers_of_light``, (H, W, 3), of the type they have there."""
+    image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
+    changed = GradientStack(stack.layers, stack.attributes, StackSource(image, stack.source.resolution), stack.path)
+    places = _light(changed)
+    for name, values in layers.items():
+        part, names = places[name]
+        _scatter(part, names, values, _is_half(part, names))
+    return changed
+
+
+def _light(stack: GradientStack) -> dict[str, tuple[ExrPart, tuple[str, ...]]]:
+    """Where they are."""
+    if stack.source is None:
+        return {}
+    parts = stack.source.image.parts
+    found = find_light([(part.name, list(part.channels)) for part in parts], stack.source.resolution)
+    return {name: (parts[place.part], place.channels) for name, place in found.items()}
 
 
 def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
@@ -256,6 +287,14 @@ def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, in
             resolution[name] = Found(main, names, name)
         _scatter(part, names, values, half)
     return image, resolution, main
+
+
+def _leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
+    """Removes the layer ``error`` that came with the file of a stack: it is that of an earlier result."""
+    place = stack.source.resolution.get("error") if stack.source else None
+    if place and "error" in stack and _holds(stack.source.image.parts[place.part], place.channels, stack["error"]):
+        for channel in place.channels:
+            image.parts[place.part].channels.pop(channel, None)
 
 
 def _with_result(image: ExrImage, resolution: Resolution, pixels: np.ndarray) -> ExrImage:

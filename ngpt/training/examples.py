@@ -10,7 +10,6 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
-from ngpt.io.exr import read
 from ngpt.network import features, padding
 from ngpt.network.model import ModelConfig
 from ngpt.network.run_torch import layers_of
@@ -20,6 +19,13 @@ from ngpt.training.augment import Augmentation, Layers, quieter
 
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
+
+
+def read(path: str) -> GradientStack:
+    """The stack in a file. Training sets need no OpenEXR: it comes in with the first file that does."""
+    from ngpt.io import exr
+
+    return exr.read(path)
 
 
 class Crop(Protocol):

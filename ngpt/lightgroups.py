@@ -1,0 +1,93 @@
+"""Light groups, denoised so that they still add up to the image: for those who set the lights anew in compositing.
+
+A renderer that splits the image by its lights writes an image for each group beside the whole. Each group is denoised
+by itself, since it has shadows of its own. What their sum then lacks of the reconstruction of the whole, or has too
+much, is divided among them, in each pixel in proportion to the light that they have there:
+
+    o_i = d_i + (D - Σ d_j) |d_i| / Σ |d_j|
+
+so Σ o_i = D whatever the method, and groups of no negative light stay so. Light that is in no group counts as one more
+group, which is not written.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from fnmatch import fnmatchcase
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.io.exr import layers_of_light, replace_layers_of_light
+from ngpt.methods import METHODS, choose, reconstruct
+from ngpt.stack import GradientStack
+
+# How renderers name the image of a group: their own names, the group's in place of the star.
+PATTERNS = {"Cycles": "Combined_*", "Arnold": "RGBA_*"}
+# The header's list of groups of a result.
+ATTRIBUTE = "ngpt:groups"
+# Light in no group, as a share of all of it, that is no more than rounding.
+NEGLIGIBLE = 2e-3
+
+
+def find(stack: GradientStack, patterns: Sequence[str] = ()) -> dict[str, np.ndarray]:
+    """The groups in the file of a stack: name -> (H, W, 3) float32.
+
+    ``patterns``  of the names of layers, such as "Combined_*"; by default those of ``PATTERNS``
+
+    In a file of several view layers those of the one that holds the primal. Raises NgptError where there are none,
+    and where they were denoised before.
+    """
+    if ATTRIBUTE in stack.attributes:
+        raise NgptError(f"{stack.path}: its light groups are denoised already; give the file of the renderer")
+    wanted = tuple(patterns) or tuple(PATTERNS.values())
+    layers = layers_of_light(stack)
+    tails = {name: name.rpartition(".")[2] for name in layers}
+    found = [name for name, tail in tails.items() if any(fnmatchcase(tail, p) or fnmatchcase(name, p) for p in wanted)]
+    beside = stack.source.resolution["primal"].name.rpartition(".")[0] if stack.source else ""
+    found = [name for name in found if name.rpartition(".")[0] == beside] or found
+    if not found:
+        others = ", ".join(layers) or "none"
+        raise NgptError(
+            f"{stack.path}: has no light groups called {' or '.join(wanted)}; other layers of colour: {others}; name "
+            "them with --group NAME"
+        )
+    return {name: layers[name] for name in found}
+
+
+def denoised(
+    stack: GradientStack, groups: Mapping[str, np.ndarray], whole: np.ndarray, method: str = "auto", **options
+) -> dict[str, np.ndarray]:
+    """The groups (H, W, 3) float32, denoised, which add up to ``whole``, the reconstruction of the stack's primal.
+
+    ``method``, ``options``  those that made ``whole``. Groups have neither gradients nor variances; a method that
+    needs them is replaced by the one that "auto" takes for an image with the stack's features.
+    """
+    features = {name: stack[name] for name in ("albedo", "normal", "depth") if name in stack}
+    if method == "auto" or not set(METHODS[method].needs) <= {"primal", *features}:
+        method, options = choose(("primal", *features)), {}
+    light = {name: np.asarray(group, np.float32) for name, group in groups.items()}
+    rest = stack["primal"] - np.sum(list(light.values()), axis=0, dtype=np.float64)
+    if np.nansum(np.abs(rest)) > NEGLIGIBLE * np.nansum(np.abs(stack["primal"])):
+        light[""] = rest.astype(np.float32)
+    parts = {
+        name: reconstruct(GradientStack({"primal": group, **features}, path=f"{stack.path}, {name}"), method, **options)
+        for name, group in light.items()
+    }
+    shared = shares([part.image for part in parts.values()], whole)
+    return {name: image for name, image in zip(parts, shared, strict=True) if name}
+
+
+def shares(parts: Sequence[np.ndarray], whole: np.ndarray) -> list[np.ndarray]:
+    """The parts (H, W, 3), changed so that they add up to ``whole``; float32."""
+    images = np.asarray(parts, np.float64)
+    weights = np.abs(images)
+    total = weights.sum(axis=0)
+    # Where no part has light, all get the same.
+    weights = np.where(total > 0, weights / np.where(total > 0, total, 1), 1 / len(images))
+    return list((images + weights * (whole - images.sum(axis=0))).astype(np.float32))
+
+
+def with_groups(stack: GradientStack, groups: Mapping[str, np.ndarray]) -> GradientStack:
+    """The stack with these groups in place of those in its file, and their names in its header."""
+    changed = replace_layers_of_light(stack, groups)
+    return replace(changed, attributes=changed.attributes | {ATTRIBUTE: ", ".join(groups)})
