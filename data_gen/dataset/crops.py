@@ -12,6 +12,7 @@ import numpy as np
 from data_gen.backend import use_variant
 from data_gen.dataset.config import Config, Job
 from ngpt.errors import NgptError
+from ngpt.merging import merge
 from ngpt.methods import denoise
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -20,6 +21,8 @@ from ngpt.version import __version__
 
 # Views that turn out to be black are replaced this often.
 ATTEMPTS = 6
+# References are rendered in so many independent parts: what two of them agree on is no noise.
+HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 
 
@@ -105,24 +108,34 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
         view = find_view(around, rng, config.size, config.roll, config.lens)
         view.apply(around.scene)
         seconds = {"camera": time.perf_counter() - clock}
-        seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + 1)]
+        seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + HALVES)]
         clock = time.perf_counter()
         stacks = [render_stack(around.scene, counts[0], seeds[0], config.sampler)]
         if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
         raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
-    stacks += [render_stack(around.scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-1], strict=True)]
+    stacks += [
+        render_stack(around.scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-HALVES], strict=True)
+    ]
     seconds["inputs"] = time.perf_counter() - clock
     clock = time.perf_counter()
-    converged = render_stack(around.scene, config.reference_spp, seeds[-1], config.sampler)
+    spp = -(-config.reference_spp // HALVES)
+    halves = [render_stack(around.scene, spp, seed, config.sampler) for seed in seeds[-HALVES:]]
+    converged = merge(halves)
     reference, caustic = references(converged, config.reference_method)
+    apart = [references(half, config.reference_method)[0] for half in halves]
     seconds["reference"] = time.perf_counter() - clock
     cleaned = [finite(stack) for stack in stacks]
     direct = np.nan_to_num(converged["direct"], posinf=0)
     light = np.maximum(reference, direct)
     data = CropData(
-        [stack for stack, _ in cleaned], counts, light if caustic is None else light + caustic, direct, caustic
+        [stack for stack, _ in cleaned],
+        counts,
+        light if caustic is None else light + caustic,
+        direct,
+        caustic,
+        tuple(np.maximum(half, direct) for half in apart),
     )
     told = {
         "crop": crop,

@@ -66,8 +66,8 @@ CHANNELS = {
 # What differences to an image, and relative noise, are enlarged by; what is added to depth before division.
 ENLARGED, NOISE_ENLARGED, LEAST_DEPTH = 20, 100, 1e-10
 
-# The least albedo that radiance is divided by.
-DARKEST = 0.05
+# What is added to albedo before radiance is divided by it: what dark surfaces reflect beside their colour.
+GLOSS = 0.1
 
 # What is computed of other layers: of which, beside ``compared``.
 SOURCES = {
@@ -120,8 +120,12 @@ def _computed(name: str, layers: Mapping[str, Tensor], compared_with: str) -> Te
 
 
 def reflectance(albedo: Tensor) -> Tensor:
-    """What radiance (N, 3, H, W) may be divided by: albedo, at least ``DARKEST``; 1 where it is 0, or not known."""
-    return torch.where(albedo.amax(1, keepdim=True) > 0, albedo.clamp(min=DARKEST), torch.ones_like(albedo))
+    """What radiance (N, 3, H, W) may be divided by: albedo and ``GLOSS``. Where no albedo is known it is one number.
+
+    It is continuous. If an albedo of 0 stood for 1, say, pixels of a black cable, the albedo of which is 0 in some and
+    0.1 in others by chance, would swap their light with those around them ten times too bright.
+    """
+    return albedo + GLOSS
 
 
 def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:

@@ -111,14 +111,11 @@ class Mixture(Head):
         return 3 + len(self.start)
 
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
-        weights = torch.softmax(prediction[:, 3:], 1)
-        mean = torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
-        return prediction[:, :3] + signed_log(mean)
+        return prediction[:, :3] + signed_log(mixed(torch.softmax(prediction[:, 3:], 1), images))
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
         weights = op.Softmax(op.Slice(prediction, [3], [self.outputs], [1]), axis=1)
-        mean = op.Sum(*(op.Slice(weights, [i], [i + 1], [1]) * image for i, image in enumerate(images)))
-        return op.Slice(prediction, [0], [3], [1]) + op.signed_log(mean)
+        return op.Slice(prediction, [0], [3], [1]) + op.signed_log(_mixed(op, weights, images))
 
 
 @dataclass(frozen=True)
@@ -166,7 +163,8 @@ class Kernels(Head):
 class Pyramid(Head):
     """Kernels of ``size`` x ``size`` pixels at ``scales`` resolutions of one image, each half as fine as the last.
 
-    With w the trust in each pixel of the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
+    Of several images it is the mean, by a weight for each in each pixel (softmax). With w the trust in each pixel of
+    the image D, in (0, 1), and D_s, w_s both averaged over 2^s x 2^s pixels:
 
         I_s(p) = sum of k_s(p, q) w_s(q) D_s(q) / sum of k_s(p, q) w_s(q)       q in the kernel around p
         o_s    = I_s + a_s up(o_(s+1) - down(I_s)),  the coarsest o_s = I_s     a_s in (0, 1)
@@ -176,8 +174,8 @@ class Pyramid(Head):
     begin with, so that such pixels do not rule what is learnt. The prediction of k_s
     and a_s is averaged over the pixels of the resolution.
 
-    ``demodulate``  the same kernels average the image over the reflectance, too, which is multiplied again afterwards;
-                    a weight in each pixel blends both. What of the image is texture is not averaged then
+    ``demodulate``  they average the image over the reflectance, which is multiplied again afterwards: what of the image
+                    is texture is not averaged
     """
 
     normalise = True
@@ -197,12 +195,20 @@ class Pyramid(Head):
 
     @property
     def outputs(self) -> int:
-        # Trust; for each scale a kernel and a share, of which the coarsest is the blend with the demodulated image.
-        return 1 + self.scales * (self.size**2 + 1)
+        # Trust; for each scale a kernel, and for each but the coarsest a share; the weights of several images.
+        return self.scales * (self.size**2 + 1) + self._weights
+
+    @property
+    def _weights(self) -> int:
+        return len(self.start) if len(self.start) > 1 else 0
 
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
-        image = torch.cat([images[0], images[0] / images[1]], 1) if self.demodulate else images[0]
-        weight = (torch.sigmoid(prediction[:, :1]) + LEAST_TRUST) / (1 + images[0].abs().mean(1, keepdim=True))
+        image = images[0]
+        if self._weights:
+            image = mixed(torch.softmax(prediction[:, -self._weights :], 1), images[: self._weights])
+        weight = (torch.sigmoid(prediction[:, :1]) + LEAST_TRUST) / (1 + image.abs().mean(1, keepdim=True))
+        if self.demodulate:
+            image = image / images[-1]
         rest, taps = prediction[:, 1:], self.size**2
         filtered, shares = [], []
         for scale in range(self.scales):
@@ -210,16 +216,13 @@ class Pyramid(Head):
                 light, weight = avg_pool2d(image * weight, 2), avg_pool2d(weight, 2)
                 image, rest = light / weight, avg_pool2d(rest[:, taps + 1 :], 2)
             filtered.append(self._filtered(rest[:, :taps], image, weight))
-            shares.append(torch.sigmoid(rest[:, taps : taps + 1]))
+            if scale + 1 < self.scales:
+                shares.append(torch.sigmoid(rest[:, taps : taps + 1]))
         result = filtered.pop()
-        for fine, share in zip(reversed(filtered), reversed(shares[:-1]), strict=True):
+        for fine, share in zip(reversed(filtered), reversed(shares), strict=True):
             change = result - avg_pool2d(fine, 2)
             result = fine + share * interpolate(change, scale_factor=2.0, mode="bilinear", align_corners=False)
-        if self.demodulate:
-            blend = torch.sigmoid(prediction[:, -1:])
-            raw, light = result[:, :3], result[:, 3:] * images[1]
-            result = raw + blend * (light - raw)
-        return signed_log(result)
+        return signed_log(result * images[-1] if self.demodulate else result)
 
     def _filtered(self, logits: Tensor, image: Tensor, weight: Tensor) -> Tensor:
         """The means of an image (N, C, H, W) by kernels exp ``logits`` times the weights of its pixels."""
@@ -242,9 +245,13 @@ class Pyramid(Head):
         def halved(x: Any) -> Any:
             return op.AveragePool(x, kernel_shape=[2, 2], strides=[2, 2])
 
-        image = op.Concat(images[0], images[0] / images[1], axis=1) if self.demodulate else images[0]
-        bright = op.ReduceMean(abs(images[0]), [1], keepdims=1) + 1.0
-        weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / bright
+        image = images[0]
+        if self._weights:
+            logits = part(prediction, self.outputs - self._weights, self.outputs)
+            image = _mixed(op, op.Softmax(logits, axis=1), images[: self._weights])
+        weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / (op.ReduceMean(abs(image), [1], keepdims=1) + 1.0)
+        if self.demodulate:
+            image = image / images[-1]
         rest, taps, border = part(prediction, 1, self.outputs), self.size**2, [self.size // 2] * 4
         filtered, shares = [], []
         for scale in range(self.scales):
@@ -257,19 +264,26 @@ class Pyramid(Head):
             for tap, pixels in enumerate(_shifted(op, op.Pad(image, border, 0.0, [2, 3]), self.size)):
                 total = part(kernels, tap, tap + 1) * pixels + total
             filtered.append(total)
-            shares.append(op.Sigmoid(part(rest, taps, taps + 1)))
+            if scale + 1 < self.scales:
+                shares.append(op.Sigmoid(part(rest, taps, taps + 1)))
         result = filtered.pop()
         doubled = np.array([1, 1, 2, 2], np.float32)
-        for fine, share in zip(reversed(filtered), reversed(shares[:-1]), strict=True):
+        for fine, share in zip(reversed(filtered), reversed(shares), strict=True):
             change = result - halved(fine)
             result = fine + share * op.Resize(
                 change, None, doubled, mode="linear", coordinate_transformation_mode="half_pixel"
             )
-        if self.demodulate:
-            blend = op.Sigmoid(part(prediction, self.outputs - 1, self.outputs))
-            raw, light = part(result, 0, 3), part(result, 3, 6) * images[1]
-            result = raw + blend * (light - raw)
-        return op.signed_log(result)
+        return op.signed_log(result * images[-1] if self.demodulate else result)
+
+
+def mixed(weights: Tensor, images: list[Tensor]) -> Tensor:
+    """The sum of images (N, 3, H, W), each times its channel of ``weights`` (N, images, H, W)."""
+    return torch.stack([weights[:, i : i + 1] * image for i, image in enumerate(images)]).sum(0)
+
+
+def _mixed(op: Any, weights: Any, images: list[Any]) -> Any:
+    """The same as nodes of a graph."""
+    return op.Sum(*(op.Slice(weights, [i], [i + 1], [1]) * image for i, image in enumerate(images)))
 
 
 def _shifted(op: Any, image: Any, size: int) -> list[Any]:

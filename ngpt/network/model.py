@@ -11,8 +11,9 @@ from torch.nn.functional import avg_pool2d
 
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import features, inputs, padding
+from ngpt.network import features, inputs, padding, poisson
 from ngpt.network.heads import Head, head_of
+from ngpt.network.poisson import Poisson
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import DenseUNet, PlainUNet
 
@@ -21,6 +22,7 @@ NETWORKS = ("dense", "plain")
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Kernels reach no further than the padding.
 MAX_KERNEL = 2 * padding.MARGIN + 1
+MAX_SWEEPS = 64
 # Of ``quiet``: the side of the window, in pixels, over which noise is averaged, since the variance of one pixel knows
 # too little; what is added to radiance before noise is divided by it; the largest number whose square is no overflow.
 WINDOW, DARK, HUGE = 15, 0.01, 1e15
@@ -43,8 +45,12 @@ class ModelConfig:
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
                   ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel
-    ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of one image only
-    ``demodulate``  whether these average the image over the albedo, too; needs the input albedo, and ``scales``
+    ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of the
+                  weighted mean of these images
+    ``demodulate``  whether these average the image over the albedo, and multiply by it again; needs the input albedo,
+                  and ``scales``
+    ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
+                  network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
     ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
     """
@@ -59,6 +65,7 @@ class ModelConfig:
     kernel: int = 0
     scales: int = 1
     demodulate: bool = False
+    sweeps: int = 0
     optional: tuple[str, ...] = ()
     emission: bool = False
 
@@ -112,10 +119,21 @@ class ModelConfig:
             raise NgptError(f"kernel = {self.kernel}: there is no image to average; give a base, or start")
         if type(self.scales) is not int or not 1 <= self.scales <= levels:
             raise NgptError(f"scales = {self.scales!r}: must be from 1 to the {levels} levels of the network")
-        if self.scales > 1 and (len(self.start) != 1 or self.kernel < 3 or self.quiet):
-            raise NgptError(f"scales = {self.scales}: kernels of 3 pixels or more of one image, without quiet")
+        if self.scales > 1 and self.kernel < 3:
+            raise NgptError(f"scales = {self.scales}: needs kernels of 3 pixels or more")
         if type(self.demodulate) is not bool or (self.demodulate and (self.scales < 2 or "albedo" not in self.inputs)):
             raise NgptError(f"demodulate = {self.demodulate!r}: true or false; needs scales and the input albedo")
+        if type(self.sweeps) is not int or not 0 <= self.sweeps <= MAX_SWEEPS:
+            raise NgptError(f"sweeps = {self.sweeps!r}: must be a whole number up to {MAX_SWEEPS}, 0 for none")
+        if self.sweeps and not {"dx", *poisson.GRADIENTS[2:]} <= {*self.layers, *self.inputs}:
+            raise NgptError(
+                f"sweeps = {self.sweeps}: draw the image toward the gradients by their noise; needs the inputs "
+                "dx_noise and dy_noise, and dx and dy or inputs that are made of them"
+            )
+        if self.sweeps and levels < poisson.SCALES:
+            raise NgptError(
+                f"sweeps = {self.sweeps}: are at {poisson.SCALES} resolutions; the network has {levels} levels"
+            )
         if not isinstance(self.quiet, int | float) or isinstance(self.quiet, bool) or not 0 <= self.quiet < math.inf:
             raise NgptError(f"quiet = {self.quiet!r}: must be a finite relative standard error, 0 for none")
         if self.quiet and not {"base", "primal_se"} <= set(self.layers):
@@ -127,7 +145,8 @@ class ModelConfig:
     @property
     def head(self) -> Head:
         """What makes an image of the network's prediction."""
-        return head_of(self.start, self.kernel, self.scales, self.demodulate)
+        head = head_of(self.start, self.kernel, self.scales, self.demodulate)
+        return Poisson(self.start, head, self.sweeps) if self.sweeps else head
 
     @property
     def layers(self) -> tuple[str, ...]:
@@ -182,8 +201,9 @@ class Reconstructor(nn.Module):
     def radius(self) -> int:
         """How far, in pixels, an input's influence on the image reaches, beside exposure, depth scale and bounds."""
         head = self.config.head
-        # Kernels alone move pixels; a pyramid moves what the network says of them, too.
-        own = self.network.radius + head.reach if self.config.scales > 1 else max(self.network.radius, head.reach)
+        # Kernels alone move pixels; pyramids and sweeps move what the network says of them, too.
+        moves = self.config.scales > 1 or self.config.sweeps
+        own = self.network.radius + head.reach if moves else max(self.network.radius, head.reach)
         return max(own, WINDOW // 2 if self.config.quiet else 0)
 
     def forward(self, layers: Mapping[str, Tensor]) -> Tensor:

@@ -21,7 +21,15 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
-from ngpt.training.shards import CAUSTIC, GRADIENTS, OF_INPUTS, REFERENCE_CAUSTIC, Shard, tensor_names
+from ngpt.training.shards import (
+    CAUSTIC,
+    GRADIENTS,
+    OF_INPUTS,
+    REFERENCE_CAUSTIC,
+    REFERENCE_HALVES,
+    Shard,
+    tensor_names,
+)
 
 FORMAT, VERSION = "ngpt-dataset", 1
 MANIFEST = "manifest.json"
@@ -75,6 +83,16 @@ class Crop:
         if REFERENCE_CAUSTIC in self.shard.names:
             return self.shard.crop(REFERENCE_CAUSTIC, self.index)
         return np.zeros_like(self.reference_direct)
+
+    @property
+    def reference_halves(self) -> tuple[np.ndarray, ...]:
+        """Two independent images (H, W, 3) without direct emission and ``reference_caustic``; () if there are none.
+
+        Each is of half of the reference's samples. What they say alike of an image is no noise of theirs.
+        """
+        if REFERENCE_HALVES not in self.shard.names:
+            return ()
+        return tuple(self.shard.crop(REFERENCE_HALVES, self.index))
 
 
 class Dataset:
@@ -176,7 +194,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     shard, crops = Shard(path), entry["crops"]
     if not crops:
         return shard
-    names = tensor_names(*(not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC)))
+    gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
+    names = tensor_names(gradients, caustic, REFERENCE_HALVES in shard.names)
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
@@ -190,6 +209,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
             expected = (len(crops), inputs)
         elif name in OF_INPUTS:
             expected = (len(crops), inputs, height, width, OF_INPUTS[name])
+        elif name == REFERENCE_HALVES:
+            expected = (len(crops), 2, height, width, 3)
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):

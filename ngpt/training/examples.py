@@ -46,9 +46,14 @@ class Crop(Protocol):
     @property
     def reference_caustic(self) -> np.ndarray: ...
 
+    @property
+    def reference_halves(self) -> tuple[np.ndarray, ...]: ...
+
 
 class StackCrop:
     """The stacks of one folder and the reference they share."""
+
+    reference_halves = ()
 
     def __init__(self, folder: Path, stacks: list[Path], reference: Path):
         self.scene, self.inputs = folder.name, len(stacks)
@@ -231,6 +236,21 @@ class Examples(TorchDataset):
             )
         y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
         return {name: layer[..., y : y + self.size, x : x + self.size] for name, layer in layers.items()}
+
+
+def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
+    """What errors of such a network are measured by, (H, W, 3) each: two independent halves, or the one target.
+
+    A product of the errors to two halves is free of their noise, see ``ngpt.measure.metrics``.
+    """
+    halves = crop.reference_halves
+    if not halves:
+        return (target_of(crop, config),)
+    # Halves have no image of the layer of their own; for networks without gradients that of all samples counts.
+    beside = np.zeros_like(halves[0]) if config.reads_gradients else crop.reference_caustic
+    if config.emission:
+        beside = beside + crop.reference_direct
+    return tuple(half + beside for half in halves)
 
 
 def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:

@@ -24,8 +24,8 @@ class LossSettings:
                      "l1" for none
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
-    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``
-                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0
+    ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
+                     weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
     ``backbone``, ``weights``  files of E-LPIPS (docs/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -38,6 +38,7 @@ class LossSettings:
     logarithmic: float = 0.0
     huber: float = 0.0
     pyramid: float = 0.0
+    flip: float = 0.0
     backbone: str = ""
     weights: str = ""
 
@@ -72,6 +73,7 @@ class Loss:
             ("logarithmic", s.logarithmic, pixelwise.logarithmic),
             ("huber", s.huber, pixelwise.huber),
             ("pyramid", s.pyramid, pixelwise.pyramid),
+            ("flip", s.flip, pixelwise.flip),
         ):
             if weight:
                 parts[name] = function(prediction, target)

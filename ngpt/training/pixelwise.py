@@ -4,11 +4,14 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d
 
+from ngpt.measure.distances import flip as _flip
 from ngpt.measure.distances.perceptual import tone_mapped
 from ngpt.network.transfer import signed_log, srgb
 
 # Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
+# Of ``flip``: the typical radiance over the exposure is 4, white at the first; at the last 32 times as much is.
+_WHITES = (0.25, 0.0078)
 
 
 def l1(prediction: Tensor, target: Tensor) -> Tensor:
@@ -64,3 +67,11 @@ def pyramid(prediction: Tensor, target: Tensor) -> Tensor:
                 a, b = (avg_pool2d(image, 2, ceil_mode=True) for image in (a, b))
             total = total + (a - b).abs().mean()
     return total / (_SCALES * len(_EXPOSURES))
+
+
+def flip(prediction: Tensor, target: Tensor) -> Tensor:
+    """Mean HDR-FLIP in [0, 1), the larger at two exposures: what a viewer sees who flips between both.
+
+    It sees what the eye resolves, and weighs it as Lab does [Andersson et al. 2020 and 2021].
+    """
+    return _flip.flip(prediction, target, _WHITES)

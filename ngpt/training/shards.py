@@ -10,6 +10,7 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     caustic, caustic_se         all three or none: light that dx and dy hold nothing of
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
+    reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
     spp                         (N, K) samples per pixel, int32
 
 A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured crop by crop, and of floats elsewhere.
@@ -38,6 +39,7 @@ CAUSTIC = {"caustic": 3, "caustic_se": 3}
 OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC
 REFERENCES = ("reference_indirect", "reference_direct")
 REFERENCE_CAUSTIC = "reference_caustic"
+REFERENCE_HALVES = "reference_halves"
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -48,7 +50,8 @@ class CropData:
     """One crop as it was rendered: K finite stacks, and the converged image.
 
     ``reference`` is all of it, ``reference_direct`` the emission seen directly in it, and ``reference_caustic`` what
-    the layer ``caustic`` of the stacks estimates; None where they have no such layer.
+    the layer ``caustic`` of the stacks estimates; None where they have no such layer. ``halves`` are two independent
+    images, each of half of the reference's samples, without ``reference_caustic``; () where it was not made so.
     """
 
     stacks: Sequence[GradientStack]
@@ -56,6 +59,7 @@ class CropData:
     reference: np.ndarray
     reference_direct: np.ndarray
     reference_caustic: np.ndarray | None = None
+    halves: tuple[np.ndarray, ...] = ()
 
     def tensors(self) -> dict[str, np.ndarray]:
         inputs = [_input_tensors(stack) for stack in self.stacks]
@@ -65,13 +69,15 @@ class CropData:
         if self.reference_caustic is not None:
             tensors["reference_indirect"] = tensors["reference_indirect"] - self.reference_caustic
             tensors[REFERENCE_CAUSTIC] = self.reference_caustic
+        if self.halves:
+            tensors[REFERENCE_HALVES] = np.stack(self.halves) - self.reference_direct
         tensors["spp"] = np.array(self.spp, np.int32)
         return tensors
 
 
-def tensor_names(gradients: bool, caustic: bool = False) -> tuple[str, ...]:
-    """The tensors of a shard whose inputs have gradients, or have none; and the layer ``caustic``, or not."""
-    further = (*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()
+def tensor_names(gradients: bool, caustic: bool = False, halves: bool = False) -> tuple[str, ...]:
+    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and halves."""
+    further = (*((*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()), *((REFERENCE_HALVES,) if halves else ()))
     return (*INPUTS, *(GRADIENTS if gradients else ()), *further, *REFERENCES, "spp")
 
 

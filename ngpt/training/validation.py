@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from ngpt.measure.images import middle
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.network.inputs import base_image
 from ngpt.network.model import Reconstructor
@@ -16,7 +17,7 @@ from ngpt.repair import repair
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.files import atomic_output
-from ngpt.training.examples import target_of
+from ngpt.training.examples import judges_of
 
 # Rows of the picture of a validation.
 _PICTURES = 6
@@ -25,6 +26,8 @@ _PICTURES = 6
 @dataclass(frozen=True)
 class Scores:
     """Geometric means, over the views, of the trimmed relMSE; with direct emission if the network reads it.
+
+    Where the data have two halves of a reference, the noise of the reference is no part of it.
 
     ``primal``, ``base``  of the input and of what the network starts from (NaN without)
     ``network``           of its result
@@ -54,15 +57,16 @@ def validate(
     shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
     for index, (crop, k) in enumerate(views):
         data = repair(crop.stack(k), model.config.reads_gradients)
-        reference = target_of(crop, model.config)
+        halves = judges_of(crop, model.config)
+        reference = middle(halves)
         layers = {name: layer[None].to(device) for name, layer in layers_of(data, model.config).items()}
         with torch.autocast(device.type, torch.bfloat16, enabled=precision == "bfloat16"):
             image = model(layers)[0].permute(1, 2, 0).float().cpu().numpy()
         given = layers["primal"][0].permute(1, 2, 0).cpu().numpy()
-        primal.append(relmse_trimmed(given, reference))
-        network.append(relmse_trimmed(image, reference))
+        primal.append(relmse_trimmed(given, *halves))
+        network.append(relmse_trimmed(image, *halves))
         if model.config.base:
-            base.append(relmse_trimmed(base_image(data, model.config.base), reference))
+            base.append(relmse_trimmed(base_image(data, model.config.base), *halves))
         if picture and index in shown:
             stops = auto_exposure(reference)
             rows.append(np.hstack([to_srgb8(i, stops) for i in (given, image, reference)]))

@@ -241,6 +241,10 @@ def test_tiny(renderer, tmp_path):
     assert len(data) == 4 and problems(tmp_path / "a") == problems(tmp_path / "b") == []
     for one, other in zip(data, Dataset(tmp_path / "b"), strict=True):
         np.testing.assert_array_equal(one.reference, other.reference)
+        a, b = one.reference_halves
+        whole = one.reference - one.reference_direct - one.reference_caustic
+        # Independent, and what they have in common is the reference.
+        assert 0 < np.abs((a + b) / 2 - whole).mean() < np.abs(a - b).mean()
         for k in range(one.inputs):
             for name in one.stack(k).names:
                 np.testing.assert_array_equal(one.stack(k)[name], other.stack(k)[name])

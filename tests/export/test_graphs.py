@@ -20,7 +20,8 @@ from ngpt.export.graphs.repair import clean, repaired
 from ngpt.network import features as torch_features
 from ngpt.network import padding as torch_padding
 from ngpt.network import transfer as torch_transfer
-from ngpt.network.heads import Direct, Kernels, Mixture, Residual
+from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
+from ngpt.network.poisson import GRADIENTS, Poisson
 from ngpt.network.run import WEIGHTS
 from ngpt.repair import repair as numpy_repair
 from ngpt.stack import GradientStack
@@ -193,6 +194,30 @@ def test_heads_are_the_same_as_graphs(head):
     expected = head.forward(prediction, images).numpy()
     graph = lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others))  # noqa: E731
     assert np.allclose(evaluate(graph, prediction, *images), expected, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "head",
+    [
+        Poisson(("base",), Residual(("base",)), 1),
+        Poisson(("primal",), Kernels(("primal",), 3), 1),
+        Poisson(("primal", "base"), Mixture(("primal", "base")), 3),
+        Poisson(("primal",), Pyramid(("primal",), 3, 3, True), 2),
+        Poisson(("primal", "base"), Pyramid(("primal", "base"), 3, 2, True), 2),
+    ],
+    ids=lambda head: type(head.inner).__name__,
+)
+def test_sweeps_are_the_same_as_graphs(head):
+    torch.manual_seed(0)
+    r, sides = head.radius, (16 + 2 * head.radius, 24 + 2 * head.radius)
+    prediction = 2 * torch.randn(2, head.outputs, 16, 24)
+    gradients = [torch.randn(2, 3, *sides), torch.randn(2, 3, *sides), *torch.rand(2, 2, 1, *sides)]
+    gradients[2][..., r + 3, :] = 0
+    images = [0.1 + 3 * torch.rand(2, 3, *sides) for _ in head.inner.reads] + gradients
+    assert len(images) == len(head.reads) and head.reads[-4:] == GRADIENTS
+    expected = head.forward(prediction, images).numpy()
+    graph = lambda first, *others: head.graph(_OperatorsOfHeads(), first, list(others))  # noqa: E731
+    assert np.allclose(evaluate(graph, prediction, *images), expected, rtol=1e-4, atol=1e-5)
 
 
 def test_expressions():

@@ -120,6 +120,7 @@ class _Crop:
         return full_stack(16, 16)
 
     reference = property(lambda self: self.stack(0)["primal"])
+    reference_halves = ()
     reference_direct = reference_caustic = property(lambda self: np.zeros((16, 16, 3), np.float32))
 
 

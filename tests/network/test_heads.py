@@ -119,13 +119,13 @@ def pyramid(demodulate=False, size=3, scales=3):
     return Pyramid(("primal",), size, scales, demodulate)
 
 
-def everywhere(head, trust=0.0, share=0.0, blend=0.0, size=(16, 24)):
-    """A prediction of flat kernels with the same trust, shares and blend in every pixel."""
+def everywhere(head, trust=0.0, share=0.0, size=(16, 24)):
+    """A prediction of flat kernels with the same trust and shares in every pixel."""
     prediction = torch.zeros(1, head.outputs, *size)
     taps = head.size**2
     for scale in range(head.scales - 1):
         prediction[:, 1 + scale * (taps + 1) + taps] = share
-    prediction[:, 0], prediction[:, -1] = trust, blend
+    prediction[:, 0] = trust
     return prediction
 
 
@@ -169,8 +169,9 @@ def test_texture_of_the_albedo_is_not_averaged():
     albedo = 0.05 + 0.9 * torch.rand(1, 3, 16, 24)
     image = 3 * albedo
     assert head.reads == ("primal", "reflectance")
-    kept = of_kernels(everywhere(head, blend=50), [image, albedo], head)
-    lost = of_kernels(everywhere(head, blend=-50), [image, albedo], head)
+    kept = of_kernels(everywhere(head), [image, albedo], head)
+    plain = pyramid()
+    lost = of_kernels(everywhere(plain), [image], plain)
     assert torch.allclose(kept, image, rtol=1e-4) and (lost - image).abs().mean() > 0.3
 
 
@@ -218,7 +219,7 @@ def test_a_pyramid_learns(tmp_path):
     [
         ({"scales": 0}, "must be from 1 to the 3 levels of the network"),
         ({"scales": 4}, "must be from 1 to the 3 levels of the network"),
-        ({"kernel": 1}, "kernels of 3 pixels or more of one image"),
+        ({"kernel": 1}, "needs kernels of 3 pixels or more"),
         ({"start": ()}, "there is no image to average"),
         ({"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
         ({"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),

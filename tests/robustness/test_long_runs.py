@@ -44,7 +44,7 @@ from pathlib import Path
 from data_gen.dataset import jobs
 from data_gen.dataset.config import read_config
 config = replace(
-    read_config(Path("configs/data-tiny.toml")), size=16, spp=(2, 2), inputs=1, reference_spp=2, crops_per_shard=8,
+    read_config(Path("configs/data-tiny.toml")), size=16, spp=(2, 2), inputs=1, reference_spp=4, crops_per_shard=8,
     scenes=int(sys.argv[2]), crops=int(sys.argv[3]),
 )
 from data_gen.dataset import crops

@@ -21,6 +21,7 @@ class SyntheticCrop:
         self.reference = image.astype(np.float32)
         self.reference_direct = np.zeros_like(self.reference)
         self.reference_caustic = np.zeros_like(self.reference)
+        self.reference_halves = ()
         self.features = {
             "albedo": np.clip(self.reference, 0, 1),
             "normal": np.broadcast_to(np.float32([0, 0, 1]), image.shape),

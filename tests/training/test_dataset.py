@@ -11,13 +11,13 @@ import pytest
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
-from ngpt.training.dataset import FORMAT, VERSION, Dataset, problems
+from ngpt.training.dataset import FORMAT, VERSION, Crop, Dataset, problems
 from ngpt.training.shards import MAX_LOSS, CropData, Shard, smallest_float, write_shard
 
 pytest.importorskip("safetensors")
 
 
-def crop_data(rng, scale=1.0, inputs=2, size=8, caustic=False):
+def crop_data(rng, scale=1.0, inputs=2, size=8, caustic=False, halves=False):
     def layers():
         made = {name: scale * rng.random((size, size, 3)) for name in ("direct", "dx", "dy")}
         made["primal"] = made["direct"] + scale * rng.random((size, size, 3))
@@ -35,7 +35,8 @@ def crop_data(rng, scale=1.0, inputs=2, size=8, caustic=False):
     direct = np.float32(scale * rng.random((size, size, 3)))
     light = np.float32(scale * rng.random((size, size, 3))) if caustic else None
     reference = direct + np.float32(scale) + (light if caustic else 0)
-    return CropData(stacks, [2, 9][:inputs], reference, direct, light)
+    apart = tuple(direct + np.float32(scale * rng.random((size, size, 3))) for _ in range(2 * halves))
+    return CropData(stacks, [2, 9][:inputs], reference, direct, light, apart)
 
 
 @pytest.fixture
@@ -56,6 +57,29 @@ def folder(tmp_path, rng):
     manifest = {"format": FORMAT, "version": VERSION, "config": {}, "planned": 3, "shards": entries}
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     return tmp_path, given
+
+
+def test_halves_of_references_are_read_back_and_judge(tmp_path, rng):
+    """Each is without direct emission; beside it stands what the network is to make of it."""
+    crop = crop_data(rng, caustic=True, halves=True)
+    write_shard(tmp_path / "x.safetensors", [crop, crop], {"scene": "a"})
+    read = Crop(Shard(tmp_path / "x.safetensors"), 1, "a", (2, 9))
+    light = [half - crop.reference_direct for half in crop.halves]
+    np.testing.assert_allclose(read.reference_halves, light, atol=2e-3)
+    pytest.importorskip("torch")
+    from ngpt.network.model import ModelConfig
+    from ngpt.training.examples import judges_of
+
+    body = {"network": "plain", "channels": (4,), "units": ()}
+    with_gradients = ModelConfig(inputs=("primal", "dx", "dy"), **body)
+    np.testing.assert_allclose(judges_of(read, with_gradients), light, atol=2e-3)
+    colour = ModelConfig(inputs=("primal",), emission=True, **body)
+    beside = crop.reference_caustic + crop.reference_direct
+    np.testing.assert_allclose(judges_of(read, colour), [half + beside for half in light], atol=4e-3)
+    bare = crop_data(rng)
+    write_shard(tmp_path / "y.safetensors", [bare], {"scene": "a"})
+    read = Crop(Shard(tmp_path / "y.safetensors"), 0, "a", (2, 9))
+    assert read.reference_halves == () and len(judges_of(read, colour)) == 1
 
 
 def test_inputs_without_gradients(tmp_path, rng):
@@ -226,6 +250,7 @@ def test_shards_with_other_tensors_are_refused(folder):
         ({"dx": tensors["dx"][:, :1]}, r"tensor 'dx' is \(2, 1, 8, 8, 3\), it must be \(2, 2, 8, 8, 3\)"),
         ({"indirect": tensors["indirect"][0]}, r"tensor 'indirect' is \(2, 8, 8, 3\), and its crops have 2 inputs"),
         ({"albedo": tensors["albedo"].astype("f8")}, "tensor 'albedo' is of type F64"),
+        ({"reference_halves": tensors["indirect"][:, :1]}, r"'reference_halves' is \(2, 1, 8, 8, 3\), it must be"),
     ]:
         save_file(tensors | change, shard, record)
         resealed(path, "shards/a-000.safetensors")

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from ngpt.export.builder import END, Value, op
 from ngpt.export.graphs.repair import clean
 from ngpt.export.graphs.transfer import log_for_networks, signed_log, signed_log_for_networks
-from ngpt.network.features import DARKEST, ENLARGED, IMAGES, LEAST_DEPTH, NOISE_ENLARGED, RADIANCE, SOURCES, compared
+from ngpt.network.features import ENLARGED, GLOSS, IMAGES, LEAST_DEPTH, NOISE_ENLARGED, RADIANCE, SOURCES, compared
 
 
 def normalised(finite: Mapping[str, Value], names: tuple[str, ...], exposure: Value, depth: Value) -> dict[str, Value]:
@@ -45,8 +45,7 @@ def _computed(name: str, layers: Mapping[str, Value], compared_with: str) -> Val
 
 def reflectance(albedo: Value) -> Value:
     """What radiance may be divided by, see ``ngpt.network.features.reflectance``."""
-    known = op.Greater(op.ReduceMax(albedo, [1], keepdims=1), 0.0)
-    return op.Where(known, op.Max(albedo, DARKEST), 1.0)
+    return albedo + GLOSS
 
 
 def encoded(name: str, layer: Value) -> Value:

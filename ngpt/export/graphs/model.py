@@ -23,7 +23,7 @@ _VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 
 class _OperatorsOfHeads(Operators):
-    signed_log = staticmethod(signed_log)
+    signed_exp, signed_log = staticmethod(signed_exp), staticmethod(signed_log)
 
 
 def layers(config: ModelConfig) -> tuple[str, ...]:
@@ -63,10 +63,10 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
     prediction = graph.include(network, "network/", op.Concat(*padded, axis=1))
 
     head = config.head
-    read = dict(scaled)
+    read = dict(completed)
     if "reflectance" in head.reads:
         read["reflectance"] = features.reflectance(scaled["albedo"])
-    images = [mirror.extended(read[name], head.radius) for name in head.reads]
+    images = [mirror.extended(read[name], head.radius, name) for name in head.reads]
     logarithm = mirror.crop(head.graph(_OperatorsOfHeads(), prediction, images))
     if config.quiet:
         base = signed_log(scaled["base"])

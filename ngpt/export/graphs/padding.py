@@ -48,9 +48,9 @@ class Mirror:
         sizes = op.Concat(op.Reshape(self.rows.size, [1]), op.Reshape(self.columns.size, [1]), axis=0)
         return op.Slice(image, [MARGIN] * 2, sizes + [MARGIN] * 2, [2, 3])
 
-    def extended(self, image: Value, radius: int) -> Value:
-        """An image padded, with ``radius`` more pixels on every side, see ``ngpt.network.padding.extended``."""
-        padded = self.pad(image)
+    def extended(self, layer: Value, radius: int, name: str = "") -> Value:
+        """A layer padded, with ``radius`` more pixels on every side, see ``ngpt.network.padding.extended``."""
+        padded = self.pad(layer, name)
         return op.Pad(padded, [radius] * 4, None, [2, 3], mode="edge") if radius else padded
 
 
