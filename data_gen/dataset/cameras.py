@@ -99,9 +99,13 @@ class Surroundings:
         passed = mi.Float(0)
         for _ in range(MOST_BOUNDARIES if self.boundaries and not boundaries else 0):
             behind = si.is_valid() & is_boundary(si.bsdf())
+            # Asked each time: all steps are one small kernel.
+            if not dr.any(behind):
+                break
             passed += dr.select(behind, si.t, 0)
             ray = dr.select(behind, si.spawn_ray(ray.d), ray)
             si = dr.select(behind, self.scene.ray_intersect(ray, behind), si)
+            dr.eval(si, ray, passed)
         identity = dr.reinterpret_array(mi.UInt32, si.shape)
         return np.array(si.t + passed), np.array(si.n).T, np.array(identity)
 

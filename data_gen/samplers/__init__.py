@@ -118,7 +118,7 @@ def _refused_by_gpt_simple(facts: Facts) -> str:
 def _notes_on_replay(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', replayed as a whole"]
     if facts.media:
-        lines.append("media: replayed with everything else; albedo counts them, normal and depth are those of surfaces behind")
+        lines.append("media: replayed with everything else; albedo counts them, normal and depth do not")
     return lines
 
 

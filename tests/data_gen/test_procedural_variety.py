@@ -144,23 +144,38 @@ def test_each_kind_renders(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("kind", ["fog", "smoke"])
-def test_cameras_are_found_in_media_and_see_through_their_boundaries(renderer, tmp_path, monkeypatch, kind):
+def test_cameras_are_found_beside_media_and_see_through_their_boundaries(renderer, kind):
+    """A camera's medium is said once: those in fog stay in it, those outside of smoke stay outside."""
     from data_gen.dataset.cameras import Surroundings, find_view
-    from data_gen.scenes.load import load_scene
+    from data_gen.scenes.builtin import _box, _camera, _diffuse, _sphere, _volume, _wall
 
-    only(monkeypatch, "media", kind=kind)
-    scene = load_scene(str(make_scene((2, 1), tmp_path, varied=True)))
+    low, high = ([-3, -0.5, -3], [3, 3, 3]) if kind == "fog" else ([-0.5, 0, -0.5], [0.5, 2, 0.5])
+    air = {"type": "homogeneous", "sigma_t": 0.3, "albedo": 0.8}
+    lens = {"type": "thinlens", "aperture_radius": 0.01, "focus_distance": 2.0}
+    things = {
+        f"ball{i}": _sphere([1.8 * np.sin(i), 0.3, 1.8 * np.cos(i)], 0.3, _diffuse(0.5, 0.5, 0.5)) for i in range(7)
+    }
+    scene = renderer.load_dict(
+        {
+            "type": "scene",
+            "sensor": _camera([0.2, 1, 2.6], [0, 0.5, 0], 60) | lens,
+            "floor": _wall([0, 0, 0], [0, 1, 0], (20, 20), _diffuse(0.5, 0.5, 0.5)),
+            "block": _box([0.2, 0.6, 0], [0.3, 1.2, 0.3], 10, _diffuse(0.5, 0.5, 0.5)),
+            "medium": _volume((low, high), air),
+            **things,
+        }
+    )
     around, rng = Surroundings(scene), np.random.default_rng(0)
-    boxes = [shape.bbox() for shape in scene.shapes() if shape.is_medium_transition()]
-    assert around.boundaries and boxes
-    for _ in range(3):
+    for _ in range(4):
         origin = np.array(find_view(around, rng, 32, 20, 0.005).origin)
-        within = [np.all(origin > np.array(box.min)) and np.all(origin < np.array(box.max)) for box in boxes]
-        # The camera's medium is that of its ray's start: in fog always, and never in smoke.
-        assert all(within) if kind == "fog" else not any(within)
-    towards = np.tile([0.0, 0.0, 1.0], (1, 1))
-    outside = np.array([[0.0, 0.5, -30.0]])
-    assert around.cast(outside, towards, boundaries=True)[0] <= around.cast(outside, towards)[0]
+        assert np.all((origin > low) & (origin < high)) == (kind == "fog")
+    start, towards = np.array([[0.2, 0.6, -9.0]]), np.array([[0.0, 0.0, 1.0]])
+    assert around.cast(start, towards, boundaries=True)[0] == pytest.approx(9 + low[2], abs=1e-3)
+    distance, normal, _ = around.cast(start, towards)
+    # The block, turned by 10 degrees, or a ball before it.
+    assert 9 + low[2] + 0.2 < distance[0] < 9 and normal[0, 2] < -0.5
+    up = np.array([[0.0, 1.0, 0.0]])
+    assert np.isinf(around.cast(start, up)[0])
 
 
 @pytest.mark.slow
