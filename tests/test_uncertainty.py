@@ -1,5 +1,8 @@
 """The standard error of a reconstruction: what it says of noise, of scale, and of what a stack must hold."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -7,7 +10,7 @@ import ngpt
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
-from ngpt.uncertainty import FACTORS, change, noisier
+from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
 
 
 @pytest.fixture
@@ -100,3 +103,25 @@ def test_the_command_writes_the_layer(stack, tmp_path):
     assert "error" not in ngpt.read(tmp_path / "again.exr")
     assert main(["denoise", str(out), "-o", str(tmp_path / "third.exr"), "-m", "primal", "--error"]) == 0
     assert not np.array_equal(ngpt.read(tmp_path / "third.exr")["error"], expected.error)
+
+
+def test_the_page_has_the_numbers_of_the_benchmark():
+    from bench.uncertainty import line
+
+    root = Path(__file__).parents[1]
+    methods = json.loads((root / "bench" / "results" / "uncertainty.json").read_text())["methods"]
+    page = (root / "docs" / "uncertainty.md").read_text()
+    assert FACTORS.keys() <= methods.keys()
+    for name, row in methods.items():
+        assert row["factor"] == FACTORS.get(name, FACTOR), f"{name}: run python -m bench.uncertainty"
+        assert line(name, row) in page
+
+
+def test_coverage_counts_the_noise_of_the_reference():
+    from bench.uncertainty import covered, miss
+
+    rng = np.random.default_rng(0)
+    error, noise = 0.3 * rng.standard_normal(100_000), 0.4 * rng.standard_normal(100_000)
+    one = (error + noise, np.full(100_000, 0.3), np.full(100_000, 0.4**2))
+    assert covered(one, 1.0) == pytest.approx({"68": 0.683, "95": 0.95}, abs=0.01)
+    assert miss([one], 1.0) < 0.01 < miss([one], 2.0)

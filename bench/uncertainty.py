@@ -1,0 +1,126 @@
+"""How often the truth lies within one and within 1.96 standard errors of a result: by method, scene and samples.
+
+    python -m bench.uncertainty --scenes diffuse lens --checked glossy --cache STACKS -o bench/results/uncertainty.json
+
+Stacks and references are rendered into --cache where they are not there: SCENE-SPP.exr and SCENE-reference.exr. A scene
+is a built-in one, or a folder with scene.xml in it. References have noise; of the intervals for the difference of both,
+it is a part: their half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
+
+Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %; --checked are scenes
+that it is then checked on. A table is printed; the numbers are written as JSON.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import metadata, save
+from ngpt.errors import NgptError
+from ngpt.io.exr import read, write
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
+
+INTERVALS = {"68": (1.0, 0.683), "95": (1.96, 0.95)}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="*", default=["diffuse", "lens"], help="that factors are chosen on")
+    parser.add_argument("--checked", nargs="*", default=["glossy", "environment"], help="that they are checked on")
+    parser.add_argument("--methods", nargs="*", default=[name for name, m in METHODS.items() if not m.missing()])
+    parser.add_argument("--spp", type=int, nargs="*", default=[4, 16])
+    parser.add_argument("--reference", type=int, default=1024, metavar="SPP")
+    parser.add_argument("--size", type=int, nargs=2, default=(192, 108), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--cache", type=Path, required=True, help="folder of stacks and references")
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/uncertainty.json"))
+    args = parser.parse_args()
+
+    result = {"benchmark": "uncertainty", "spp": args.spp, "chosen on": args.scenes, "checked on": args.checked}
+    result |= {"metadata": metadata("onnxruntime", "mitsuba-oidn"), "methods": {}}
+    for method in args.methods:
+        cases = {}
+        for scene in (*args.scenes, *args.checked):
+            for spp in args.spp:
+                try:
+                    cases[Path(scene).name, spp] = case(method, *images(scene, spp, args))
+                except NgptError as error:
+                    print(f"{method}, {scene}, {spp} spp: {error}", flush=True)
+        chosen, checked = (
+            [c for (scene, _), c in cases.items() if scene in {Path(s).name for s in names}]
+            for names in (args.scenes, args.checked)
+        )
+        if not chosen:
+            continue
+        best = min(np.geomspace(0.3, 6, 240), key=lambda factor: miss(chosen, float(factor)))
+        used = FACTORS.get(method, FACTOR)
+        row = {"best factor": round(float(best), 3), "factor": used}
+        row |= {"chosen": mean(chosen, used), "checked": mean(checked, used)}
+        row["cases"] = {f"{scene}, {spp} spp": covered(c, used) for (scene, spp), c in cases.items()}
+        result["methods"][method] = row
+        print(line(method, row), flush=True)
+        save(args.output, result)
+
+
+def images(scene: str, spp: int, args: argparse.Namespace) -> tuple[GradientStack, GradientStack]:
+    """The stack and the reference, rendered where they are not in the cache."""
+    name, found = Path(scene).name, []
+    for file, count, sampler in (
+        (f"{name}-{spp}.exr", spp, "auto"),
+        (f"{name}-reference.exr", args.reference, "primal"),
+    ):
+        path = args.cache / file
+        if not path.exists():
+            from data_gen.backend import use_variant
+
+            use_variant()
+            from data_gen.render import render_stack
+            from data_gen.scenes.load import load_scene
+
+            at = Path(scene) / "scene.xml"
+            loaded = load_scene(str(at) if at.exists() else scene, tuple(args.size))
+            args.cache.mkdir(parents=True, exist_ok=True)
+            write(path, render_stack(loaded, count, spp, sampler))
+        found.append(read(path))
+    return found[0], found[1]
+
+
+def case(method: str, stack: GradientStack, reference: GradientStack) -> tuple[np.ndarray, ...]:
+    """Of all values that show no lamp: difference to the reference, change by more noise, variance of the reference."""
+    image = reconstruct(stack, method).image
+    changed = change(image, reconstruct(noisier(stack), method).image)
+    shown = ~stack["direct"].any(axis=-1) if "direct" in stack else np.ones(image.shape[:2], bool)
+    variance = np.nan_to_num(reference["primal_var"])
+    return tuple(a[shown].astype(np.float64) for a in (image - reference["primal"], changed, variance))
+
+
+def covered(one: tuple[np.ndarray, ...], factor: float) -> dict[str, float]:
+    """The share of values within each interval."""
+    difference, changed, variance = one
+    width = np.sqrt((factor * changed) ** 2 + variance)
+    return {name: round(float(np.mean(np.abs(difference) <= k * width)), 4) for name, (k, _) in INTERVALS.items()}
+
+
+def mean(cases: list, factor: float) -> dict[str, float]:
+    each = [covered(one, factor) for one in cases]
+    return {name: round(float(np.mean([c[name] for c in each])), 4) for name in INTERVALS} if each else {}
+
+
+def miss(cases: list, factor: float) -> float:
+    found = mean(cases, factor)
+    return sum(abs(found[name] - wanted) for name, (_, wanted) in INTERVALS.items())
+
+
+def line(method: str, row: dict) -> str:
+    """A row of a table in Markdown: factor, coverage in the mean, and over scenes and samples from least to most."""
+    cells = [f"| `{method}` | {row['factor']} | {row['best factor']:.2f}"]
+    for name in INTERVALS:
+        each = [one[name] for one in row["cases"].values()]
+        checked = f"{100 * row['checked'][name]:.0f}" if row["checked"] else ""
+        cells.append(f"{100 * row['chosen'][name]:.0f} | {checked} | {100 * min(each):.0f} .. {100 * max(each):.0f}")
+    return " | ".join(cells) + " |"
+
+
+if __name__ == "__main__":
+    main()
