@@ -273,9 +273,8 @@ def next_surface(scene):
     return lambda ray, medium, active: scene.ray_intersect_preliminary(ray, active=active)
 
 
-def transmittance(scene, media: Media, x, place: Place, target: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
-    """Of the way from vertex ``x`` to the point ``target``, which is on a surface or far away; 0 where it is blocked."""
-    ray = x.spawn_ray_to(target)
+def transmittance(scene, media: Media, x, place: Place, ray, target: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
+    """Of the way along ``ray``, from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
     medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
     if not media.boundaries:
         return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(majorant(medium, ray, active), reach)))

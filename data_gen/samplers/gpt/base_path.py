@@ -85,13 +85,13 @@ def base_step(
     # Toward the emitter and along a new direction at once
     f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
     # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
+    shadow_ray, T_light = x.spawn_ray_to(light.p), None
     asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
-    T_light = None
     if plan.media:
-        T_light = media.transmittance(scene, plan.media, x, place, light.p, asked)
+        T_light = media.transmittance(scene, plan.media, x, place, shadow_ray, light.p, asked)
         lit &= dr.max(T_light) > 0
     else:
-        lit &= ~scene.ray_test(x.spawn_ray_to(light.p), asked)
+        lit &= ~scene.ray_test(shadow_ray, asked)
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
     if plan.media:
@@ -140,10 +140,10 @@ def base_step(
             chain, follows = advance(chain, depth, event, goes_on, x_connectable, survival, late, x1, Le)
             caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
-        sharp = plan.materials.sharp(x1, scene)
+        smooth, sharp = kind == SMOOTH, plan.materials.sharp(x1, scene)
         if plan.media:
             sharp &= ~segment.place.scatters
-        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, sharp)
+        ends_late = late | caustic.ends_late(smooth, x_connectable, sharp)
     step = Step(
         x=x,
         x_connectable=x_connectable,

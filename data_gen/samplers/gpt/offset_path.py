@@ -154,7 +154,8 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     # Each path has its own m: from y, the emitter is found with other densities than from x.
     if plan.media:
         L_light = f * light.weight
-        T = media.transmittance(scene, plan.media, y, path.place, light.target, dr.max(L_light) > 0)
+        shadow_ray, asked = y.spawn_ray_to(light.target), dr.max(L_light) > 0
+        T = media.transmittance(scene, plan.media, y, path.place, shadow_ray, light.target, asked)
         L_light *= T * light_mis(light.delta, light.p, p)
     else:
         L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
@@ -279,12 +280,12 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     # --------------- Next vertex, and Le there -------------------
     seen = move.seen if not plan.hides else move.seen | (kind != NULL)
     ray = y.spawn_ray(y.to_world(wo))
-    place, in_medium = move.place, mi.Bool(False)
+    place = move.place
     if plan.media:
         # The same number, which meets other media, has the same density all the same.
         trace, medium = media.next_surface(scene), place.toward(y, ray.d)
         segment = media.fly(scene, plan.media, trace, ray, medium, step.channel, step.u_distance, found)
-        ray, hit, place, in_medium = segment.ray, segment.hit, segment.place, segment.place.scatters
+        ray, hit, place = segment.ray, segment.hit, segment.place
         y1, f_p = media.vertex(ray, hit, place), f_p * segment.weight
     else:
         hit = scene.ray_intersect_preliminary(ray, active=found)
@@ -292,16 +293,19 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     reaches = found & y1.is_valid()
     Le, p_light = emission(scene, y1, y, reaches | (found & seen), found & (kind == SMOOTH))
     # Reject what would not be shifted back, or the weights of the pair would not sum to 1 (survey, section 3.5).
-    inverts = shift.replay_inverts(
-        kind, connectable, ~reaches | in_medium | plan.materials.connectable(y1.bsdf()), step.x_connectable
-    )
+    y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf())
+    if plan.media:
+        y1_connectable |= place.scatters
+    inverts = shift.replay_inverts(kind, connectable, y1_connectable, step.x_connectable)
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
     # A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
-        sharp = plan.materials.sharp(y1, scene) & ~in_medium
-        allowed &= ~(late | caustic.ends_late(kind == SMOOTH, connectable, sharp))
+        smooth, sharp = kind == SMOOTH, plan.materials.sharp(y1, scene)
+        if plan.media:
+            sharp &= ~place.scatters
+        allowed &= ~(late | caustic.ends_late(smooth, connectable, sharp))
     return Move(
         ray=ray,
         hit=hit,
