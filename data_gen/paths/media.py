@@ -1,20 +1,9 @@
-"""Media between the vertices of a path: where a path scatters in them, and how much light comes through.
+"""Media, and the vertices of paths in them.
 
 A vertex of a path is on a surface or in a medium. One in a medium is a ``SurfaceInteraction3f`` too, of no shape, with a
 normal of 0 and the world's axes for a frame, so that what holds for any vertex is written once; its ``Place`` says
-which of the two it is. A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries,
-which bend nothing and reflect nothing: surfaces of the material ``null`` that are no lamps. These are no vertices.
-
-    σ, σs, σn   extinction, scattering and null-collision coefficients, one for each colour
-    μ           majorant: at least σ, constant in a medium, σ itself in a homogeneous one
-    τ           optical depth of a segment by the majorants of its media
-    c           the colour by which the distances of a path are sampled, the same for all five paths
-
-Distances are sampled as optical depths: a collision comes at every exponentially distributed step of τ in colour c, so
-one number decides where a path first collides, through whatever media it goes. Nothing of what is here is compiled
-into the kernel of a scene without media.
-
-[Hua et al. 2019, section 7.1; docs/media.md]
+which of the two it is. The ways between vertices are in ``data_gen.paths.segments``. Nothing of either is compiled into
+the kernel of a scene without media.
 """
 
 from __future__ import annotations
@@ -26,6 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.vertex import evaluate
+from data_gen.scenes.facts import media_of
 
 
 @dataclass
@@ -41,25 +31,15 @@ class Place:
         return dr.select(changes, x.target_medium(d), self.medium)
 
 
-@dataclass
-class Segment:
-    """What is met along a ray: a vertex in a medium, one on a surface, or nothing."""
-
-    ray: mi.Ray3f  # its last piece, behind the last boundary
-    hit: mi.PreliminaryIntersection3f  # of that piece; its distance is that of the vertex, in a medium too
-    place: Place
-    weight: mi.Spectrum  # transmittance, times σs in a medium, over the density in colour c
-    σ: mi.Spectrum  # albedo by colour c, σs / σ_c, in a medium, else 1
-    τ_c: mi.Float
-
-
 class Media:
     """Facts about the media of a scene.
 
-    ``boundaries``  whether there are index-matched ones
+    ``boundaries``  whether there are surfaces that rays go straight through: see ``index_matched()``
+    ``grids``       whether there are media whose density varies
     """
 
     def __init__(self, scene: mi.Scene):
+        self.grids = any(not medium.is_homogeneous() for medium in media_of(scene))
         matched = {dr_number(shape): index_matched(shape) for shape in scene.shapes()}
         table = np.zeros(max(matched, default=0) + 1, bool)
         table[list(matched)] = list(matched.values())
@@ -74,7 +54,7 @@ class Media:
 
 
 def index_matched(shape: mi.Shape) -> bool:
-    """Whether light goes through as if the surface were not there."""
+    """Whether light goes through as if the surface were not there: its material is ``null``, and it is no lamp."""
     bsdf = shape.bsdf()
     if bsdf is None or shape.is_emitter() or not mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null):
         return False
@@ -164,7 +144,7 @@ def scattered(x, place: Place, u_lobe, u_direction, sample, f_p) -> tuple[mi.BSD
     return dr.select(place.scatters, own, sample), dr.select(place.scatters, weight, f_p)
 
 
-# ------------------------------ Segments ------------------------------
+# ------------------------- Colours and pieces -------------------------
 
 
 def choose_channel(u: mi.Float) -> mi.UInt32:
@@ -181,59 +161,19 @@ def pick(value: mi.Spectrum, channel: mi.UInt32) -> mi.Float:
     return dr.select(channel == 0, value[0], dr.select(channel == 1, value[1], value[2]))
 
 
-def majorant(medium: mi.MediumPtr, ray: mi.Ray3f, active: mi.Bool) -> mi.Spectrum:
-    """μ, 0 outside of all media."""
+def extinction(medium: mi.MediumPtr, ray: mi.Ray3f) -> mi.Spectrum:
+    """σ of a homogeneous medium, 0 outside of all media."""
     where = dr.zeros(mi.MediumInteraction3f, dr.width(ray.o))
     where.p, where.wavelengths = ray.o, ray.wavelengths
-    return dr.select(medium != None, medium.get_majorant(where, active), 0)  # noqa: E711 - an array of pointers
+    return dr.select(medium != None, medium.get_majorant(where), 0)  # noqa: E711 - an array of pointers
 
 
-def depth(μ: mi.Spectrum, distance: mi.Float) -> mi.Spectrum:
+def depth(σ: mi.Spectrum, distance: mi.Float) -> mi.Spectrum:
     """τ of a piece, which may be infinitely long where there is no medium."""
-    return dr.select(μ > 0, μ * distance, 0)
+    return dr.select(σ > 0, σ * distance, 0)
 
 
-def fly(scene, media: Media, trace, ray, medium, channel, u, active) -> Segment:
-    """The segment along ``ray``, from within ``medium``, with the distance of the random number ``u``.
-
-    ``trace`` (ray, medium, active) finds the next surface, as ``next_surface()`` does.
-    """
-    ray, hit, medium, scatters, τ = fly_on(scene, media, trace, ray, medium, channel, u, active)
-    here = dr.zeros(mi.MediumInteraction3f, dr.width(hit.t))
-    here.p, here.wavelengths, here.medium, here.t = ray(hit.t), ray.wavelengths, medium, hit.t
-    σs, _, σ = medium.get_scattering_coefficients(here, scatters)
-    σ = dr.select(scatters, σs / pick(σ, channel), 1)
-    τ_c = pick(τ, channel)
-    weight = dr.exp(τ_c - τ) * σ
-    return Segment(ray, hit, Place(medium, scatters), dr.select(dr.isfinite(weight), weight, 0), σ, τ_c)
-
-
-@dr.syntax
-def fly_on(scene, media: Media, trace, ray, medium, channel, u, active):
-    """The last piece of a segment, its surface, its medium, whether the path scatters there, and τ up to there."""
-    ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
-    left = -dr.log(1 - u)
-    τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
-    scatters = mi.Bool(False)
-    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray.o))
-    flying = mi.Bool(active)
-    while dr.hint(flying, label="segment"):
-        μ = majorant(medium, ray, flying)
-        μ_c = pick(μ, channel)
-        collision = dr.select(μ_c > 0, left / μ_c, dr.inf)
-        hit = trace(piece(ray, collision), medium, flying)
-        scatters = flying & ~hit.is_valid() & dr.isfinite(collision)
-        hit.t, hit.valid = dr.select(scatters, collision, hit.t), hit.valid | scatters
-        τ += depth(μ, hit.t)
-        left = dr.maximum(left - dr.select(μ_c > 0, μ_c * hit.t, 0), 0)
-        flying &= hit.is_valid() & ~scatters & media.passes(hit.shape)
-        if flying:
-            ray, medium = beyond(ray, hit, medium)
-    return ray, hit, medium, scatters, τ
-
-
-def piece(ray: mi.Ray3f, length: mi.Float) -> mi.Ray3f:
-    """The first ``length`` of a ray."""
+def shortened(ray: mi.Ray3f, length: mi.Float) -> mi.Ray3f:
     short = mi.Ray3f(ray)
     short.maxt = dr.minimum(ray.maxt, length)
     return short
@@ -245,51 +185,3 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
     after = si.spawn_ray(ray.d)
     after.maxt = ray.maxt - hit.t
     return after, dr.select(si.is_medium_transition(), si.target_medium(ray.d), medium)
-
-
-@dr.syntax
-def cross(scene, media: Media, trace, ray, medium, reach, active):
-    """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
-
-    Returns τ, the surface, the last piece of the ray, and the medium there.
-    """
-    ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
-    τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
-    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray.o))
-    crossing = mi.Bool(active)
-    while dr.hint(crossing, label="transmittance"):
-        hit = trace(ray, medium, crossing)
-        # A ray that was shortened, not to meet what it leads to, goes all the way in the medium.
-        τ += depth(majorant(medium, ray, crossing), dr.select(hit.is_valid(), hit.t, reach))
-        crossing &= hit.is_valid() & media.passes(hit.shape)
-        if crossing:
-            reach -= hit.t
-            ray, medium = beyond(ray, hit, medium)
-    return τ, hit, ray, medium
-
-
-def next_surface(scene):
-    """What ``fly()`` and ``cross()`` trace with."""
-    return lambda ray, medium, active: scene.ray_intersect_preliminary(ray, active=active)
-
-
-def transmittance(scene, media: Media, x, place: Place, ray, target: mi.Point3f, active: mi.Bool) -> mi.Spectrum:
-    """Of the way along ``ray``, from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
-    medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
-    if not media.boundaries:
-        return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(majorant(medium, ray, active), reach)))
-    τ, hit, _, _ = cross(scene, media, next_surface(scene), ray, medium, reach, active)
-    return dr.select(active & hit.is_valid(), 0, dr.exp(-τ))
-
-
-def reconnect(scene, media: Media, y, place: Place, ray, x1, base: Segment, channel, active) -> tuple:
-    """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends.
-
-    Returns its transmittance T'(d') over the density T_c(d) of the base path, times the albedo at x1; the ratio of
-    densities T_c'(d') / T_c(d); and whether it is blocked.
-    """
-    reach = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf)
-    τ, hit, _, medium = cross(scene, media, next_surface(scene), ray, place.toward(y, ray.d), reach, active)
-    # In what is around x1 both paths must have come: a boundary may have holes.
-    blocked = hit.is_valid() | (medium != base.place.medium)
-    return dr.exp(base.τ_c - τ) * base.σ, dr.exp(base.τ_c - pick(τ, channel)), blocked

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, media
+from data_gen.paths import caustic, media, segments
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
@@ -55,11 +55,12 @@ class Step:
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
     chain: Chain | None  # behind x
-    # See data_gen.paths.media; None in scenes without media
+    # See data_gen.paths.media and segments; None in scenes without media
     place: media.Place | None
     channel: mi.UInt32 | None
-    u_distance: mi.Float | None
-    segment: media.Segment | None
+    numbers: segments.Numbers | None  # of the segment
+    light_key: mi.UInt32 | None  # of the random numbers on the way to the emitter
+    segment: segments.Segment | None
 
 
 def base_step(
@@ -72,7 +73,8 @@ def base_step(
     # ---------------------- Random numbers -----------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
-    u_distance = random.next_1d() if plan.media else None
+    numbers = segments.draw(random, plan.media) if plan.media else None
+    light_key = random.next_key() if plan.media and plan.media.grids else None
 
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
@@ -88,7 +90,9 @@ def base_step(
     shadow_ray, T_light = x.spawn_ray_to(light.p), None
     asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
     if plan.media:
-        T_light = media.transmittance(scene, plan.media, x, place, shadow_ray, light.p, asked)
+        T_light = segments.transmittance(
+            scene, plan.media, x, place, shadow_ray, light.p, channel, light_key, asked
+        )
         lit &= dr.max(T_light) > 0
     else:
         lit &= ~scene.ray_test(shadow_ray, asked)
@@ -114,8 +118,8 @@ def base_step(
     # ------------------- Next vertex, and Le there ---------------
     ray, segment = x.spawn_ray(x.to_world(sample.wo)), None
     if plan.media:
-        trace, medium = media.next_surface(scene), place.toward(x, ray.d)
-        segment = media.fly(scene, plan.media, trace, ray, medium, channel, u_distance, goes_on)
+        trace, medium = segments.next_surface(scene), place.toward(x, ray.d)
+        segment = segments.fly(plan.media, trace, ray, medium, channel, numbers, goes_on)
         x1 = media.vertex(segment.ray, segment.hit, segment.place)
         # Of the whole segment
         x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
@@ -179,7 +183,8 @@ def base_step(
         chain=chain,
         place=place,
         channel=channel,
-        u_distance=u_distance,
+        numbers=numbers,
+        light_key=light_key,
         segment=segment,
     )
     if plan.media:

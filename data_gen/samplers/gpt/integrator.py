@@ -45,7 +45,7 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths import media
+from data_gen.paths import media, segments
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
@@ -165,16 +165,17 @@ class GPT(GradientIntegrator):
         # --------------------- First vertices ------------------------
         seen = mi.Bool(not plan.hides)
         if plan.media:
-            channel, u_distance = media.choose_channel(random.next_1d()), random.next_1d()
+            channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, plan.media)
+            light_key = random.next_key() if plan.media.grids else None
 
             def fly(ray, importance):
                 trace = partial(self.first_surface, scene)
-                segment = media.fly(scene, plan.media, trace, ray, within, channel, u_distance, mi.Bool(True))
+                segment = segments.fly(plan.media, trace, ray, within, channel, numbers, mi.Bool(True))
                 return segment.ray, segment.hit, importance * segment.weight, segment.place
 
             first_ray, hit, β, place = fly(ray, importance)
             x = media.vertex(first_ray, hit, place)
-            Le = importance * self.lamps_in_fog(scene, plan, ray, within)
+            Le = importance * self.lamps_in_fog(scene, plan, ray, within, channel, light_key)
             offsets = []
             for offset_ray, offset_importance, inside in shifted:
                 offset_ray, hit, offset_β, offset_place = fly(offset_ray, offset_importance)
@@ -253,15 +254,14 @@ class GPT(GradientIntegrator):
             hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
         return hit
 
-    def lamps_in_fog(self, scene, plan: Plan, ray, within) -> mi.Spectrum:
-        """What the camera sees of lamps and the environment through media: the expectation, not a sample."""
+    def lamps_in_fog(self, scene, plan: Plan, ray, within, channel, key) -> mi.Spectrum:
+        """What the camera sees of lamps and the environment through media; of homogeneous ones the expectation."""
         if self.hide_emitters:
             return mi.Spectrum(0)
-        τ, hit, ray, _ = media.cross(
-            scene, plan.media, partial(self.first_surface, scene), ray, within, dr.inf, mi.Bool(True)
-        )
+        trace, reach = partial(self.first_surface, scene), mi.Float(dr.inf)
+        T, hit, ray = segments.see(scene, plan.media, trace, ray, within, reach, channel, key, mi.Bool(True))
         si = hit.compute_surface_interaction(ray)
-        return dr.exp(-τ) * si.emitter(scene).eval(si, mi.Bool(plan.max_depth > 0))
+        return T * si.emitter(scene).eval(si, mi.Bool(plan.max_depth > 0))
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, media, shift
+from data_gen.paths import caustic, media, segments, shift
 from data_gen.paths.lights import emission, replay_light, shadowed, shared_emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
@@ -155,7 +155,9 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     if plan.media:
         L_light = f * light.weight
         shadow_ray, asked = y.spawn_ray_to(light.target), dr.max(L_light) > 0
-        T = media.transmittance(scene, plan.media, y, path.place, shadow_ray, light.target, asked)
+        T = segments.transmittance(
+            scene, plan.media, y, path.place, shadow_ray, light.target, step.channel, step.light_key, asked
+        )
         L_light *= T * light_mis(light.delta, light.p, p)
     else:
         L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
@@ -227,7 +229,9 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
     ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
     T, T_c = 1, 1
     if plan.media:
-        T, T_c, occluded = media.reconnect(scene, plan.media, y, move.place, ray, x1, step.segment, step.channel, p > 0)
+        T, T_c, occluded = segments.reconnect(
+            scene, plan.media, y, move.place, ray, x1, step.segment, step.channel, p > 0
+        )
     else:
         occluded = scene.ray_test(ray, p > 0)
 
@@ -283,8 +287,8 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     place = move.place
     if plan.media:
         # The same number, which meets other media, has the same density all the same.
-        trace, medium = media.next_surface(scene), place.toward(y, ray.d)
-        segment = media.fly(scene, plan.media, trace, ray, medium, step.channel, step.u_distance, found)
+        trace, medium = segments.next_surface(scene), place.toward(y, ray.d)
+        segment = segments.fly(plan.media, trace, ray, medium, step.channel, step.numbers, found)
         ray, hit, place = segment.ray, segment.hit, segment.place
         y1, f_p = media.vertex(ray, hit, place), f_p * segment.weight
     else:
