@@ -172,6 +172,10 @@ def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active
         return cross(passes, trace, ray, medium, reach, channel, base.key, scale, base.n, mi.Bool(True))[-1]
 
     (N,) = dr.if_stmt((N,), moved, lambda N: (place(N),), lambda N: (N,))
-    J = dr.select(base.n > 0, dr.power(scale, mi.Float(base.n)), 1)
-    N *= dr.exp(base.M - M) * J / base.N_c
+    N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
     return τ, hit, end, N, pick(N, channel)
+
+
+def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:
+    """Of stretching the places of ``n`` collisions."""
+    return dr.select(n > 0, dr.power(scale, mi.Float(n)), 1)

@@ -27,7 +27,8 @@ apart walks on as a ghost. Its offset paths replay numbers that it has no use fo
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
 
 The base path is in ``base_path``, the offset paths in ``offset_path``, the rules of shifting in
-``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel.
+``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in a medium:
+see ``data_gen.paths.media`` and ``segments``.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -63,7 +64,7 @@ _SHIFTS = ("replay", "half-vector", "manifold")
 
 
 class GPT(GradientIntegrator):
-    """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces.
+    """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces and media.
 
     Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``:
 
@@ -79,10 +80,12 @@ class GPT(GradientIntegrator):
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
     ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
                              a layer of its own, not in the gradients, see ``data_gen.paths.caustic``; false: it is
+    ``volumes``              false: media are not seen, as with ``path``; true: they are, as with ``volpath``
     ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
                              without a counterpart: rejected, or of zero density, at a step that the base path took
 
-    Not handled: media (they are not seen), and polarised variants, for which rendering raises NgptError.
+    Not handled: polarised variants, for which rendering raises NgptError. Through media only "replay" goes. There is no
+    limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.
     """
 
     def __init__(self, props: mi.Properties):
@@ -102,9 +105,10 @@ class GPT(GradientIntegrator):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone, by Mitsuba's ``path``."""
+        """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
         depths = {"max_depth": self.max_depth if self.max_depth < 0xFFFFFFFF else -1, "rr_depth": self.rr_depth}
-        path = mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters, **depths})
+        plugin = "volpath" if self.volumes else "path"
+        path = mi.load_dict({"type": plugin, "hide_emitters": self.hide_emitters, **depths})
         return path.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
@@ -187,7 +191,7 @@ class GPT(GradientIntegrator):
             offsets, place, channel = [], None, None
             for offset_ray, offset_importance, inside in shifted:
                 hit = self.first_hit(scene, offset_ray)
-                offsets.append(start(plan, x, β, offset_ray, hit, offset_importance, inside, None))
+                offsets.append(start(plan, x, β, offset_ray, hit, offset_importance, inside))
         chain = no_chain(dr.width(hit.t)) if plan.manifold else None
         if plan.max_depth < 2:
             none = dr.zeros(mi.Spectrum, dr.width(hit.t))

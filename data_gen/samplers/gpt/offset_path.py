@@ -51,7 +51,7 @@ class Move:
     place: media.Place | None
 
 
-def start(plan: Plan, x, β, ray, hit, β_offset, inside, place) -> Offset:
+def start(plan: Plan, x, β, ray, hit, β_offset, inside, place=None) -> Offset:
     """An offset path up to its first vertex, ``hit``; it has ended where it finds none.
 
     A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
