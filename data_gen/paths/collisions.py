@@ -119,7 +119,7 @@ def fly_on(passes, trace, ray, medium, channel, u, key, active):
 
 @dr.syntax
 def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
-    """As ``segments.cross()``, where there are grids, with no more than ``most`` collisions, their steps ``scale`` long.
+    """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
 
     Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.
     """

@@ -1,7 +1,7 @@
 """Media, and the vertices of paths in them.
 
-A vertex of a path is on a surface or in a medium. One in a medium is a ``SurfaceInteraction3f`` too, of no shape, with a
-normal of 0 and the world's axes for a frame, so that what holds for any vertex is written once; its ``Place`` says
+A vertex of a path is on a surface or in a medium. One in a medium is a ``SurfaceInteraction3f`` too, of no shape, with
+a normal of 0 and the world's axes for a frame, so that what holds for any vertex is written once; its ``Place`` says
 which of the two it is. The ways between vertices are in ``data_gen.paths.segments``. Nothing of either is compiled into
 the kernel of a scene without media.
 """

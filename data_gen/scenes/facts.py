@@ -13,6 +13,7 @@ _PLUGINS = {
     "VolpathMisIntegratorImpl": "volpathmis",
 }
 
+
 @dataclass(frozen=True)
 class Facts:
     """Facts about a scene, known without rendering it.

@@ -57,7 +57,13 @@ def milk():
 def nested():
     """A cloud behind boundaries that bend nothing, with another one inside, a ball half in it, and mist around both."""
     mist = {"type": "ref", "id": "air"}
-    cloud = {"type": "homogeneous", "id": "cloud", "albedo": _rgb(0.9, 0.7, 0.8), "sigma_t": _rgb(0.6, 0.4, 0.5), "scale": 2.0}
+    cloud = {
+        "type": "homogeneous",
+        "id": "cloud",
+        "albedo": _rgb(0.9, 0.7, 0.8),
+        "sigma_t": _rgb(0.6, 0.4, 0.5),
+        "scale": 2.0,
+    }
     core = {"type": "homogeneous", "albedo": 0.6, "sigma_t": 3.0, "phase": {"type": "hg", "g": -0.3}}
     inside = {"interior": {"type": "ref", "id": "cloud"}, "exterior": mist}
     scene = room({"albedo": 0.8, "sigma_t": 0.15})
@@ -90,14 +96,9 @@ def cloudy(cloud, mist=None):
     scene = room(mist or {"sigma_t": 0.1})
     if not mist:
         del scene["air"], scene["sensor"]["medium"]
-    scene["ball"] = _sphere([0.5, -0.6, -0.3], 0.3, _diffuse(0.7, 0.6, 0.3))
+    scene["ball"] = _sphere([0.0, -0.85, 1.05], 0.15, _diffuse(0.7, 0.6, 0.3))
     box = mi.ScalarTransform4f().translate([0.0, 0.0, 0.1]).scale(0.8)
     scene["box"] = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}, "interior": cloud, **around}
-    scene["box"]["to_world"] = box
-    if mist:
-        scene["ball"] |= {"exterior": {"type": "ref", "id": "air"}, "interior": {"type": "ref", "id": "air"}}
-    scene["ball"]["center"] = [0.0, -0.85, 1.05]
-    scene["ball"]["radius"] = 0.15
     return scene
 
 

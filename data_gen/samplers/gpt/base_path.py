@@ -90,9 +90,7 @@ def base_step(
     shadow_ray, T_light = x.spawn_ray_to(light.p), None
     asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
     if plan.media:
-        T_light = segments.transmittance(
-            scene, plan.media, x, place, shadow_ray, light.p, channel, light_key, asked
-        )
+        T_light = segments.transmittance(scene, plan.media, x, place, shadow_ray, light.p, channel, light_key, asked)
         lit &= dr.max(T_light) > 0
     else:
         lit &= ~scene.ray_test(shadow_ray, asked)

@@ -223,9 +223,7 @@ class GPT(GradientIntegrator):
         active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         while dr.hint(active, label="gpt"):
             # The base path first: an offset path can only join a vertex that is known.
-            step, η = base_step(
-                scene, plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets
-            )
+            step, η = base_step(scene, plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
             if dr.hint(plan.caustic, mode="scalar"):
                 L_caustic += β * step.L_caustic

@@ -107,7 +107,7 @@ def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Of
     settle(step, offsets)
 
     def join(*offsets):
-        return tuple(step_joined(plan, step, y) for y in offsets)
+        return tuple(step_joined(step, y) for y in offsets)
 
     def rotate(i, y, *others):
         y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
@@ -135,10 +135,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
     # The state carries the preliminary hit alone: whole interactions of four paths would swell every loop.
-    if plan.media:
-        y = media.vertex(path.ray, path.hit, path.place)
-    else:
-        y = path.hit.compute_surface_interaction(path.ray)
+    y = media.vertex(path.ray, path.hit, path.place) if plan.media else path.hit.compute_surface_interaction(path.ray)
     bsdf = y.bsdf()
     connectable = plan.materials.connectable(bsdf)
 
@@ -324,7 +321,7 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     )
 
 
-def step_joined(plan: Plan, step: Step, path: Offset) -> Offset:
+def step_joined(step: Step, path: Offset) -> Offset:
     """A step from the shared vertex x, to which a joined offset path has come from elsewhere; settles it."""
     y = seen_from(step.x, path.ray.d)
     bsdf = y.bsdf()
@@ -333,7 +330,7 @@ def step_joined(plan: Plan, step: Step, path: Offset) -> Offset:
     # One vertex, one emitter, one shadow ray: only f and m know from where the path has come.
     f, p = media.evaluate_vertex(bsdf, y, step.place, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
-    if plan.media:
+    if step.segment:
         L_light *= step.T_light
     w2_light = shift.gradient_weight(path.r, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
@@ -342,7 +339,7 @@ def step_joined(plan: Plan, step: Step, path: Offset) -> Offset:
     # J = 1 (same vertex, same direction), but sampled with another p' after another arrival: the last factor of r.
     f, p = media.evaluate_vertex(bsdf, y, step.place, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
-    if plan.media:
+    if step.segment:
         β1 *= step.segment.weight
     r1 = path.r * p / step.p
     # Where the base path has ended r1 is not finite, and both halves of what follows are 0, whatever w.
