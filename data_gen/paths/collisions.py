@@ -57,7 +57,7 @@ def extent(medium: mi.MediumPtr, ray: mi.Ray3f) -> tuple[mi.Spectrum, mi.Bool, m
     exists = medium != None  # noqa: E711 - a comparison of arrays of pointers
     where = dr.zeros(mi.MediumInteraction3f, dr.width(ray.o))
     where.p, where.wavelengths = ray.o, ray.wavelengths
-    μ = dr.select(exists, medium.get_majorant(where), 0)
+    μ = mi.Spectrum(dr.select(exists, medium.get_majorant(where), 0))
     grid = exists & ~medium.is_homogeneous()
     # Outside of its box a grid is empty.
     met, near, far = medium.intersect_aabb(ray)
@@ -69,7 +69,7 @@ def null_and_real(medium, ray, t, μ_c, active) -> tuple[mi.Spectrum, mi.Spectru
     where = dr.zeros(mi.MediumInteraction3f, dr.width(t))
     where.t, where.p, where.wavelengths, where.medium = t, ray(t), ray.wavelengths, medium
     _, σn, σ = medium.get_scattering_coefficients(where, active)
-    return dr.select(active, σn / μ_c, 1), dr.select(active, σ / μ_c, 0)
+    return mi.Spectrum(dr.select(active, σn / μ_c, 1)), mi.Spectrum(dr.select(active, σ / μ_c, 0))
 
 
 @dr.syntax
@@ -93,7 +93,7 @@ def fly_on(passes, trace, ray, medium, channel, u, key, active):
         collides = collision < end
         stop = dr.select(collides, collision, end)
         # Infinitely long only where there is nothing
-        τ += dr.select(grid | (μ <= 0), 0, μ * (stop - t))
+        τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
         passed = dr.select(μ_c > 0, μ_c * dr.maximum(stop - t, 0), 0)
         M += dr.select(grid, passed, 0)
         left, ahead = left - dr.select(grid, 0, passed), ahead - dr.select(grid, passed, 0)
@@ -139,7 +139,7 @@ def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
         collision = dr.select(grid & (μ_c > 0) & (n < most), t + ahead / μ_c, dr.inf)
         collides = collision < end
         stop = dr.select(collides, collision, end)
-        τ += dr.select(grid | (μ <= 0), 0, μ * (stop - t))
+        τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
         passed = dr.select(grid & (μ_c > 0), μ_c * dr.maximum(stop - t, 0), 0)
         M, ahead = M + passed, ahead - passed
         t = mi.Float(stop)

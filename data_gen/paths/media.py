@@ -165,12 +165,13 @@ def extinction(medium: mi.MediumPtr, ray: mi.Ray3f) -> mi.Spectrum:
     """σ of a homogeneous medium, 0 outside of all media."""
     where = dr.zeros(mi.MediumInteraction3f, dr.width(ray.o))
     where.p, where.wavelengths = ray.o, ray.wavelengths
-    return dr.select(medium != None, medium.get_majorant(where), 0)  # noqa: E711 - an array of pointers
+    σ = medium.get_majorant(where)
+    return mi.Spectrum(dr.select(medium != None, σ, 0))  # noqa: E711 - an array of pointers
 
 
 def depth(σ: mi.Spectrum, distance: mi.Float) -> mi.Spectrum:
     """τ of a piece, which may be infinitely long where there is no medium."""
-    return dr.select(σ > 0, σ * distance, 0)
+    return mi.Spectrum(dr.select(σ > 0, σ * distance, 0))
 
 
 def shortened(ray: mi.Ray3f, length: mi.Float) -> mi.Ray3f:

@@ -74,7 +74,7 @@ def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, active) -> 
     here = dr.zeros(mi.MediumInteraction3f, dr.width(hit.t))
     here.p, here.wavelengths, here.medium, here.t = ray(hit.t), ray.wavelengths, medium, hit.t
     σs, _, σ = medium.get_scattering_coefficients(here, scatters)
-    albedo = dr.select(scatters, σs / pick(σ, channel), 1)
+    albedo = mi.Spectrum(dr.select(scatters, σs / pick(σ, channel), 1))
     τ_c = pick(τ, channel)
     weight = dr.exp(τ_c - τ) * albedo * N
     return Segment(ray, hit, Place(medium, scatters), dr.select(dr.isfinite(weight), weight, 0), albedo, τ_c, nulls)

@@ -322,3 +322,19 @@ def test_shifts_that_know_no_media_say_so(renderer):
     for shift in ("half-vector", "manifold"):
         with pytest.raises(NgptError, match=f"gpt: shift '{shift}' does not go through media"):
             render_stack(scene, 1, sampler="gpt", shift=shift)
+
+
+def test_spectral_variant(renderer):
+    from data_gen.backend import use_variant
+
+    use_variant("llvm_ad_spectral")
+    try:
+        import mitsuba as mi
+
+        stacks = render_ours(load(mi, colours, SIZE), "gpt", 12, 48)
+        references = render_references(mi, load(mi, colours, SIZE), 12, 96)
+        for name, result in gradient_tests(stacks, references):
+            assert result.passed, f"{name}: {result}"
+        render_ours(load(mi, coloured_smoke, (4, 4)), "gpt", 1, 1)
+    finally:
+        use_variant("llvm_ad_rgb")
