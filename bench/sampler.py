@@ -2,7 +2,7 @@
 
     python -m bench.sampler --folder SCENES [--maps NAME ...]
 
-Rendered are the built-in scenes and each FOLDER/*/scene.xml that is without media (the others are named and left out):
+Rendered are the built-in scenes and each FOLDER/*/scene.xml that `gpt` can render (the others are named and left out):
 
     cost       time of `gpt`, whole stacks with features, variances and film, over that of Mitsuba's C++ `path` at the
                same samples per pixel, --timing-spp of them; alternating, kernels compiled before
@@ -86,7 +86,7 @@ def run(args: argparse.Namespace) -> None:
             start = time.perf_counter()
             row = bench_scene(scene, name, args)
             if row is None:
-                print(f"{name}: left out, it has media", flush=True)
+                print(f"{name}: left out, gpt cannot render it", flush=True)
                 continue
             result["scenes"][name] = row
             save(args.output, result)

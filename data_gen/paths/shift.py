@@ -50,15 +50,20 @@ def keeps_joined(kind: mi.UInt32) -> mi.Bool:
     return kind == SMOOTH
 
 
-def reconnection_jacobian(base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f) -> mi.Float:
+def reconnection_jacobian(
+    base: mi.Point3f, offset: mi.Point3f, target: mi.Point3f, normal: mi.Normal3f, in_medium: mi.Bool | None = None
+) -> mi.Float:
     """dω'/dω, for directions from ``base`` and from ``offset`` to the same ``target`` with geometric ``normal``.
 
-    (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3).
+    (cos θ' / cos θ) (d² / d'²), with angles at the target (survey, section 3.3). In a medium, where distances have a
+    density of their own, it is d² / d'² (survey, section 7.1).
     """
     to_base, to_offset = base - target, offset - target
     near, far = dr.squared_norm(to_base), dr.squared_norm(to_offset)
     # One factor is a ratio of cosines, the other of squared distances: r³ would leave float32 before they do.
     cosines = dr.abs(dr.dot(normal, to_offset) / dr.dot(normal, to_base)) * dr.sqrt(near / far)
+    if in_medium is not None:
+        cosines = dr.select(in_medium, 1, cosines)
     return cosines * (near / far)
 
 

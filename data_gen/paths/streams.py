@@ -42,6 +42,10 @@ def _stream_class(variant: str) -> type:
             x = self.random.next_float32(active)
             return mi.Point2f(x, self.random.next_float32(active))
 
+        def next_key(self):
+            """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
+            return self.random.next_uint32()
+
         def clone(self):
             return Stream(self.random)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -30,12 +31,14 @@ class Materials:
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
 
+    Shapes that are ``passed`` have no vertices, and do not count.
+
     ``unconnectable`` lists the materials, as "shape.material (class)", at which a vertex is not connectable or an event
     may be other than smooth; ``all_connectable`` is True where there are none.
     """
 
-    def __init__(self, scene: mi.Scene, threshold: float):
-        shapes = scene.shapes()
+    def __init__(self, scene: mi.Scene, threshold: float, passed: Callable[[mi.Shape], bool] = lambda shape: False):
+        shapes = [shape for shape in scene.shapes() if not passed(shape)]
         # By Dr.Jit's number of each material, one of the shapes that are made of it
         users = {dr_number(shape.bsdf()): shape for shape in shapes if shape.bsdf() is not None}
         table = np.ones(max(users, default=0) + 1, bool)

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
+# Integrators that render media, of those that samplers of ours follow
+VOLUMETRIC = ("volpath", "volpathmis")
 
 
 @dataclass(frozen=True)
@@ -100,19 +102,24 @@ def _from_module(module: str) -> Callable[..., SamplePass]:
     return lambda scene, **options: import_module(module).make(scene, **options)
 
 
-def _refused_by_gpt(facts: Facts, name: str = "gpt") -> str:
+def _refused_by_gpt(facts: Facts) -> str:
     if facts.polarised:
-        return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow"
-    if facts.integrator != "path":
-        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
-    if facts.media:
-        return f"there are media ({', '.join(facts.media)}), which '{name}' does not see"
+        return f"variant '{facts.polarised}' is polarised, which 'gpt' does not follow"
+    if facts.integrator not in ("path", *VOLUMETRIC):
+        return f"the integrator is '{facts.integrator}', and 'gpt' knows only 'path', 'volpath' and 'volpathmis'"
+    if facts.media and facts.integrator == "path":
+        return f"there are media ({', '.join(facts.media)}), which the integrator 'path' does not render"
     return ""
 
 
 def _refused_by_gpt_simple(facts: Facts) -> str:
-    mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
-    return _refused_by_gpt(facts, "gpt-simple") or mirrors
+    if facts.polarised:
+        return f"variant '{facts.polarised}' is polarised, which 'gpt-simple' does not follow"
+    if facts.integrator != "path":
+        return f"the integrator is '{facts.integrator}', and 'gpt-simple' knows only 'path'"
+    if facts.media:
+        return f"there are media ({', '.join(facts.media)}), which 'gpt-simple' does not see"
+    return "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
 
 
 def _notes_on_replay(facts: Facts) -> list[str]:
@@ -126,6 +133,8 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', offset paths join it where materials are rough"]
     if facts.mirrors:
         lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
+    if facts.media:
+        lines.append("media: offset paths join where light scatters; features are those of the surfaces behind them")
     return lines
 
 
@@ -136,7 +145,7 @@ _GPT, _BASIC, _SIMPLE, _PRIMAL = (
 for _sampler in (
     Sampler(
         "gpt",
-        "gradients by shifted paths that join their base path (surfaces; the sampler to use)",
+        "gradients by shifted paths that join their base path (surfaces and media; the sampler to use)",
         _from_module(_GPT),
         _refused_by_gpt,
         _notes_on_gpt,

@@ -6,6 +6,13 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
+# By the names of their classes, the integrators that matter here
+_PLUGINS = {
+    "PathIntegrator": "path",
+    "VolumetricPathIntegrator": "volpath",
+    "VolpathMisIntegratorImpl": "volpathmis",
+}
+
 
 @dataclass(frozen=True)
 class Facts:
@@ -25,15 +32,26 @@ class Facts:
 
 def scene_facts(scene: mi.Scene) -> Facts:
     """The facts about a scene that is loaded."""
-    integrator = scene.integrator()
-    # A loaded integrator knows its class, not its plugin; only this one matters here.
-    name = "path" if integrator is None or integrator.class_name() == "PathIntegrator" else integrator.class_name()
-    media = [scene.sensors()[0].get_medium()]
+    names = {medium.id() or medium.class_name() for medium in media_of(scene)}
+    return Facts(integrator_name(scene), tuple(sorted(names)), polarised())
+
+
+def integrator_name(scene: mi.Scene) -> str:
+    """The plugin name of the scene's own integrator if it is one of ours to follow, or the name of its class."""
+    if scene.integrator() is None:
+        return "path"
+    # A loaded integrator knows its class, not its plugin.
+    name = scene.integrator().class_name()
+    return _PLUGINS.get(name, name)
+
+
+def media_of(scene: mi.Scene) -> list[mi.Medium]:
+    """All media of a scene, the camera's included."""
+    found = [scene.sensors()[0].get_medium()]
     for shape in scene.shapes():
         if shape.is_medium_transition():
-            media += [shape.interior_medium(), shape.exterior_medium()]
-    names = {medium.id() or medium.class_name() for medium in media if medium is not None}
-    return Facts(name, tuple(sorted(names)), polarised())
+            found += [shape.interior_medium(), shape.exterior_medium()]
+    return [medium for medium in found if medium is not None]
 
 
 def polarised() -> str:

@@ -91,7 +91,7 @@ class Steps:
 
         mi, β = self.mi, self.mi.Spectrum(1)
         state = (β, mi.Float(1), mi.UInt32(1), mi.Bool(True), mi.Bool(False), mi.Bool(False), None)
-        return base_step(self.scene, self.plan, self.u.clone(), x, *state, [])[0]
+        return base_step(self.scene, self.plan, self.u.clone(), x, None, None, *state, [])[0]
 
     def offset_at(self, ray):
         """An offset path that has come along ``ray``."""

@@ -209,9 +209,10 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     text = text.replace("<film", '<float name="shutter_close" value="0.5"/><film').replace('="constant"', '="point"')
     report = inspect_scene(scene_file(text=text))
     assert report["media"] == ["mist"] and report["shutter"] == 0.5 and not report["lens"]
-    assert report["sampler"] == "gpt-basic"
+    assert report["sampler"] == "gpt"
     plan = "\n".join(report["plan"])
-    assert "`--sampler gpt` refuses" in plan and "nothing moves" in plan and "'direct' layer" not in plan
+    assert "media: offset paths join where light scatters" in plan and "`--sampler gpt-simple` refuses" in plan
+    assert "nothing moves" in plan and "'direct' layer" not in plan
     report = inspect_scene("lens")
     assert report["lens"] and "depth of field" in "\n".join(report["plan"])
 

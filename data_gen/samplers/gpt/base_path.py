@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic
+from data_gen.paths import caustic, media, segments
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
@@ -26,6 +26,7 @@ class Step:
     u_light: mi.Point2f
     light: mi.DirectionSample3f
     light_weight: mi.Spectrum  # Le / p
+    T_light: mi.Spectrum | None  # transmittance
     lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
@@ -54,9 +55,17 @@ class Step:
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
     chain: Chain | None  # behind x
+    # See data_gen.paths.media and segments; None in scenes without media
+    place: media.Place | None
+    channel: mi.UInt32 | None
+    numbers: segments.Numbers | None  # of the segment
+    light_key: mi.UInt32 | None  # of the random numbers on the way to the emitter
+    segment: segments.Segment | None
 
 
-def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, chain, offsets) -> tuple[Step, mi.Float]:
+def base_step(
+    scene, plan: Plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets
+) -> tuple[Step, mi.Float]:
     """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
@@ -64,19 +73,31 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, ch
     # ---------------------- Random numbers -----------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
+    numbers = segments.draw(random, plan.media) if plan.media else None
+    light_key = random.next_key() if plan.media and plan.media.grids else None
 
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    if plan.media:
+        lit |= place.scatters
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
     light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
     lit &= light.pdf != 0
-    # Toward the emitter and along a new direction at once: materials are virtual functions, and calls to them dear.
-    f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(), x, x.to_local(light.d), u_lobe, u_direction)
+    # Toward the emitter and along a new direction at once
+    f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
     # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
-    lit &= ~scene.ray_test(x.spawn_ray_to(light.p), lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets])))
+    shadow_ray, T_light = x.spawn_ray_to(light.p), None
+    asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
+    if plan.media:
+        T_light = segments.transmittance(scene, plan.media, x, place, shadow_ray, light.p, channel, light_key, asked)
+        lit &= dr.max(T_light) > 0
+    else:
+        lit &= ~scene.ray_test(shadow_ray, asked)
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
     L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
+    if plan.media:
+        L_light *= T_light
 
     # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
@@ -93,8 +114,19 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, ch
     f_p = dr.select(goes_on, f_p * survival, 0)
 
     # ------------------- Next vertex, and Le there ---------------
-    x1 = scene.ray_intersect(x.spawn_ray(x.to_world(sample.wo)), goes_on)
+    ray, segment = x.spawn_ray(x.to_world(sample.wo)), None
+    if plan.media:
+        trace, medium = segments.next_surface(scene), place.toward(x, ray.d)
+        segment = segments.fly(plan.media, trace, ray, medium, channel, numbers, goes_on)
+        x1 = media.vertex(segment.ray, segment.hit, segment.place)
+        # Of the whole segment
+        x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
+        f_p *= segment.weight
+    else:
+        x1 = scene.ray_intersect(ray, goes_on)
     x_connectable = plan.materials.connectable(bsdf)
+    if plan.media:
+        x_connectable |= place.scatters
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
     Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
     L_bsdf, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Bool(False)
@@ -110,7 +142,10 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, ch
             chain, follows = advance(chain, depth, event, goes_on, x_connectable, survival, late, x1, Le)
             caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
-        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, plan.materials.sharp(x1, scene))
+        smooth, sharp = kind == SMOOTH, plan.materials.sharp(x1, scene)
+        if plan.media:
+            sharp &= ~segment.place.scatters
+        ends_late = late | caustic.ends_late(smooth, x_connectable, sharp)
     step = Step(
         x=x,
         x_connectable=x_connectable,
@@ -118,6 +153,7 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, ch
         u_light=u_light,
         light=light,
         light_weight=light_weight,
+        T_light=T_light,
         lit=lit,
         L_light=L_light,
         u_lobe=u_lobe,
@@ -143,7 +179,14 @@ def base_step(scene, plan: Plan, random, x, β, η, depth, seen, rough, late, ch
         ends_late=ends_late,
         L_followed=L_followed,
         chain=chain,
+        place=place,
+        channel=channel,
+        numbers=numbers,
+        light_key=light_key,
+        segment=segment,
     )
+    if plan.media:
+        step.x1_connectable |= segment.place.scatters
     return step, η
 
 

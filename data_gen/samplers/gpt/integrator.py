@@ -27,7 +27,8 @@ apart walks on as a ghost. Its offset paths replay numbers that it has no use fo
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
 
 The base path is in ``base_path``, the offset paths in ``offset_path``, the rules of shifting in
-``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel.
+``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in a medium:
+see ``data_gen.paths.media`` and ``segments``.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -38,27 +39,32 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
+from data_gen.paths import media, segments
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
+from data_gen.samplers import VOLUMETRIC
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.manifold_shift import add_followed, no_chain
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
+from data_gen.scenes.facts import integrator_name, media_of
 from ngpt.errors import NgptError
 
 _SHIFTS = ("replay", "half-vector", "manifold")
 
 
 class GPT(GradientIntegrator):
-    """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces.
+    """Gradient-domain path tracing with reconnection and random sequence replay, for surfaces and media.
 
     Plugin ``gpt``. Parameters, the first three as for Mitsuba's ``path``:
 
@@ -74,10 +80,12 @@ class GPT(GradientIntegrator):
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
     ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
                              a layer of its own, not in the gradients, see ``data_gen.paths.caustic``; false: it is
+    ``volumes``              false: media are not seen, as with ``path``; true: they are, as with ``volpath``
     ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
                              without a counterpart: rejected, or of zero density, at a step that the base path took
 
-    Not handled: media (they are not seen), and polarised variants, for which rendering raises NgptError.
+    Not handled: polarised variants, for which rendering raises NgptError. Through media only "replay" goes. There is no
+    limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.
     """
 
     def __init__(self, props: mi.Properties):
@@ -90,15 +98,17 @@ class GPT(GradientIntegrator):
         self.reuse = props.get("reuse", False)
         self.diagnostics = props.get("diagnostics", False)
         self.caustic = props.get("caustic", True)
+        self.volumes = props.get("volumes", False)
         if self.shift not in _SHIFTS:
             raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: {', '.join(_SHIFTS)}")
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
-        """The primal estimate alone, by Mitsuba's ``path``."""
+        """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
         depths = {"max_depth": self.max_depth if self.max_depth < 0xFFFFFFFF else -1, "rr_depth": self.rr_depth}
-        path = mi.load_dict({"type": "path", "hide_emitters": self.hide_emitters, **depths})
+        plugin = "volpath" if self.volumes else "path"
+        path = mi.load_dict({"type": plugin, "hide_emitters": self.hide_emitters, **depths})
         return path.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
@@ -115,6 +125,7 @@ class GPT(GradientIntegrator):
             shift=self.shift,
             hide_emitters=self.hide_emitters,
             caustic=self.caustic,
+            volumes=self.volumes and bool(media_of(scene)),
         )
         return lambda camera, film: self.sample_pass(scene, plan, camera, film)
 
@@ -122,9 +133,11 @@ class GPT(GradientIntegrator):
         """Takes one base path and its four offset paths for each camera sample."""
         # ------------------------- Paths -----------------------------
         ray, importance, _ = camera.rays()
+        within = mi.MediumPtr(camera.sensor.get_medium()) if plan.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        L, Le, L_caustic, offsets, chain = self.trace(scene, plan, camera.random.clone(), ray, importance, shifted)
+        random = camera.random.clone()
+        L, Le, L_caustic, offsets, chain = self.trace(scene, plan, random, ray, importance, shifted, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (L, Le, L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
 
@@ -147,20 +160,38 @@ class GPT(GradientIntegrator):
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
-    def trace(self, scene, plan: Plan, random, ray, importance, shifted):
+    def trace(self, scene, plan: Plan, random, ray, importance, shifted, within):
         """L, Le and the four offset paths at their ends, in the order of SHIFTS, of base paths that begin with ``ray``.
 
-        At the first vertex all offset paths are apart, and few later on: that step stands before the loop.
+        The camera is in the medium ``within``. At the first vertex all offset paths are apart, and few later on: that
+        step stands before the loop.
         """
         # --------------------- First vertices ------------------------
-        x = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray))
         seen = mi.Bool(not plan.hides)
-        # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
-        Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
-        offsets = []
-        for offset_ray, offset_importance, inside in shifted:
-            hit = self.first_hit(scene, offset_ray)
-            offsets.append(start(plan, x, importance, offset_ray, hit, offset_importance, inside))
+        if plan.media:
+            channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, plan.media)
+            light_key = random.next_key() if plan.media.grids else None
+
+            def fly(ray, importance):
+                trace = partial(self.first_surface, scene)
+                segment = segments.fly(plan.media, trace, ray, within, channel, numbers, mi.Bool(True))
+                return segment.ray, segment.hit, importance * segment.weight, segment.place
+
+            first_ray, hit, β, place = fly(ray, importance)
+            x = media.vertex(first_ray, hit, place)
+            Le = importance * self.lamps_in_fog(scene, plan, ray, within, channel, light_key)
+            offsets = []
+            for offset_ray, offset_importance, inside in shifted:
+                offset_ray, hit, offset_β, offset_place = fly(offset_ray, offset_importance)
+                offsets.append(start(plan, x, β, offset_ray, hit, offset_β, inside, offset_place))
+        else:
+            x, β = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray)), importance
+            # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
+            Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
+            offsets, place, channel = [], None, None
+            for offset_ray, offset_importance, inside in shifted:
+                hit = self.first_hit(scene, offset_ray)
+                offsets.append(start(plan, x, β, offset_ray, hit, offset_importance, inside))
         chain = no_chain(dr.width(hit.t)) if plan.manifold else None
         if plan.max_depth < 2:
             none = dr.zeros(mi.Spectrum, dr.width(hit.t))
@@ -168,9 +199,11 @@ class GPT(GradientIntegrator):
 
         # --------------------- The first step ------------------------
         # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
-        β = dr.select(x.is_valid(), importance, 0)
+        β = dr.select(x.is_valid(), β, 0)
         false = mi.Bool(False)
-        step, η = base_step(scene, plan, random, x, β, mi.Float(1), mi.UInt32(1), seen, false, false, chain, offsets)
+        step, η = base_step(
+            scene, plan, random, x, place, channel, β, mi.Float(1), mi.UInt32(1), seen, false, false, chain, offsets
+        )
         # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
         L = β * step.L_light + step.β1 * step.L_bsdf
         L_caustic = β * step.L_caustic if plan.caustic else step.L_caustic
@@ -184,12 +217,13 @@ class GPT(GradientIntegrator):
         # ---------------------- Loop state ---------------------------
         x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
         rough, late, chain = step.rough, step.late, step.chain
+        place, channel = step.segment.place if plan.media else None, step.channel
         depth = mi.UInt32(2)
         # As long as the base path lives, or a ghost has company
         active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         while dr.hint(active, label="gpt"):
             # The base path first: an offset path can only join a vertex that is known.
-            step, η = base_step(scene, plan, random, x, β, η, depth, seen, rough, late, chain, offsets)
+            step, η = base_step(scene, plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets)
             L += β * step.L_light + step.β1 * step.L_bsdf
             if dr.hint(plan.caustic, mode="scalar"):
                 L_caustic += β * step.L_caustic
@@ -198,19 +232,38 @@ class GPT(GradientIntegrator):
             offsets = later_steps(scene, plan, step, offsets)
             x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
             rough, late, chain = step.rough, step.late, step.chain
+            if dr.hint(plan.media is not None, mode="scalar"):
+                place = step.segment.place
             depth += 1
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         return L, L_caustic, offsets, chain
 
-    def first_hit(self, scene, ray) -> mi.PreliminaryIntersection3f:
+    def first_hit(self, scene, ray, active=True) -> mi.PreliminaryIntersection3f:
         """Where a camera ray leads, through lamps that hide from the camera."""
         ray = mi.Ray3f(ray)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
         if self.hide_emitters:
             lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
             si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
             hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
         return hit
+
+    def first_surface(self, scene, ray, medium, active) -> mi.PreliminaryIntersection3f:
+        """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
+        hit = self.first_hit(scene, ray, active)
+        if self.hide_emitters:
+            found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
+        return hit
+
+    def lamps_in_fog(self, scene, plan: Plan, ray, within, channel, key) -> mi.Spectrum:
+        """What the camera sees of lamps and the environment through media; of homogeneous ones the expectation."""
+        if self.hide_emitters:
+            return mi.Spectrum(0)
+        trace, reach = partial(self.first_surface, scene), mi.Float(dr.inf)
+        T, hit, ray = segments.see(scene, plan.media, trace, ray, within, reach, channel, key, mi.Bool(True))
+        si = hit.compute_surface_interaction(ray)
+        return T * si.emitter(scene).eval(si, mi.Bool(plan.max_depth > 0))
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
@@ -241,7 +294,8 @@ def make(scene: mi.Scene, **options) -> SamplePass:
 
 def stand_in(scene: mi.Scene, **options) -> GPT:
     """The plugin with the parameters of the scene's own ``path``: see ``like_path()``."""
-    return like_path(scene, "gpt", **options)
+    volumes = integrator_name(scene) in VOLUMETRIC
+    return like_path(scene, "gpt", volumes=volumes, **options)
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))

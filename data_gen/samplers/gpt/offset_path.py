@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, shift
+from data_gen.paths import caustic, media, segments, shift
 from data_gen.paths.lights import emission, replay_light, shadowed, shared_emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
@@ -32,6 +32,7 @@ class Offset:
     w2: mi.Float  # settled: 2 w of all that follows
     A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ
     rough: mi.Bool  # see data_gen.paths.caustic; it is never late
+    place: media.Place | None  # apart: of that vertex; None in scenes without media
 
 
 @dataclass
@@ -47,9 +48,10 @@ class Move:
     reaches: mi.Bool  # there is a next vertex
     good: mi.Bool
     rough: mi.Bool
+    place: media.Place | None
 
 
-def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Offset:
+def start(plan: Plan, x, β, ray, hit, β_offset, inside, place=None) -> Offset:
     """An offset path up to its first vertex, ``hit``; it has ended where it finds none.
 
     A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
@@ -62,18 +64,19 @@ def start(plan: Plan, x, importance, ray, hit, offset_importance, inside) -> Off
     return Offset(
         ray=mi.Ray3f(ray),
         hit=hit,
-        β=mi.Spectrum(offset_importance),
+        β=mi.Spectrum(β_offset),
         r=mi.Float(1),
         apart=lives if plan.replays else lives & x.is_valid(),
         joined=mi.Bool(False),
         seen=mi.Bool(not plan.hides),
-        a=dr.select(ended, -importance * (1 if plan.replays else 2), 0),
+        a=dr.select(ended, -β * (1 if plan.replays else 2), 0),
         Δ=dr.zeros(mi.Spectrum, dr.width(hit.t)),
         failed=mi.Bool(False) if plan.replays else ended,
         # Beyond the border there is no path that could have its part of the weight.
         w2=dr.select(ended, 1 if plan.replays else 2, dr.select(inside, mi.Float(0), 2)),
         A=dr.zeros(mi.Spectrum, dr.width(hit.t)),
         rough=mi.Bool(False),
+        place=place,
     )
 
 
@@ -132,7 +135,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
     # The state carries the preliminary hit alone: whole interactions of four paths would swell every loop.
-    y = path.hit.compute_surface_interaction(path.ray)
+    y = media.vertex(path.ray, path.hit, path.place) if plan.media else path.hit.compute_surface_interaction(path.ray)
     bsdf = y.bsdf()
     connectable = plan.materials.connectable(bsdf)
 
@@ -140,10 +143,21 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     # Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
     # near, the same point of an emitter.
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    if plan.media:
+        connectable |= path.place.scatters
+        lit |= path.place.scatters
     light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
-    f, p = evaluate(bsdf, y, y.to_local(light.d), lit)
+    f, p = media.evaluate_vertex(bsdf, y, path.place, y.to_local(light.d), lit)
     # Each path has its own m: from y, the emitter is found with other densities than from x.
-    L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
+    if plan.media:
+        L_light = f * light.weight
+        shadow_ray, asked = y.spawn_ray_to(light.target), dr.max(L_light) > 0
+        T = segments.transmittance(
+            scene, plan.media, y, path.place, shadow_ray, light.target, step.channel, step.light_key, asked
+        )
+        L_light *= T * light_mis(light.delta, light.p, p)
+    else:
+        L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
     if plan.caustic:
         L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), connectable), L_light)
     # Never rejected: an emitter that y does not see is a sample of value 0, and the reverse shift knows it as such.
@@ -157,7 +171,10 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     parts = step.walks & ~joins & ~step.ends_late
     none = mi.Bool(False)
     # What neither does is rejected: β' = 0, r = 0.
-    move = Move(path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, mi.Spectrum(0), none, none, path.rough)
+    no_light = mi.Spectrum(0)
+    move = Move(
+        path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, no_light, none, none, path.rough, path.place
+    )
     move = dr.if_stmt((move,), joins, lambda move: reconnect(scene, plan, step, y, bsdf, move), lambda move: move)
     if plan.replays:
         move = dr.if_stmt(
@@ -187,6 +204,7 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
         rough=move.rough,
+        place=move.place,
     )
 
 
@@ -200,11 +218,19 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
 
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
-    J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n), 1)
-    f, p = evaluate(bsdf, y, y.to_local(direction))
+    in_medium = step.segment.place.scatters if plan.media else None
+    J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n, in_medium), 1)
+    f, p = media.evaluate_vertex(bsdf, y, move.place, y.to_local(direction))
     # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
     # Where p = 0 that is so already.
-    occluded = scene.ray_test(dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction)), p > 0)
+    ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
+    T, T_c = 1, 1
+    if plan.media:
+        T, T_c, occluded = segments.reconnect(
+            scene, plan.media, y, move.place, ray, x1, step.segment, step.channel, p > 0
+        )
+    else:
+        occluded = scene.ray_test(ray, p > 0)
 
     # ---------------------- Emission at x1 -----------------------
     # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
@@ -215,13 +241,14 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
         # f |J| over the density of the *base* path (survey, eq. 4): p' enters by the weight alone.
-        f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0),
-        r=J * p / step.p,
+        f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0) * T,
+        r=J * p / step.p * T_c,
         seen=mi.Bool(True),
         L_bsdf=Le * mis_weight(p, p_light),
         reaches=reaches,
         good=~occluded,
         rough=mi.Bool(plan.caustic),
+        place=move.place,
     )
 
 
@@ -229,7 +256,7 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     """In a direction of its own, with the half-vector of the base path or along its random numbers."""
     # -------------------- Random sequence replay -----------------
     # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
-    sample, f_p = bsdf.sample(mi.BSDFContext(), y, step.u_lobe, step.u_direction)
+    sample, f_p = media.sample_vertex(bsdf, y, move.place, step.u_lobe, step.u_direction)
     found = sample.pdf > 0
     wo, p, r = sample.wo, sample.pdf, mi.Float(1)
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
@@ -254,20 +281,32 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
     # --------------- Next vertex, and Le there -------------------
     seen = move.seen if not plan.hides else move.seen | (kind != NULL)
     ray = y.spawn_ray(y.to_world(wo))
-    hit = scene.ray_intersect_preliminary(ray, active=found)
-    y1 = hit.compute_surface_interaction(ray)
+    place = move.place
+    if plan.media:
+        # The same number, which meets other media, has the same density all the same.
+        trace, medium = segments.next_surface(scene), place.toward(y, ray.d)
+        segment = segments.fly(plan.media, trace, ray, medium, step.channel, step.numbers, found)
+        ray, hit, place = segment.ray, segment.hit, segment.place
+        y1, f_p = media.vertex(ray, hit, place), f_p * segment.weight
+    else:
+        hit = scene.ray_intersect_preliminary(ray, active=found)
+        y1 = hit.compute_surface_interaction(ray)
     reaches = found & y1.is_valid()
     Le, p_light = emission(scene, y1, y, reaches | (found & seen), found & (kind == SMOOTH))
     # Reject what would not be shifted back, or the weights of the pair would not sum to 1 (survey, section 3.5).
-    inverts = shift.replay_inverts(
-        kind, connectable, ~reaches | plan.materials.connectable(y1.bsdf()), step.x_connectable
-    )
+    y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf())
+    if plan.media:
+        y1_connectable |= place.scatters
+    inverts = shift.replay_inverts(kind, connectable, y1_connectable, step.x_connectable)
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
     # A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
         rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
-        allowed &= ~(late | caustic.ends_late(kind == SMOOTH, connectable, plan.materials.sharp(y1, scene)))
+        smooth, sharp = kind == SMOOTH, plan.materials.sharp(y1, scene)
+        if plan.media:
+            sharp &= ~place.scatters
+        allowed &= ~(late | caustic.ends_late(smooth, connectable, sharp))
     return Move(
         ray=ray,
         hit=hit,
@@ -278,6 +317,7 @@ def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Mov
         reaches=reaches,
         good=allowed & inverts,
         rough=rough,
+        place=place,
     )
 
 
@@ -288,15 +328,19 @@ def step_joined(step: Step, path: Offset) -> Offset:
 
     # --------------- Emitter sampling: the same sample -----------
     # One vertex, one emitter, one shadow ray: only f and m know from where the path has come.
-    f, p = evaluate(bsdf, y, y.to_local(step.light.d), step.lit)
+    f, p = media.evaluate_vertex(bsdf, y, step.place, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
+    if step.segment:
+        L_light *= step.T_light
     w2_light = shift.gradient_weight(path.r, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # -------------- BSDF sampling: the same direction ------------
     # J = 1 (same vertex, same direction), but sampled with another p' after another arrival: the last factor of r.
-    f, p = evaluate(bsdf, y, step.wo, step.goes_on)
+    f, p = media.evaluate_vertex(bsdf, y, step.place, step.wo, step.goes_on)
     β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
+    if step.segment:
+        β1 *= step.segment.weight
     r1 = path.r * p / step.p
     # Where the base path has ended r1 is not finite, and both halves of what follows are 0, whatever w.
     good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
@@ -320,4 +364,5 @@ def step_joined(step: Step, path: Offset) -> Offset:
         w2=dr.select(path.joined, w2, path.w2),
         A=dr.select(path.joined, A, path.A),
         rough=path.rough,
+        place=path.place,
     )

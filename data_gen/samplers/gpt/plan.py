@@ -7,7 +7,9 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from data_gen.paths.lights import Lights
+from data_gen.paths.media import Media, index_matched
 from data_gen.paths.vertex import Materials
+from ngpt.errors import NgptError
 
 
 @dataclass
@@ -18,6 +20,7 @@ class Plan:
     ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     ``caustic``       light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
     ``manifold``      some of that light is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
+    ``media``         what fills the space between surfaces, see ``data_gen.paths.media``; None if there is nothing
     ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
     """
 
@@ -30,6 +33,7 @@ class Plan:
     hide_emitters: bool
     caustic: bool
     manifold: bool
+    media: Media | None
 
     @property
     def hides(self) -> bool:
@@ -44,12 +48,20 @@ def make_plan(
     shift: str,
     hide_emitters: bool,
     caustic: bool,
+    volumes: bool = False,
 ) -> Plan:
-    """Inspects the scene; the parameters are those of ``gpt``."""
-    materials = Materials(scene, roughness_threshold)
+    """Inspects the scene; the parameters are those of ``gpt``. Without ``volumes`` its media are not seen.
+
+    Raises NgptError for shifts that know no media.
+    """
+    media = Media(scene) if volumes else None
+    if media and shift != "replay":
+        raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")
+    materials = Materials(scene, roughness_threshold, index_matched if media else lambda shape: False)
     # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
     replays = not materials.all_connectable
     half_vectors = replays and shift == "half-vector"
     caustic = caustic and replays
     manifold = caustic and shift == "manifold"
-    return Plan(materials, Lights(scene), max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic, manifold)
+    lights = Lights(scene)
+    return Plan(materials, lights, max_depth, rr_depth, replays, half_vectors, hide_emitters, caustic, manifold, media)

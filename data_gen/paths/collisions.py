@@ -1,0 +1,181 @@
+"""Segments through media whose density varies: null collisions, and how their list goes with a shift.
+
+In a grid the transmittance is known only by estimates. So a path holds more than its vertices: the null collisions on
+its way, which happen at the density of the majorant μ and change nothing. In this larger space all densities are known.
+A list of n null collisions and a vertex at the end have the density
+
+    exp(-M) ∏ σn(x_i) / μ · σ,        M the majorant's optical depth of the segment, in grids alone
+
+and the integrand differs from that by σs in place of σ, and by its colours. Collisions are exponential steps along the
+optical depth m of the majorant, which is the same number of units whatever grids and gaps the segment crosses.
+
+    replay      the same steps, and the same numbers to tell real collisions from null ones: r = 1
+    reconnect   the list of the base path, m_i' = m_i M' / M, with the Jacobian (M' / M)^n; its steps are made anew from
+                the base path's key, so nothing has to be kept but n
+
+Homogeneous media have a clock of their own: their one exponential number of a segment, and no list.
+
+[Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/media.md]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.media import beyond, pick
+
+
+@dataclass
+class Collisions:
+    """The null collisions of a segment."""
+
+    key: mi.UInt32  # of the random numbers that place them
+    n: mi.UInt32
+    M: mi.Float
+    N_c: mi.Float  # the product of σn / μ in colour c
+
+
+def number(key: mi.UInt32, i: mi.UInt32) -> mi.Float:
+    """The ``i``-th random number of a segment."""
+    return mi.sample_tea_float32(key, i, 4)
+
+
+def step(key: mi.UInt32, i: mi.UInt32) -> mi.Float:
+    """The optical depth between its collision ``i`` and the one before."""
+    return -dr.log(1 - number(key, 2 * i))
+
+
+def is_real(key: mi.UInt32, i: mi.UInt32, probability: mi.Float) -> mi.Bool:
+    return number(key, 2 * i + 1) < probability
+
+
+def extent(medium: mi.MediumPtr, ray: mi.Ray3f) -> tuple[mi.Spectrum, mi.Bool, mi.Float, mi.Float]:
+    """μ of ``medium``, whether it is a grid, and from where to where it fills a ray."""
+    exists = medium != None  # noqa: E711 - a comparison of arrays of pointers
+    where = dr.zeros(mi.MediumInteraction3f, dr.width(ray.o))
+    where.p, where.wavelengths = ray.o, ray.wavelengths
+    μ = mi.Spectrum(dr.select(exists, medium.get_majorant(where), 0))
+    grid = exists & ~medium.is_homogeneous()
+    # Outside of its box a grid is empty.
+    met, near, far = medium.intersect_aabb(ray)
+    return μ, grid, dr.select(grid & met, dr.maximum(near, 0), 0), dr.select(grid, dr.select(met, far, 0), dr.inf)
+
+
+def null_and_real(medium, ray, t, μ_c, active) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """σn / μ_c and σ / μ_c at distance ``t``."""
+    where = dr.zeros(mi.MediumInteraction3f, dr.width(t))
+    where.t, where.p, where.wavelengths, where.medium = t, ray(t), ray.wavelengths, medium
+    _, σn, σ = medium.get_scattering_coefficients(where, active)
+    return mi.Spectrum(dr.select(active, σn / μ_c, 1)), mi.Spectrum(dr.select(active, σ / μ_c, 0))
+
+
+@dr.syntax
+def fly_on(passes, trace, ray, medium, channel, u, key, active):
+    """As ``segments.fly_on()``, where there are grids; returns the same, its null collisions, and ∏ σn / σn_c."""
+    lanes = dr.width(ray.o)
+    ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
+    left, ahead, n = -dr.log(1 - u), step(key, mi.UInt32(0)), mi.UInt32(0)
+    τ, N, M = dr.zeros(mi.Spectrum, lanes), dr.full(mi.Spectrum, 1, lanes), mi.Float(0)
+    hit = dr.zeros(mi.PreliminaryIntersection3f, lanes)
+    μ, grid, t, far = dr.zeros(mi.Spectrum, lanes), mi.Bool(False), mi.Float(0), mi.Float(0)
+    flying, scatters, fresh = mi.Bool(active), mi.Bool(False), mi.Bool(True)
+    while dr.hint(flying, label="segment"):
+        # -------------------------- A piece --------------------------
+        if fresh:
+            hit = trace(ray, medium, mi.Bool(True))
+            μ, grid, t, far = extent(medium, ray)
+        μ_c = pick(μ, channel)
+        end = dr.minimum(hit.t, far)
+        collision = dr.select(μ_c > 0, t + dr.select(grid, ahead, left) / μ_c, dr.inf)
+        collides = collision < end
+        stop = dr.select(collides, collision, end)
+        # Infinitely long only where there is nothing
+        τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
+        passed = dr.select(μ_c > 0, μ_c * dr.maximum(stop - t, 0), 0)
+        M += dr.select(grid, passed, 0)
+        left, ahead = left - dr.select(grid, 0, passed), ahead - dr.select(grid, passed, 0)
+        t = mi.Float(stop)
+
+        # ------------------------ A collision ------------------------
+        null, real = null_and_real(medium, ray, t, μ_c, collides & grid)
+        scatters = collides & (~grid | is_real(key, n, pick(real, channel)))
+        skips = collides & ~scatters
+        N *= dr.select(skips, null, 1)
+        n = dr.select(skips, n + 1, n)
+        ahead = dr.select(skips, step(key, n), ahead)
+        hit.t, hit.valid = dr.select(scatters, t, hit.t), hit.valid | scatters
+
+        # ------------------------ A boundary -------------------------
+        fresh = ~collides & hit.is_valid() & passes(hit.shape)
+        flying &= skips | fresh
+        if flying & fresh:
+            ray, medium = beyond(ray, hit, medium)
+    N_c = pick(N, channel)
+    return ray, hit, medium, scatters, τ, Collisions(key, n, M, N_c), N / N_c
+
+
+@dr.syntax
+def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
+    """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
+
+    Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.
+    """
+    lanes = dr.width(ray.o)
+    ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
+    ahead, n = scale * step(key, mi.UInt32(0)), mi.UInt32(0)
+    τ, N, M = dr.zeros(mi.Spectrum, lanes), dr.full(mi.Spectrum, 1, lanes), mi.Float(0)
+    hit = dr.zeros(mi.PreliminaryIntersection3f, lanes)
+    μ, grid, t, far = dr.zeros(mi.Spectrum, lanes), mi.Bool(False), mi.Float(0), mi.Float(0)
+    crossing, fresh = mi.Bool(active), mi.Bool(True)
+    while dr.hint(crossing, label="transmittance"):
+        if fresh:
+            hit = trace(ray, medium, mi.Bool(True))
+            μ, grid, t, far = extent(medium, ray)
+        μ_c = pick(μ, channel)
+        end = dr.minimum(dr.select(hit.is_valid(), hit.t, reach), far)
+        collision = dr.select(grid & (μ_c > 0) & (n < most), t + ahead / μ_c, dr.inf)
+        collides = collision < end
+        stop = dr.select(collides, collision, end)
+        τ += mi.Spectrum(dr.select(grid | (μ <= 0), 0, μ * (stop - t)))
+        passed = dr.select(grid & (μ_c > 0), μ_c * dr.maximum(stop - t, 0), 0)
+        M, ahead = M + passed, ahead - passed
+        t = mi.Float(stop)
+        null, _ = null_and_real(medium, ray, t, μ_c, collides)
+        N *= null
+        n = dr.select(collides, n + 1, n)
+        ahead = dr.select(collides, scale * step(key, n), ahead)
+        fresh = ~collides & hit.is_valid() & passes(hit.shape)
+        crossing &= collides | fresh
+        # Nothing comes through what is opaque to the majorant.
+        crossing &= dr.max(N) > 0
+        if crossing & fresh:
+            reach -= hit.t
+            ray, medium = beyond(ray, hit, medium)
+    return τ, hit, ray, medium, M, N
+
+
+def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active) -> tuple:
+    """The null collisions of a ``base`` segment on another way to its end: m_i' = m_i M' / M.
+
+    Returns τ of homogeneous media, what is met, the medium there, the integrand of the list with its Jacobian over the
+    density of that of the base path, and of that the colour c, which is the ratio of the densities.
+    """
+    none, one = mi.UInt32(0), mi.Float(1)
+    τ, hit, _, end, M, N = cross(passes, trace, ray, medium, reach, channel, base.key, one, none, active)
+    scale = M / base.M
+    moved = active & (base.n > 0) & ~hit.is_valid()
+
+    def place(N):
+        return cross(passes, trace, ray, medium, reach, channel, base.key, scale, base.n, mi.Bool(True))[-1]
+
+    (N,) = dr.if_stmt((N,), moved, lambda N: (place(N),), lambda N: (N,))
+    N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
+    return τ, hit, end, N, pick(N, channel)
+
+
+def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:
+    """Of stretching the places of ``n`` collisions."""
+    return dr.select(n > 0, dr.power(scale, mi.Float(n)), 1)

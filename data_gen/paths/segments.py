@@ -1,0 +1,170 @@
+"""The ways between the vertices of a path through media: how far it goes, how much light comes through, and shifts.
+
+A *segment* leads from vertex to vertex. It goes straight through index-matched boundaries, which bend nothing and
+reflect nothing. These are no vertices: they do not count in the length of a path, and emitters are sampled and found
+through them.
+
+    σ, σs       extinction and scattering coefficients, one for each colour
+    c           the colour by which the distances of a path are sampled, the same for all five paths
+    τ           optical depth of the homogeneous media of a segment
+    T           exp(-τ)
+
+An optical depth in colour c is sampled, not a distance: one number decides where a path scatters, through whatever
+homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and that of one on a surface T_c. A shifted
+copy that reconnects to the vertex has T_c' for T_c, and the same σ_c. One that replays the number has r = 1. For media
+whose density varies see ``data_gen.paths.collisions``.
+
+[Hua et al. 2019, section 7.1; docs/media.md]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import collisions
+from data_gen.paths.collisions import Collisions
+from data_gen.paths.media import Media, Place, beyond, depth, extinction, pick, shortened
+
+
+@dataclass
+class Numbers:
+    """The random numbers of a segment."""
+
+    u: mi.Float
+    key: mi.UInt32 | None  # of as many as there are null collisions; None without grids
+
+
+@dataclass
+class Segment:
+    """What is met along a ray: a vertex in a medium, one on a surface, or nothing."""
+
+    ray: mi.Ray3f  # its last piece, behind the last boundary
+    hit: mi.PreliminaryIntersection3f  # of that piece; its distance is that of the vertex, in a medium too
+    place: Place
+    weight: mi.Spectrum  # integrand over density in colour c: T / T_c, times σs / σ_c in a medium
+    albedo: mi.Spectrum  # σs / σ_c in a medium, else 1
+    τ_c: mi.Float
+    nulls: Collisions | None  # None without grids
+
+
+def draw(random, media: Media) -> Numbers:
+    return Numbers(random.next_1d(), random.next_key() if media.grids else None)
+
+
+def next_surface(scene):
+    """What ``fly()`` and ``cross()`` trace pieces of rays with."""
+    return lambda ray, medium, active: scene.ray_intersect_preliminary(ray, active=active)
+
+
+def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, active) -> Segment:
+    """The segment along ``ray``, from within ``medium``, that these ``numbers`` make.
+
+    ``trace`` (ray, medium, active) finds the next surface, as ``next_surface()`` does.
+    """
+    nulls, N = None, 1
+    if media.grids:
+        ray, hit, medium, scatters, τ, nulls, N = collisions.fly_on(
+            media.passes, trace, ray, medium, channel, numbers.u, numbers.key, active
+        )
+    else:
+        ray, hit, medium, scatters, τ = fly_on(media.passes, trace, ray, medium, channel, numbers.u, active)
+    here = dr.zeros(mi.MediumInteraction3f, dr.width(hit.t))
+    here.p, here.wavelengths, here.medium, here.t = ray(hit.t), ray.wavelengths, medium, hit.t
+    σs, _, σ = medium.get_scattering_coefficients(here, scatters)
+    albedo = mi.Spectrum(dr.select(scatters, σs / pick(σ, channel), 1))
+    τ_c = pick(τ, channel)
+    weight = dr.exp(τ_c - τ) * albedo * N
+    return Segment(ray, hit, Place(medium, scatters), dr.select(dr.isfinite(weight), weight, 0), albedo, τ_c, nulls)
+
+
+@dr.syntax
+def fly_on(passes, trace, ray, medium, channel, u, active):
+    """The last piece of a segment, its surface, its medium, whether the path scatters there, and τ up to there."""
+    ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
+    left = -dr.log(1 - u)
+    τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
+    scatters, flying = mi.Bool(False), mi.Bool(active)
+    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray.o))
+    while dr.hint(flying, label="segment"):
+        σ = extinction(medium, ray)
+        σ_c = pick(σ, channel)
+        collision = dr.select(σ_c > 0, left / σ_c, dr.inf)
+        hit = trace(shortened(ray, collision), medium, flying)
+        scatters = flying & ~hit.is_valid() & dr.isfinite(collision)
+        hit.t, hit.valid = dr.select(scatters, collision, hit.t), hit.valid | scatters
+        τ += depth(σ, hit.t)
+        left = dr.maximum(left - dr.select(σ_c > 0, σ_c * hit.t, 0), 0)
+        flying &= hit.is_valid() & ~scatters & passes(hit.shape)
+        if flying:
+            ray, medium = beyond(ray, hit, medium)
+    return ray, hit, medium, scatters, τ
+
+
+@dr.syntax
+def cross(passes, trace, ray, medium, reach, active):
+    """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
+
+    Returns τ, the surface, the last piece of the ray, and the medium there.
+    """
+    ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
+    τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
+    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(ray.o))
+    crossing = mi.Bool(active)
+    while dr.hint(crossing, label="transmittance"):
+        hit = trace(ray, medium, crossing)
+        # A ray that was shortened, not to meet what it leads to, goes all the way in the medium.
+        τ += depth(extinction(medium, ray), dr.select(hit.is_valid(), hit.t, reach))
+        crossing &= hit.is_valid() & passes(hit.shape)
+        if crossing:
+            reach -= hit.t
+            ray, medium = beyond(ray, hit, medium)
+    return τ, hit, ray, medium
+
+
+def see(scene, media: Media, trace, ray, medium, reach, channel, key, active) -> tuple:
+    """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
+
+    Returns T, that surface, and the last piece of the ray.
+    """
+    if not media.grids:
+        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
+        return dr.exp(-τ), hit, ray
+    # Ratio tracking: at each collision of the majorant what is null goes on.
+    every, same = mi.UInt32(0xFFFFFFFF), mi.Float(1)
+    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, channel, key, same, every, active)
+    return dr.exp(-τ) * N, hit, ray
+
+
+def transmittance(
+    scene, media: Media, x, place: Place, ray, target: mi.Point3f, channel, key, active: mi.Bool
+) -> mi.Spectrum:
+    """T of the way along ``ray``, from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
+    medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
+    if not media.boundaries and not media.grids:
+        return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(extinction(medium, ray), reach)))
+    T, hit, _ = see(scene, media, next_surface(scene), ray, medium, reach, channel, key, active)
+    return dr.select(active & hit.is_valid(), 0, T)
+
+
+def reconnect(scene, media: Media, y, place: Place, ray, x1, base: Segment, channel, active) -> tuple:
+    """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends.
+
+    Returns its integrand over the density of the base path; the ratio of the two densities, of colour c; and whether it
+    is blocked. The Jacobian of x1 itself is not in them.
+    """
+    reach, medium = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf), place.toward(y, ray.d)
+    trace = next_surface(scene)
+    if media.grids:
+        τ, hit, medium, N, N_c = collisions.rescale(
+            media.passes, trace, ray, medium, reach, channel, base.nulls, active
+        )
+    else:
+        τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active)
+        N, N_c = 1, 1
+    # In what is around x1 both paths must have come: a boundary may have holes.
+    blocked = hit.is_valid() | (medium != base.place.medium)
+    τ_c = pick(τ, channel)
+    return dr.exp(base.τ_c - τ) * base.albedo * N, dr.exp(base.τ_c - τ_c) * N_c, blocked

@@ -1,0 +1,122 @@
+"""Scenes with media for the statistical tests: small rooms seen from near by, so that pixels are wide."""
+
+from data_gen_scenes import _scale
+
+from data_gen.scenes.builtin import _camera, _diffuse, _light, _rgb, _sphere, _wall
+
+
+def room(medium, walls=(0.6, 0.6, 0.6), **more):
+    """A corner with a ball and a lamp, filled with a medium in which the camera stands."""
+    camera = _camera([0.2, 0.3, 2.2], [0, 0, 0], 60) | {"medium": {"type": "ref", "id": "air"}}
+    return {
+        "type": "scene",
+        "air": {"type": "homogeneous", "id": "air"} | medium,
+        "integrator": {"type": "volpath", "max_depth": 6, "rr_depth": 4},
+        "sensor": camera,
+        "floor": _wall([0, -1, 0], [0, 1, 0], (5, 5), _diffuse(*walls)),
+        "wall": _wall([-1, 0, 0], [1, 0, 0], (5, 5), _diffuse(0.6, 0.3, 0.2)),
+        "back": _wall([0, 0, -1], [0, 0, 1], (5, 5), _diffuse(0.4, 0.5, 0.6)),
+        "ball": _sphere([0.3, -0.5, 0.2], 0.5, _diffuse(0.7, 0.6, 0.3)),
+        "lamp": _light([0.2, 1.6, 0.6], [0, -1, 0], (1.2, 1.2), (9, 9, 9)),
+        **more,
+    }
+
+
+def haze():
+    """Isotropic, of one colour."""
+    return room({"albedo": 0.9, "sigma_t": 0.4})
+
+
+def forward():
+    """Scatters forward, with g = 0.8."""
+    return room({"albedo": 0.95, "sigma_t": 0.6, "phase": {"type": "hg", "g": 0.8}})
+
+
+def colours():
+    """Extinction and albedo of other values in each colour."""
+    return room({"albedo": _rgb(0.9, 0.8, 0.6), "sigma_t": _rgb(0.3, 0.6, 1.0)})
+
+
+def dense():
+    """An optical depth of 4 across the view."""
+    return room({"albedo": 0.8, "sigma_t": 1.5})
+
+
+def milk():
+    """Balls of clear and of frosted glass full of a medium, in clear air, before the sky."""
+    liquid = {"type": "homogeneous", "albedo": _rgb(0.95, 0.9, 0.7), "sigma_t": 1.5}
+    scene = room({"sigma_t": 0.1}) | {
+        "sky": {"type": "constant", "radiance": _rgb(0.4, 0.5, 0.6)},
+        "clear": _sphere([-0.5, -0.2, 0.3], 0.4, {"type": "dielectric"}) | {"interior": liquid},
+        "ball": _sphere([0.4, -0.3, 0.3], 0.6, {"type": "roughdielectric", "alpha": 0.3}) | {"interior": dict(liquid)},
+    }
+    del scene["air"], scene["sensor"]["medium"], scene["back"]
+    return scene
+
+
+def nested():
+    """A cloud behind boundaries that bend nothing, with another one inside, a ball half in it, and mist around both."""
+    mist = {"type": "ref", "id": "air"}
+    cloud = {
+        "type": "homogeneous",
+        "id": "cloud",
+        "albedo": _rgb(0.9, 0.7, 0.8),
+        "sigma_t": _rgb(0.6, 0.4, 0.5),
+        "scale": 2.0,
+    }
+    core = {"type": "homogeneous", "albedo": 0.6, "sigma_t": 3.0, "phase": {"type": "hg", "g": -0.3}}
+    inside = {"interior": {"type": "ref", "id": "cloud"}, "exterior": mist}
+    scene = room({"albedo": 0.8, "sigma_t": 0.15})
+    return {
+        "type": "scene",
+        "cloud": cloud,
+        **scene,
+        "outer": {"type": "cube", "to_world": _scale(0.7), "bsdf": {"type": "null"}, **inside},
+        "inner": _sphere([-0.2, 0.2, 0.1], 0.35, {"type": "null"})
+        | {"interior": core, "exterior": {"type": "ref", "id": "cloud"}},
+        "ball": _sphere([0.9, -0.6, 0.2], 0.15, _diffuse(0.7, 0.6, 0.3)) | {"exterior": mist, "interior": mist},
+    }
+
+
+def smoke():
+    """A cloud whose density varies, in a box that is larger, between a ball, the floor and a lamp."""
+    return cloudy(grid(1))
+
+
+def coloured_smoke():
+    """The same with another density in each colour, an albedo that varies, and mist around it."""
+    cloud = grid(3) | {"albedo": {"type": "gridvolume", "grid": density(3, 0.5, 1.0, 7), **placed()}}
+    return cloudy(cloud, mist={"albedo": 0.8, "sigma_t": 0.1})
+
+
+def cloudy(cloud, mist=None):
+    import mitsuba as mi
+
+    around = {"exterior": {"type": "ref", "id": "air"}} if mist else {}
+    scene = room(mist or {"sigma_t": 0.1})
+    if not mist:
+        del scene["air"], scene["sensor"]["medium"]
+    scene["ball"] = _sphere([0.0, -0.85, 1.05], 0.15, _diffuse(0.7, 0.6, 0.3))
+    box = mi.ScalarTransform4f().translate([0.0, 0.0, 0.1]).scale(0.8)
+    scene["box"] = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}, "interior": cloud, **around}
+    return scene
+
+
+def grid(channels):
+    volume = {"type": "gridvolume", "grid": density(channels, 0.0, 1.0, 5), **placed()}
+    return {"type": "heterogeneous", "albedo": 0.9, "sigma_t": volume, "scale": 4.0}
+
+
+def placed():
+    """Where grids are: smaller than their box."""
+    import mitsuba as mi
+
+    return {"to_world": mi.ScalarTransform4f().translate([-0.7, -0.7, -0.6]).scale(1.4)}
+
+
+def density(channels, low, high, seed):
+    import mitsuba as mi
+    import numpy as np
+
+    values = np.random.default_rng(seed).uniform(low, high, (5, 5, 5, channels)).astype(np.float32)
+    return mi.VolumeGrid(values)
