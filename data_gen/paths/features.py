@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.spectrum import reflectance_to_rgb
+from data_gen.scenes.facts import media_of
 
 # A longer chain of mirrors is cut: the features of what it shows are unknown then, as for a path that escapes.
 MAX_SPECULAR_VERTICES = 32
@@ -52,11 +53,7 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
 
 def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
     """The ``medium`` that the camera is in, and the steps to take in media: 0 where the scene has none."""
-    media = [medium]
-    for shape in scene.shapes():
-        if shape.is_medium_transition():
-            media += [shape.interior_medium(), shape.exterior_medium()]
-    media = [medium for medium in media if medium is not None]
+    media = media_of(scene)
     if not media:
         return None, 0
     # One step through a medium of one density is exact.

@@ -134,7 +134,7 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
     if facts.mirrors:
         lines.append("mirrors or clear glass: shifted by replay, so gradients are noisier there")
     if facts.media:
-        lines.append("media: offset paths join where light scatters; features are those of the surfaces behind them")
+        lines.append("media: offset paths join where light scatters; albedo counts them, normal and depth do not")
     return lines
 
 
