@@ -129,8 +129,15 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _PRIMAL = (
-    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "primal")
+def _notes_on_bdpt(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends"]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: what they show of caustics is found from the camera alone, with much noise")
+    return lines
+
+
+_GPT, _BASIC, _SIMPLE, _BDPT, _PRIMAL = (
+    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "primal")
 )
 
 for _sampler in (
@@ -166,6 +173,17 @@ for _sampler in (
         _refused_by_gpt_simple,
         lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
         module=_SIMPLE,
+    ),
+    Sampler(
+        "bdpt",
+        "paths from the camera and from the lights, without gradients (hidden lamps, caustics seen directly)",
+        _from_module(_BDPT),
+        lambda facts: _refused_by_gpt(facts, "bdpt"),
+        _notes_on_bdpt,
+        {"joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera"},
+        gradients=False,
+        batch=8,
+        module=_BDPT,
     ),
     Sampler(
         "primal",
