@@ -182,7 +182,7 @@ for _sampler in (
         _notes_on_bdpt,
         {"joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera"},
         gradients=False,
-        batch=8,
+        batch=4,
         module=_BDPT,
     ),
     Sampler(
