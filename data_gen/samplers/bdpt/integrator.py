@@ -28,7 +28,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import NULL, SMOOTH, event_kind
+from data_gen.paths.vertex import NULL, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connected, emission_at, to_camera, to_light
@@ -39,6 +39,7 @@ from data_gen.samplers.bdpt.vertex import (
     Vertex,
     adjoint,
     cosine,
+    leave,
     recall,
     record,
     reverse_density,
@@ -96,7 +97,7 @@ class BDPT(GradientIntegrator):
 
     @dr.syntax
     def light_path(self, scene, lights, camera, random, camera_ray, importance, longest, splats: Splats):
-        """Traces a path from a light; returns its vertices that scatter smoothly, how many they are, and ``random``."""
+        """Traces a path from a light; returns its vertices, how many they are, and ``random``."""
         size, lens = camera.size, camera.sensor.needs_aperture_sample()
         start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
         ray, β = start.ray, start.β
@@ -113,8 +114,9 @@ class BDPT(GradientIntegrator):
             y = Vertex(si, β, end, depth)
             bsdf = si.bsdf()
             smooth = active & scatters_smoothly(bsdf)
-            kept.write(record(ray, hit, y), count, smooth)
-            count = dr.select(smooth, count + 1, count)
+            # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
+            kept.write(record(ray, hit, y, smooth), depth - 1, active)
+            count = dr.select(active, depth, count)
 
             # ------------------- To the camera -----------------------
             on_lens = mi.Point2f(0.5)
@@ -128,10 +130,7 @@ class BDPT(GradientIntegrator):
             # -------------------- Next vertex ------------------------
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, u_lobe, u_direction, active)
-            d = si.to_world(sample.wo)
-            smooth_event = event_kind(sample.sampled_type) == SMOOTH
-            q = reverse_density(si, bsdf, sample.wo, active & smooth_event)
-            end = mis.leave(end, cosine(si, d), sample.pdf, q, ~smooth_event)
+            d, end = leave(y, bsdf, sample, active)
             β *= f_p * adjoint(si, sample.wo)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
@@ -185,14 +184,10 @@ class BDPT(GradientIntegrator):
                 L += self.connections(scene, z, bsdf, smooth & joined, kept, count, longest, ray)
 
             # -------------------- Next vertex ------------------------
-            kind = event_kind(sample.sampled_type)
             found = active & (sample.pdf > 0)
-            sky_seen |= found & (kind != NULL)
+            sky_seen |= found & (event_kind(sample.sampled_type) != NULL)
             η = dr.select(found, η * sample.eta, η)
-            d = si.to_world(sample.wo)
-            smooth_event = kind == SMOOTH
-            q = reverse_density(si, bsdf, sample.wo, found & smooth_event)
-            end = mis.leave(end, cosine(si, d), sample.pdf, q, ~smooth_event)
+            d, end = leave(z, bsdf, sample, found)
             β *= f_p
             # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
@@ -220,7 +215,8 @@ class BDPT(GradientIntegrator):
         i = mi.UInt32(0)
         while dr.hint(active & (i < count), label="connections"):
             y = recall(kept.read(i), ray.time, ray.wavelengths)
-            C, others = connected(scene, z, bsdf, y, z.depth + y.depth + 1 <= longest)
+            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= longest)
+            C, others = connected(scene, z, bsdf, y, joins)
             L += dr.select(dr.max(C) > 0, C / (1 + others), 0)
             i += 1
         return L

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.vertex import SMOOTH, event_kind
+from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 
 RADIANCE, IMPORTANCE = mi.TransportMode.Radiance, mi.TransportMode.Importance
@@ -42,12 +44,13 @@ class Record:
     depth: mi.UInt32
 
 
-def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex) -> Record:
-    """What is kept of a ``vertex`` that ``ray`` has hit."""
+def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Record:
+    """What is kept of a ``vertex`` that ``ray`` has hit; its depth is 0 if nothing can be connected to it."""
     end = vertex.end
     where = (mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(hit.t), mi.Point2f(hit.prim_uv), mi.UInt32(hit.prim_index))
     shapes = (mi.ShapePtr(hit.shape), mi.ShapePtr(hit.instance))
-    return Record(*where, *shapes, mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), mi.UInt32(vertex.depth))
+    depth = dr.select(smooth, vertex.depth, 0)
+    return Record(*where, *shapes, mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth)
 
 
 def recall(kept: Record, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
@@ -87,6 +90,14 @@ def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
     swapped.wi = wo
     q = bsdf.pdf(mi.BSDFContext(), swapped, si.wi, active)
     return dr.select(dr.isfinite(q), q, 0)
+
+
+def leave(vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active) -> tuple[mi.Vector3f, Partial]:
+    """The direction of a sampled event, and what the path's end knows behind it."""
+    si, d = vertex.si, vertex.si.to_world(sample.wo)
+    smooth = event_kind(sample.sampled_type) == SMOOTH
+    q = reverse_density(si, bsdf, sample.wo, active & smooth)
+    return d, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, ~smooth)
 
 
 def adjoint(si, wo: mi.Vector3f) -> mi.Float:
