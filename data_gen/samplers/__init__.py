@@ -132,7 +132,7 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
 def _notes_on_bdpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends"]
     if facts.mirrors:
-        lines.append("mirrors or clear glass: what they show of caustics is found from the camera alone, with much noise")
+        lines.append("mirrors or clear glass: caustics seen in them are found from the camera alone, with much noise")
     return lines
 
 

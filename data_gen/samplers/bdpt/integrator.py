@@ -122,7 +122,9 @@ class BDPT(GradientIntegrator):
             on_lens = mi.Point2f(0.5)
             if dr.hint(lens, mode="scalar"):
                 on_lens = random.next_2d()
-            C, others, uv = to_camera(scene, camera.sensor, on_lens, y, bsdf, smooth)
+            C, others, uv = to_camera(
+                camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
+            )
             light = to_rgb(C * importance / (1 + others), camera_ray.wavelengths)
             pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
             splats.add(pixel, list(light), dr.max(C) > 0)
@@ -148,7 +150,7 @@ class BDPT(GradientIntegrator):
     def camera_path(self, scene, lights, camera, random, ray, importance, kept, count, longest):
         """L and Le of a path from the camera, joined to the light path's vertices ``kept``."""
         ray = mi.Ray3f(ray)
-        si = scene.ray_intersect(ray, mi.RayFlags.All, True)
+        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
         sky_seen = mi.Bool(not self.hide_emitters)
         shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
@@ -207,6 +209,19 @@ class BDPT(GradientIntegrator):
             active &= si.is_valid() & (depth < self.max_depth)
             end = mis.arrive(end, cosine(si, d), dr.square(si.t))
         return L, Le
+
+    def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
+        """Whether something is between ``si`` and the camera; lamps are not, if they are hidden."""
+        if not self.hide_emitters:
+            return scene.ray_test(si.spawn_ray_to(camera.p), active)
+        on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers
+        ray = si.spawn_ray_to(camera.p)
+        hit = scene.ray_intersect_preliminary(ray, active=active & ~on_lamp)
+        lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711
+        behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp).spawn_ray_to(camera.p)
+        further = self.skip_area_emitters(scene, behind, False, lamp)
+        blocked = dr.select(lamp, further.is_valid() & (further.t < behind.maxt), hit.is_valid())
+        return on_lamp | blocked
 
     @dr.syntax
     def connections(self, scene, z, bsdf, active, kept, count, longest, ray):

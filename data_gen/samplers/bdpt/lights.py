@@ -52,8 +52,8 @@ class LightEnds:
         self.emitters = scene.emitters_dr() if emitters else None
         self.kind = mi.UInt32(np.array(kinds or [0], np.uint32))
         tables = [_table(scene, emitter, kind) for emitter, kind in zip(emitters, kinds, strict=True)] or [[0] * 8]
-        (x, y, z, u, v, w, cutoff, of_ball) = (mi.Float(np.array(column, np.float32)) for column in zip(*tables))
-        self.position, self.axis, self.cutoff = mi.Point3f(x, y, z), mi.Vector3f(u, v, w), cutoff
+        x, y, z, u, v, w, self.cutoff, of_ball = map(mi.Float, np.array(tables, np.float32).T)
+        self.position, self.axis = mi.Point3f(x, y, z), mi.Vector3f(u, v, w)
         # Of spheres, of which connections find the visible part alone: density of emission per area; else 0
         self.of_ball = of_ball
         self.balls = bool(np.any(np.array(of_ball) > 0))

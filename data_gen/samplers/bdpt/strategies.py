@@ -50,12 +50,12 @@ def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum,
     return C, mis.others_connected(z.end, cosines[0], p_z, q_z, y.end, cosines[1], p_y, q_y, distance2)
 
 
-def to_camera(scene, sensor, lens: mi.Point2f, y: Vertex, bsdf, active) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
-    """t = 1, occlusion included; and the place on the film, in pixels."""
+def to_camera(sensor, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+    """t = 1; and the place on the film, in pixels. ``occluded`` is asked for (si, toward the camera, active)."""
     camera, importance = sensor.sample_direction(y.si, lens, active)
     active = active & (camera.pdf > 0) & (dr.max(importance) > 0)
     f, _, q = evaluate(IMPORTANCE, y.si, bsdf, y.si.to_local(camera.d), active)
     C = y.β * f * importance
     seen = active & (dr.max(C) > 0)
-    C = dr.select(seen & ~scene.ray_test(y.si.spawn_ray_to(camera.p), seen), C, 0)
+    C = dr.select(seen & ~occluded(y.si, camera, seen), C, 0)
     return C, mis.others_to_camera(y.end, importance[0], cosine(y.si, camera.d), q), camera.uv
