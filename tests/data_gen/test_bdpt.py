@@ -183,8 +183,10 @@ def test_weights_are_those_of_all_densities(renderer):
         good = np.array(good & dr.all([there for _, there, *_ in vertices]))
         with np.errstate(divide="ignore", invalid="ignore"):
             brute = sum(p for i, p in enumerate(densities) if i != s) / densities[s]
+        # Of directions that graze rough glass, positions in float32 may lie on the other side: density 0 there.
+        assert good.sum() > 100 and np.isfinite(brute[good]).mean() > 0.9
+        good &= np.isfinite(brute)
         error = np.abs(np.array(others) - brute)[good] / (1 + brute[good])
-        assert good.sum() > 100
         # Of grazing directions float32 leaves a part in a thousand.
         assert np.median(error) < 1e-4 and np.quantile(error, 0.99) < 0.01, (len(vertices), s)
 
