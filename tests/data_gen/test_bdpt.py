@@ -85,13 +85,13 @@ class Ends:
         """The vertices of one end: (Vertex, whether it is there, its material, whether its event is not smooth)."""
         from data_gen.paths.vertex import SMOOTH, event_kind
         from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import Vertex, cosine, leave
+        from data_gen.samplers.bdpt.vertex import Vertex, context, cosine, leave
 
         mi, dr, random = self.mi, self.dr, self.random
         found, there = [], si.is_valid()
         for depth in range(1, self.LENGTH + 1):
             vertex, bsdf = Vertex(si, mi.Spectrum(1), end, mi.UInt32(depth)), si.bsdf()
-            sample, _ = bsdf.sample(mi.BSDFContext(mode), si, random.next_1d(), random.next_2d(), there)
+            sample, _ = bsdf.sample(context(mode), si, random.next_1d(), random.next_2d(), there)
             d, end = leave(vertex, bsdf, sample, there)
             found.append((vertex, there, bsdf, event_kind(sample.sampled_type) != SMOOTH))
             there = there & (sample.pdf > 0)

@@ -38,6 +38,7 @@ from data_gen.samplers.bdpt.vertex import (
     Record,
     Vertex,
     adjoint,
+    context,
     cosine,
     leave,
     recall,
@@ -131,7 +132,7 @@ class BDPT(GradientIntegrator):
 
             # -------------------- Next vertex ------------------------
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-            sample, f_p = bsdf.sample(mi.BSDFContext(IMPORTANCE), si, u_lobe, u_direction, active)
+            sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
             d, end = leave(y, bsdf, sample, active)
             β *= f_p * adjoint(si, sample.wo)
             # By what is left of the light that the path began with
@@ -172,7 +173,7 @@ class BDPT(GradientIntegrator):
             light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
             lit = smooth & (light.pdf > 0)
             wo = si.to_local(light.d)
-            f, p, sample, f_p = bsdf.eval_pdf_sample(mi.BSDFContext(RADIANCE), si, wo, u_lobe, u_direction)
+            f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
             f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
             lit &= dr.max(f * weight) > 0
             q = reverse_density(si, bsdf, wo, lit)

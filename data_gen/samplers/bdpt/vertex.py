@@ -11,7 +11,13 @@ from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Partial
 
-RADIANCE, IMPORTANCE = mi.TransportMode.Radiance, mi.TransportMode.Importance
+# By name: Mitsuba's own values belong to a variant.
+RADIANCE, IMPORTANCE = "Radiance", "Importance"
+
+
+def context(mode: str) -> mi.BSDFContext:
+    """What a path carries, for Mitsuba's materials."""
+    return mi.BSDFContext(getattr(mi.TransportMode, mode))
 
 
 @dataclass
@@ -76,7 +82,7 @@ def scatters_smoothly(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
     """f cos for a path that goes on along ``wo`` (local), the density of that, and with both directions swapped."""
-    f, p = bsdf.eval_pdf(mi.BSDFContext(mode), si, wo, active)
+    f, p = bsdf.eval_pdf(context(mode), si, wo, active)
     good = dr.isfinite(p) & dr.isfinite(dr.sum(f))
     f, p = dr.select(good, f, 0), dr.select(good, p, 0)
     if mode == IMPORTANCE:
