@@ -35,7 +35,6 @@ from data_gen.samplers.bdpt.strategies import connected, emission_at, to_camera,
 from data_gen.samplers.bdpt.vertex import (
     IMPORTANCE,
     RADIANCE,
-    Record,
     Vertex,
     adjoint,
     context,
@@ -43,6 +42,7 @@ from data_gen.samplers.bdpt.vertex import (
     leave,
     recall,
     record,
+    record_class,
     reverse_density,
     scatters_smoothly,
 )
@@ -110,6 +110,7 @@ class BDPT(GradientIntegrator):
         e, p_light = lights.densities(scene, start, si)
         end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
         depth, count = mi.UInt32(1), mi.UInt32(0)
+        Record = record_class(mi.variant())
         kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
         while dr.hint(active, label="light path"):
             y = Vertex(si, β, end, depth)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -30,36 +32,44 @@ class Vertex:
     depth: mi.UInt32
 
 
-@dataclass
-class Record:
-    """A vertex of a light path as it is kept: 20 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
+@cache
+def record_class(variant: str) -> type:
+    """Of what is kept; Dr.Jit reads the types of its fields once, and Mitsuba's belong to a variant."""
 
-    The interaction is computed anew from the ray that led there and what it hit.
-    """
+    @dataclass
+    class Record:
+        """A vertex of a light path as it is kept: 20 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
 
-    o: mi.Point3f
-    d: mi.Vector3f
-    t: mi.Float
-    prim_uv: mi.Point2f
-    prim_index: mi.UInt32
-    shape: mi.ShapePtr
-    instance: mi.ShapePtr
-    β: mi.Spectrum
-    vcm: mi.Float
-    vc: mi.Float
-    depth: mi.UInt32
+        The interaction is computed anew from the ray that led there and what it hit.
+        """
+
+        o: mi.Point3f
+        d: mi.Vector3f
+        t: mi.Float
+        prim_uv: mi.Point2f
+        prim_index: mi.UInt32
+        shape: mi.ShapePtr
+        instance: mi.ShapePtr
+        β: mi.Spectrum
+        vcm: mi.Float
+        vc: mi.Float
+        depth: mi.UInt32
+
+    return Record
 
 
-def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Record:
+def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Any:
     """What is kept of a ``vertex`` that ``ray`` has hit; its depth is 0 if nothing can be connected to it."""
     end = vertex.end
     where = (mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(hit.t), mi.Point2f(hit.prim_uv), mi.UInt32(hit.prim_index))
     shapes = (mi.ShapePtr(hit.shape), mi.ShapePtr(hit.instance))
     depth = dr.select(smooth, vertex.depth, 0)
-    return Record(*where, *shapes, mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth)
+    return record_class(mi.variant())(
+        *where, *shapes, mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth
+    )
 
 
-def recall(kept: Record, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
+def recall(kept, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
     """The vertex of which a record was kept."""
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(kept.t))
     hit.t, hit.prim_uv, hit.prim_index, hit.shape, hit.instance = (
