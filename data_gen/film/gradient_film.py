@@ -7,7 +7,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film.moments import Moments, accumulate, no_moments, one_more
-from data_gen.film.splats import splat_sums
+from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
 # What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
@@ -26,8 +26,8 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
-# Per pixel, of a pass that is one batch: the mean over the batch, and two sums of splats, of one name.
-_BATCH_BYTES = 3 * 8 + 3 * 3 * 8
+# Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
+_BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
 
@@ -54,7 +54,7 @@ class GradientFilm:
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
         self.moments: dict[str, Moments] = {}
         self._pass: dict[str, tuple] = {}
-        self._splats: dict[str, tuple] = {}
+        self._splats: dict[str, Splats] = {}
 
     def put(self, name: str, value, active: bool | mi.Bool = True) -> None:
         """Adds the samples of one pass.
@@ -78,14 +78,16 @@ class GradientFilm:
         splats over n. So a lane's splat counts like its put: one light path per camera sample, each worth the
         contribution to its pixel over its density, fills the image. Several splats of a name in a pass add up.
         """
+        components = _components(value)
+        self.splats(name, len(components)).add(pixel, components, mi.Bool(active))
+
+    def splats(self, name: str, channels: int = 3) -> Splats:
+        """What collects the splats of a name in this pass: its ``add`` may be called within symbolic loops."""
         if not self.batches:
             raise ValueError("this film takes samples for independent, which splats are not: make it with batches")
-        sums, lost = splat_sums(self.pixels, pixel, _components(value), mi.Bool(active))
-        if name in self._splats:
-            before, already = self._splats[name]
-            sums, lost = [a + b for a, b in zip(before, sums, strict=True)], already + lost
-            dr.eval(sums, lost)
-        self._splats[name] = (sums, lost)
+        if name not in self._splats:
+            self._splats[name] = Splats(self.pixels, channels)
+        return self._splats[name]
 
     def end_pass(self, block: int | None = None) -> None:
         """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
@@ -130,7 +132,7 @@ class GradientFilm:
                 batch = accumulate(no_moments(self.pixels, len(components), False), components, active, *where)
                 mean, exists, lost = batch.mean, batch.count > 0, batch.lost
             if name in splats:
-                sums, lost_splats = splats[name]
+                sums, lost_splats = splats[name].totals(), splats[name].lost
                 share = dr.opaque(dr.float64_array_t(mi.Float), 1 / spp)
                 # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]

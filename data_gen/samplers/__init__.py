@@ -112,14 +112,19 @@ def _refused_by_gpt(facts: Facts) -> str:
     return ""
 
 
-def _refused_by_gpt_simple(facts: Facts) -> str:
+def _refused_but_for_surfaces(facts: Facts, name: str) -> str:
     if facts.polarised:
-        return f"variant '{facts.polarised}' is polarised, which 'gpt-simple' does not follow"
+        return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow"
     if facts.integrator != "path":
-        return f"the integrator is '{facts.integrator}', and 'gpt-simple' knows only 'path'"
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
     if facts.media:
-        return f"there are media ({', '.join(facts.media)}), which 'gpt-simple' does not see"
-    return "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
+        return f"there are media ({', '.join(facts.media)}), which '{name}' does not see"
+    return ""
+
+
+def _refused_by_gpt_simple(facts: Facts) -> str:
+    mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
+    return _refused_but_for_surfaces(facts, "gpt-simple") or mirrors
 
 
 def _notes_on_replay(facts: Facts) -> list[str]:
@@ -138,8 +143,15 @@ def _notes_on_gpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _PRIMAL = (
-    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "primal")
+def _notes_on_bdpt(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends"]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: caustics seen in them are found from the camera alone, with much noise")
+    return lines
+
+
+_GPT, _BASIC, _SIMPLE, _BDPT, _PRIMAL = (
+    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "primal")
 )
 
 for _sampler in (
@@ -175,6 +187,17 @@ for _sampler in (
         _refused_by_gpt_simple,
         lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
         module=_SIMPLE,
+    ),
+    Sampler(
+        "bdpt",
+        "paths from the camera and from the lights, without gradients (hidden lamps, caustics seen directly)",
+        _from_module(_BDPT),
+        lambda facts: _refused_but_for_surfaces(facts, "bdpt"),
+        _notes_on_bdpt,
+        {"joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera"},
+        gradients=False,
+        batch=4,
+        module=_BDPT,
     ),
     Sampler(
         "primal",

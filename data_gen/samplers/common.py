@@ -62,6 +62,16 @@ class GradientIntegrator(mi.SamplingIntegrator):
     def aov_names(self):
         return self.channels
 
+    def first_hit(self, scene, ray, active=True) -> mi.PreliminaryIntersection3f:
+        """Where a camera ray leads, through lamps that hide from the camera."""
+        ray = mi.Ray3f(ray)
+        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        if self.hide_emitters:
+            lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
+            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
+            hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
+        return hit
+
 
 def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
     """The integrator ``plugin`` with the parameters of the scene's own ``path``, and ``options`` of its own.

@@ -238,16 +238,6 @@ class GPT(GradientIntegrator):
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         return L, L_caustic, offsets, chain
 
-    def first_hit(self, scene, ray, active=True) -> mi.PreliminaryIntersection3f:
-        """Where a camera ray leads, through lamps that hide from the camera."""
-        ray = mi.Ray3f(ray)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-        if self.hide_emitters:
-            lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
-            si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
-            hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
-        return hit
-
     def first_surface(self, scene, ray, medium, active) -> mi.PreliminaryIntersection3f:
         """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
         hit = self.first_hit(scene, ray, active)

@@ -1,0 +1,262 @@
+r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
+
+Light that a camera path finds by accident alone, from lamps behind shades or through glass onto a wall, a light path
+finds at once. Every way to find a path is a strategy; all are weighted against each other (``mis``).
+
+    z                 vertices of the camera path
+    y                 vertices of the light path, kept while the camera path is traced
+    β                 throughput f / p of either
+    p, q              density of a sampled direction, and of the same with both directions swapped
+    others            Σ p_j / p_s over all other strategies
+    L, Le             radiance of the camera path without, and of only, the emission that the camera sees directly
+
+Both paths are made in one kernel. Light paths that reach the camera end on pixels of their own: they are splatted, so
+samples are independent from pass to pass only. Paths of more than ``joined_depth`` edges are found from the camera
+alone, by s = 0 and s = 1: that bounds what is kept of a light path, and paths may be as long as they like.
+
+[Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", chapter 10]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import GradientFilm
+from data_gen.film.splats import Splats
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import NULL, event_kind
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.bdpt.strategies import connected, emission_at, to_camera, to_light
+from data_gen.samplers.bdpt.vertex import (
+    IMPORTANCE,
+    RADIANCE,
+    Vertex,
+    adjoint,
+    context,
+    cosine,
+    leave,
+    recall,
+    record,
+    record_class,
+    reverse_density,
+    scatters_smoothly,
+)
+from data_gen.samplers.common import GradientIntegrator, like_path
+from ngpt.errors import NgptError
+
+_CAMERAS = ("PerspectiveCamera", "ThinLensCamera")
+
+
+class BDPT(GradientIntegrator):
+    """Bidirectional path tracing, for surfaces; no gradients.
+
+    Plugin ``bdpt``. Parameters, the first three as for Mitsuba's ``path``:
+
+    ``max_depth``      default -1: no limit
+    ``rr_depth``       5
+    ``hide_emitters``  false
+    ``joined_depth``   10, the number of edges up to which paths are found from both ends
+
+    Not handled: media, polarised variants, cameras that are neither perspective nor thin lenses, emitters other than
+    areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        max_depth = props.get("max_depth", -1)
+        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
+        self.rr_depth = props.get("rr_depth", 5)
+        self.joined_depth = props.get("joined_depth", 10)
+        if not 1 <= self.joined_depth <= 64:
+            raise NgptError(f"bdpt: joined_depth {self.joined_depth} is out of range; use 1 .. 64")
+
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene)
+        lights = LightEnds(scene)
+        return lambda camera, film: self.sample_pass(scene, lights, camera, film)
+
+    def sample_pass(self, scene, lights: LightEnds, camera: CameraSamples, film: GradientFilm) -> None:
+        """Takes one path from the camera and one from a light for each camera sample."""
+        ray, importance, _ = camera.rays()
+        random = camera.random.clone()
+        longest = min(self.max_depth, self.joined_depth)
+        kept, count = None, mi.UInt32(0)
+        if longest > 1 and lights.emitters is not None:
+            splats = film.splats("primal")
+            kept, count, random = self.light_path(scene, lights, camera, random, ray, importance, longest, splats)
+        L, Le = self.camera_path(scene, lights, camera, random, ray, importance, kept, count, longest)
+        values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
+        values |= features(scene, camera.sensor, camera.random.clone(), ray)
+        # One kernel for all of it: each value read on its own would trace the paths again.
+        dr.eval(values)
+        film.put_all(values)
+
+    @dr.syntax
+    def light_path(self, scene, lights, camera, random, camera_ray, importance, longest, splats: Splats):
+        """Traces a path from a light; returns its vertices, how many they are, and ``random``."""
+        size, lens = camera.size, camera.sensor.needs_aperture_sample()
+        start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
+        ray, β = start.ray, start.β
+        active = dr.max(β) > 0
+        brightest = dr.rcp(dr.max(β))
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        si = hit.compute_surface_interaction(ray)
+        active &= si.is_valid()
+        e, p_light = lights.densities(scene, start, si)
+        end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
+        depth, count = mi.UInt32(1), mi.UInt32(0)
+        Record = record_class(mi.variant())
+        kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
+        while dr.hint(active, label="light path"):
+            y = Vertex(si, β, end, depth)
+            bsdf = si.bsdf()
+            smooth = active & scatters_smoothly(bsdf)
+            # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
+            kept.write(record(ray, hit, y, smooth), depth - 1, active)
+            count = dr.select(active, depth, count)
+
+            # ------------------- To the camera -----------------------
+            on_lens = mi.Point2f(0.5)
+            if dr.hint(lens, mode="scalar"):
+                on_lens = random.next_2d()
+            C, others, uv = to_camera(
+                camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
+            )
+            light = to_rgb(C * importance / (1 + others), camera_ray.wavelengths)
+            pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
+            splats.add(pixel, list(light), dr.max(C) > 0)
+
+            # -------------------- Next vertex ------------------------
+            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+            sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
+            d, end = leave(y, bsdf, sample, active)
+            β *= f_p * adjoint(si, sample.wo)
+            # By what is left of the light that the path began with
+            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
+            active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
+            β /= survival
+            depth += 1
+            ray = si.spawn_ray(d)
+            hit = scene.ray_intersect_preliminary(ray, active=active)
+            si = hit.compute_surface_interaction(ray)
+            active &= si.is_valid()
+            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+        return kept, count, random
+
+    @dr.syntax
+    def camera_path(self, scene, lights, camera, random, ray, importance, kept, count, longest):
+        """L and Le of a path from the camera, joined to the light path's vertices ``kept``."""
+        ray = mi.Ray3f(ray)
+        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
+        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+        sky_seen = mi.Bool(not self.hide_emitters)
+        shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
+        Le = importance * si.emitter(scene).eval(si, shown)
+        L = dr.zeros(mi.Spectrum, dr.width(ray))
+        β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+        active = si.is_valid() & (depth < self.max_depth)
+        _, density = camera.sensor.sample_direction(si, camera.lens, active)
+        end = mis.begin_camera(density[0], cosine(si, ray.d))
+        while dr.hint(active, label="camera path"):
+            z = Vertex(si, β, end, depth)
+            bsdf = si.bsdf()
+            smooth = active & scatters_smoothly(bsdf)
+            joined = depth + 1 <= longest
+
+            # --------------------- To a light ------------------------
+            u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
+            u_survival = random.next_1d()
+            light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
+            lit = smooth & (light.pdf > 0)
+            wo = si.to_local(light.d)
+            f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
+            f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
+            lit &= dr.max(f * weight) > 0
+            q = reverse_density(si, bsdf, wo, lit)
+            z.end = mis.Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0))
+            C, others = to_light(lights, z, light, weight, f, p, q)
+            lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
+            L += dr.select(lit, C / (1 + others), 0)
+
+            # ---------------- To the light path ----------------------
+            if dr.hint(kept is not None, mode="scalar"):
+                L += self.connections(scene, z, bsdf, smooth & joined, kept, count, longest, ray)
+
+            # -------------------- Next vertex ------------------------
+            found = active & (sample.pdf > 0)
+            sky_seen |= found & (event_kind(sample.sampled_type) != NULL)
+            η = dr.select(found, η * sample.eta, η)
+            d, end = leave(z, bsdf, sample, found)
+            β *= f_p
+            # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
+            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
+            active = found & (dr.max(β) > 0) & (u_survival < survival)
+            β /= survival
+            depth += 1
+            ray = si.spawn_ray(d)
+            reached = scene.ray_intersect(ray, active)
+
+            # ----------------- Emission met by chance ----------------
+            met = active & (reached.is_valid() | sky_seen)
+            Le_met, p, e = emission_at(scene, lights, reached, si, met)
+            # Longer paths are not found by light paths.
+            end.vc = dr.select(depth <= longest, end.vc, 0)
+            L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
+            si = reached
+            active &= si.is_valid() & (depth < self.max_depth)
+            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+        return L, Le
+
+    def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
+        """Whether something is between ``si`` and the camera; lamps are not, if they are hidden."""
+        if not self.hide_emitters:
+            return scene.ray_test(si.spawn_ray_to(camera.p), active)
+        on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers
+        ray = si.spawn_ray_to(camera.p)
+        hit = scene.ray_intersect_preliminary(ray, active=active & ~on_lamp)
+        lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711
+        behind = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp).spawn_ray_to(camera.p)
+        further = self.skip_area_emitters(scene, behind, False, lamp)
+        blocked = dr.select(lamp, further.is_valid() & (further.t < behind.maxt), hit.is_valid())
+        return on_lamp | blocked
+
+    @dr.syntax
+    def connections(self, scene, z, bsdf, active, kept, count, longest, ray):
+        """The light of all paths that join vertex ``z`` to one of those ``kept``."""
+        L = dr.zeros(mi.Spectrum, dr.width(z.depth))
+        i = mi.UInt32(0)
+        while dr.hint(active & (i < count), label="connections"):
+            y = recall(kept.read(i), ray.time, ray.wavelengths)
+            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= longest)
+            C, others = connected(scene, z, bsdf, y, joins)
+            L += dr.select(dr.max(C) > 0, C / (1 + others), 0)
+            i += 1
+        return L
+
+
+def refuse(scene) -> None:
+    """Raises NgptError for a variant or a camera that light paths cannot reach."""
+    if mi.is_polarized:
+        raise NgptError(
+            f"sampler 'bdpt' does not follow polarised light (variant '{mi.variant()}'); "
+            f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
+        )
+    camera = scene.sensors()[0]
+    if camera.class_name() not in _CAMERAS:
+        raise NgptError(
+            f"sampler 'bdpt' cannot render this scene: light paths cannot reach a camera of type "
+            f"{camera.class_name()}, but perspective and thin lens; use --sampler gpt, or primal"
+        )
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``bdpt``, with the parameters of the scene's own ``path``."""
+    return like_path(scene, "bdpt", **options).prepare(scene)
+
+
+mi.register_integrator("bdpt", lambda props: BDPT(props))

@@ -1,0 +1,184 @@
+"""The light's end of paths: where light starts, and with what densities."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from ngpt.errors import NgptError
+
+# An emitter is an area, a point (spots are points that fill a cone), or infinitely far away.
+_AREA, _POINT, _FAR = 0, 1, 2
+
+
+@dataclass
+class LightRay:
+    """The first edge of a light path, and the light's end of it."""
+
+    ray: mi.Ray3f
+    β: mi.Spectrum  # Le cos / p
+    emitter: mi.EmitterPtr
+    index: mi.UInt32
+    end: mi.DirectionSample3f  # position, normal and uv of the emitter's point, and its pdf
+    delta: mi.Bool
+
+
+class LightEnds:
+    """The emitters of a scene as the beginnings of light paths.
+
+    Points on areas are sampled as Mitsuba's emitters do, with a cosine distribution of directions; the directions of
+    what is infinitely far away as well, on a disk that covers the scene; points light all around, spots their cone.
+
+    Raises NgptError for a scene with emitters that Mitsuba does not tell enough of.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        emitters = scene.emitters()
+        kinds = [_kind(emitter) for emitter in emitters]
+        for emitter, kind in zip(emitters, kinds, strict=True):
+            if kind is None:
+                raise NgptError(
+                    f"sampler 'bdpt' cannot render this scene: light cannot be traced from emitter '{emitter.id()}' "
+                    f"({emitter.class_name()}); use --sampler gpt, or primal"
+                )
+        box = scene.bbox()
+        self.center = mi.ScalarPoint3f(box.center())
+        # A disk that only just covers the corners would lose some to rounding.
+        self.radius = 1.001 * float(np.linalg.norm(np.array(box.extents()))) / 2
+        self.kinds = set(kinds)
+        self.emitters = scene.emitters_dr() if emitters else None
+        self.kind = mi.UInt32(np.array(kinds or [0], np.uint32))
+        tables = [_table(scene, emitter, kind) for emitter, kind in zip(emitters, kinds, strict=True)] or [[0] * 8]
+        x, y, z, u, v, w, self.cutoff, of_ball = map(mi.Float, np.array(tables, np.float32).T)
+        self.position, self.axis = mi.Point3f(x, y, z), mi.Vector3f(u, v, w)
+        # Of spheres, of which connections find the visible part alone: density of emission per area; else 0
+        self.of_ball = of_ball
+        self.balls = bool(np.any(np.array(of_ball) > 0))
+        numbers = [int(dr.reinterpret_array(mi.UInt32, mi.EmitterPtr(emitter))[0]) for emitter in emitters]
+        index = np.zeros(max(numbers, default=0) + 1, np.uint32)
+        index[numbers] = np.arange(len(numbers))
+        self.indices = mi.UInt32(index)
+        dr.eval(self.kind, self.position, self.axis, self.cutoff, self.of_ball, self.indices)
+
+    def index_of(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
+        """The number of an emitter in the scene."""
+        return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
+
+    def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
+        """``e`` of ``mis``, of the emitter with that number.
+
+        ``p``          density of connecting to this point of the emitter from the other end of the edge, not of deltas
+        ``cos``        absolute cosine at the emitter
+        ``distance2``  squared length of the edge
+        """
+        kind = dr.gather(mi.UInt32, self.kind, index)
+        e = mi.Float(1 / (np.pi * self.radius**2))
+        if _POINT in self.kinds:
+            e = dr.select(kind == _POINT, _cone_density(dr.gather(mi.Float, self.cutoff, index)) / distance2, e)
+        if _AREA in self.kinds:
+            area = cos / (dr.pi * distance2)
+            if self.balls:
+                of_ball = dr.gather(mi.Float, self.of_ball, index)
+                area = dr.select(of_ball > 0, of_ball / (dr.pi * p), area)
+            e = dr.select(kind == _AREA, area, e)
+        return e
+
+    def sample(self, scene, random, time, wavelengths) -> LightRay:
+        """The start of a light path."""
+        u, u_position, u_direction = random.next_1d(), random.next_2d(), random.next_2d()
+        index, weight, _ = scene.sample_emitter(u)
+        emitter = dr.gather(mi.EmitterPtr, self.emitters, index)
+        kind = dr.gather(mi.UInt32, self.kind, index)
+        n = dr.width(index)
+        end = dr.zeros(mi.DirectionSample3f, n)
+        origin, d = dr.zeros(mi.Point3f, n), mi.Vector3f(0, 0, 1)
+        β, delta = mi.Spectrum(0), mi.Bool(False)
+        if _AREA in self.kinds:
+            here = kind == _AREA
+            place, _ = emitter.sample_position(time, u_position, here)
+            si = mi.SurfaceInteraction3f(place, wavelengths)
+            si.wi = mi.warp.square_to_cosine_hemisphere(u_direction)
+            Le = emitter.eval(si, here)
+            β = dr.select(here & (place.pdf > 0), Le * (dr.pi * weight / place.pdf), β)
+            d = dr.select(here, si.to_world(si.wi), d)
+            origin = dr.select(here, si.spawn_ray(d).o, origin)
+            end.p, end.n, end.uv, end.pdf = place.p, place.n, place.uv, place.pdf
+        if _POINT in self.kinds:
+            here = kind == _POINT
+            cutoff = dr.gather(mi.Float, self.cutoff, index)
+            frame = mi.Frame3f(dr.gather(mi.Vector3f, self.axis, index))
+            position = dr.gather(mi.Point3f, self.position, index)
+            along = frame.to_world(mi.warp.square_to_uniform_cone(u_direction, cutoff))
+            # The intensity is what arrives at distance 1.
+            beside = _somewhere(position + along, time, wavelengths)
+            _, intensity = emitter.sample_direction(beside, mi.Point2f(0.5), here)
+            β = dr.select(here, intensity * (weight / _cone_density(cutoff)), β)
+            origin, d, delta = dr.select(here, position, origin), dr.select(here, along, d), delta | here
+            end.p = dr.select(here, position, end.p)
+        if _FAR in self.kinds:
+            here = kind == _FAR
+            middle = _somewhere(mi.Point3f(self.center), time, wavelengths)
+            sky, arrives = emitter.sample_direction(middle, u_position, here)
+            disk = mi.warp.square_to_uniform_disk_concentric(u_direction)
+            offset = mi.Frame3f(sky.d).to_world(mi.Vector3f(disk.x, disk.y, 1))
+            β = dr.select(here & (sky.pdf > 0), arrives * (weight * (np.pi * self.radius**2)), β)
+            origin = dr.select(here, self.center + self.radius * offset, origin)
+            d = dr.select(here, -sky.d, d)
+            delta |= here & sky.delta
+            end.pdf = dr.select(here, sky.pdf, end.pdf)
+        end.pdf /= weight
+        return LightRay(mi.Ray3f(origin, d, time, wavelengths), β, emitter, index, end, delta)
+
+    def densities(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[mi.Float, mi.Float]:
+        """``e`` and ``p`` of ``mis``, seen from the first vertex ``y`` of a light path."""
+        end, d = mi.DirectionSample3f(start.end), start.ray.d
+        distance2 = dr.squared_norm(end.p - y.p)
+        cos = dr.abs(dr.dot(end.n, d))
+        area = dr.gather(mi.UInt32, self.kind, start.index) == _AREA
+        p = dr.select(area, end.pdf * distance2 / cos, end.pdf)
+        if self.balls:
+            end.d, end.dist, end.emitter = -d, dr.sqrt(distance2), start.emitter
+            ball = area & (dr.gather(mi.Float, self.of_ball, start.index) > 0)
+            p = dr.select(ball, scene.pdf_emitter_direction(y, end, ball), p)
+        return self.emission(start.index, p, cos, distance2), p
+
+
+def _kind(emitter: mi.Emitter) -> int | None:
+    """The kind of an emitter; None for one that light paths cannot begin at."""
+    if mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite):
+        return _FAR
+    return {"AreaLight": _AREA, "PointLight": _POINT, "SpotLight": _POINT}.get(emitter.class_name())
+
+
+def _table(scene: mi.Scene, emitter: mi.Emitter, kind: int) -> list[float]:
+    """Position, axis and cosine of the cutoff of points, and of spheres the density of emission per area."""
+    if kind == _AREA:
+        shape = emitter.get_shape()
+        ball = shape.class_name() == "Sphere"
+        index = [other.ptr for other in scene.emitters()].index(emitter.ptr)
+        density = float(scene.pdf_emitter(mi.UInt32(index))[0] / shape.surface_area()[0]) if ball else 0.0
+        return [0, 0, 0, 0, 0, 1, -1, density]
+    if kind == _POINT:
+        position = emitter.sample_direction(dr.zeros(mi.Interaction3f), mi.Point2f(0.5))[0].p
+        params = mi.traverse(emitter)
+        axis, cutoff = mi.Vector3f(0, 0, 1), -1.0
+        if emitter.class_name() == "SpotLight":
+            axis = dr.normalize(params["to_world"] @ mi.Vector3f(0, 0, 1))
+            cutoff = float(np.cos(np.radians(float(np.array(params["cutoff_angle"]).ravel()[0]))))
+        return [*np.array(position).ravel(), *np.array(axis).ravel(), cutoff, 0]
+    return [0, 0, 0, 0, 0, 1, -1, 0]
+
+
+def _cone_density(cutoff: mi.Float) -> mi.Float:
+    """Of directions within a cone, or a whole sphere where the cosine of its angle is -1."""
+    return dr.rcp(dr.two_pi * (1 - cutoff))
+
+
+def _somewhere(position: mi.Point3f, time, wavelengths) -> mi.Interaction3f:
+    """A point that is on no surface."""
+    it = dr.zeros(mi.Interaction3f, dr.width(position))
+    it.t, it.p, it.time, it.wavelengths = 0, position, time, wavelengths
+    return it

@@ -1,0 +1,79 @@
+r"""How the ways to find a path share it: the balance heuristic over all of them, by recursion along either end.
+
+A path x0 (camera) x1 ... xk (light) is found by k + 1 strategies: s of its vertices come from the light, the others
+from the camera. With p_s the density of strategy s, its weight is p_s / Σ p_j = 1 / (1 + others), where
+
+    others = Σ_{j≠s} p_j / p_s = the strategies with a longer light path + those with a longer camera path.
+
+Either sum is a number that its end carries from vertex to vertex, without the densities themselves (Georgiev 2012,
+"Implementing Vertex Connection and Merging", with no merging):
+
+    vcm   1 / the density of the last vertex, the first summand without what is still unknown of it
+    vc    the sum of all further summands, likewise
+
+Densities are those before Russian roulette: weights are then a function of the path alone. Camera and light begin
+alike. ``e`` stands for both: p_emit / (p_connect cos), the density of sampling the first edge outward, over that of
+choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
+summands are 0, and the densities of both directions cancel in what is behind them.
+
+``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
+the geometric normal. All quotients are taken one by one: squares of densities would leave float32.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+
+@dataclass
+class Partial:
+    """What one end of a path knows of the strategies, at its last vertex, or on the way from there."""
+
+    vcm: mi.Float
+    vc: mi.Float
+
+
+def begin_camera(e: mi.Float, cos: mi.Float) -> Partial:
+    """At the first vertex that the camera sees: there is no strategy that meets the camera by chance."""
+    return Partial(dr.rcp(e * cos), mi.Float(0))
+
+
+def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Partial:
+    """At the first vertex lit: ``p`` is the density of connecting that vertex to the light's end."""
+    return Partial(dr.rcp(e * cos), dr.select(delta, 0, dr.rcp(e * p * cos)))
+
+
+def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool) -> Partial:
+    """Behind an event that was sampled with density ``p``."""
+    vc = dr.select(delta, end.vc * cos, cos / p * (end.vcm + end.vc * q))
+    return Partial(dr.select(delta, 0, dr.rcp(p)), vc)
+
+
+def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
+    """At the next vertex."""
+    return Partial(end.vcm * distance2 / cos, end.vc / cos)
+
+
+def others_emitted(end: Partial, e: mi.Float, p: mi.Float) -> mi.Float:
+    """Of a camera path that has met an emitter; ``end`` is on the way there, ``p`` the density of connecting to it."""
+    return p * (end.vcm + e * end.vc)
+
+
+def others_to_light(end: Partial, e: mi.Float, p_light: mi.Float, cos: mi.Float, p, q) -> mi.Float:
+    """Of a camera path whose last vertex is connected to a light, found with density ``p_light``; 0: a delta light."""
+    return dr.select(p_light > 0, p / p_light, 0) + others_to_camera(end, e, cos, q)
+
+
+def others_to_camera(end: Partial, e: mi.Float, cos: mi.Float, q: mi.Float) -> mi.Float:
+    """Of a light path whose last vertex is connected to the camera."""
+    return e * cos * (end.vcm + end.vc * q)
+
+
+def others_connected(z: Partial, cos_z, p_z, q_z, y: Partial, cos_y, p_y, q_y, distance2) -> mi.Float:
+    """Of a camera path connected to a light path: ``z`` and ``y`` are their last vertices."""
+    from_camera = p_z * cos_y / distance2 * (y.vcm + y.vc * q_y)
+    from_light = p_y * cos_z / distance2 * (z.vcm + z.vc * q_z)
+    return from_camera + from_light

@@ -1,0 +1,61 @@
+"""The four ways to complete a path: by its last vertex, s or t of them from an end, each with its MIS weight.
+
+    emitted     s = 0: the camera path has met an emitter
+    to_light    s = 1: its last vertex is connected to a sampled point of an emitter
+    connected   s, t > 1: its last vertex is connected to one of the light path
+    to_camera   t = 1: a vertex of the light path is connected to the camera
+
+Each returns f / p of the path that it completes, and ``others`` of ``mis``: its weight is 1 / (1 + others).
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate
+
+
+def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
+    """Le at ``si`` toward ``ref`` where ``active``; ``p`` of connecting to it from there, and ``e`` of ``mis``."""
+    light = mi.DirectionSample3f(scene, si, ref)
+    Le, p = light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, active)
+    cos = dr.abs(dr.dot(light.n, light.d))
+    e = lights.emission(lights.index_of(light.emitter, active), p, cos, dr.square(light.dist))
+    return Le, p, dr.select(p > 0, e, 0)
+
+
+def to_light(lights: LightEnds, z: Vertex, light, weight, f, p, q) -> tuple[mi.Spectrum, mi.Float]:
+    """s = 1: ``light`` and its ``weight`` Le / p are Mitsuba's; f, p, q those of ``evaluate`` toward it."""
+    cos = dr.abs(dr.dot(light.n, light.d))
+    e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
+    p_light = dr.select(light.delta, 0, light.pdf)
+    return z.β * f * weight, mis.others_to_light(z.end, e, p_light, cosine(z.si, light.d), p, q)
+
+
+def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
+    """s, t > 1, occlusion included."""
+    to = mi.Vector3f(y.si.p - z.si.p)
+    distance2 = dr.squared_norm(to)
+    d = to * dr.rsqrt(distance2)
+    f, p_z, q_z = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(d), active)
+    g, p_y, q_y = evaluate(IMPORTANCE, y.si, y.si.bsdf(), y.si.to_local(-d), active)
+    C = z.β * y.β * f * g / distance2
+    # Vertices in one place are no path: their density is infinite.
+    lit = active & (dr.max(C) > 0) & (distance2 > 0)
+    C = dr.select(lit & ~scene.ray_test(z.si.spawn_ray_to(y.si.p), lit), C, 0)
+    cosines = cosine(z.si, d), cosine(y.si, d)
+    return C, mis.others_connected(z.end, cosines[0], p_z, q_z, y.end, cosines[1], p_y, q_y, distance2)
+
+
+def to_camera(sensor, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+    """t = 1; and the place on the film, in pixels. ``occluded`` is asked for (si, toward the camera, active)."""
+    camera, importance = sensor.sample_direction(y.si, lens, active)
+    active = active & (camera.pdf > 0) & (dr.max(importance) > 0)
+    f, _, q = evaluate(IMPORTANCE, y.si, bsdf, y.si.to_local(camera.d), active)
+    C = y.β * f * importance
+    seen = active & (dr.max(C) > 0)
+    C = dr.select(seen & ~occluded(y.si, camera, seen), C, 0)
+    return C, mis.others_to_camera(y.end, importance[0], cosine(y.si, camera.d), q), camera.uv

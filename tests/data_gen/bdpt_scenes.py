@@ -1,0 +1,95 @@
+"""Scenes with every kind of light, for the tests of bidirectional samplers: name -> description."""
+
+import numpy as np
+from data_gen_scenes import caustics, furnace, glass, hidden_lamp, plenty, polished
+
+
+def _stage(**lamps):
+    """A corner with a metal ball, without lamps but those given."""
+    from data_gen.scenes.builtin import _camera, _diffuse, _sphere, _wall
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 6, "rr_depth": 3},
+        "sensor": _camera([0, 0.8, 4], [0, 0.6, 0], 45),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (6, 6), _diffuse(0.6, 0.5, 0.4)),
+        "wall": _wall([1.2, 1, 0], [-1, 0, 0], (6, 2), _diffuse(0.7, 0.2, 0.2)),
+        "ball": _sphere([-0.4, 0.5, 0], 0.5, {"type": "roughconductor", "material": "Cu", "alpha": 0.2}),
+        **lamps,
+    }
+
+
+def points():
+    """What has no area, without glass: ``path`` cannot see its caustics."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _rgb
+
+    toward = mi.ScalarTransform4f().look_at([-0.5, 2.5, 1.5], [0, 0.3, 0], [0, 0, 1])
+    return _stage(
+        point={"type": "point", "position": [0.5, 2, 1], "intensity": _rgb(4, 3, 2), "sampling_weight": 0.4},
+        spot={"type": "spot", "to_world": toward, "intensity": _rgb(12, 9, 9), "cutoff_angle": 30},
+        sun={"type": "directional", "direction": [0.3, -1, -0.5], "irradiance": _rgb(2, 2, 1.5)},
+    )
+
+
+def areas():
+    """A textured rectangle, a sphere, a cylinder, a disk and a mesh."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _box, _diffuse, _light, _rgb, _sphere
+
+    def glows(*rgb):
+        return {"emitter": {"type": "area", "radiance": _rgb(*rgb)}}
+
+    texels = (np.random.default_rng(1).random((4, 4, 3)) ** 4 * 20).astype(np.float32)
+    picture = {"type": "bitmap", "bitmap": mi.Bitmap(texels), "raw": True, "filter_type": "nearest"}
+    over = mi.ScalarTransform4f().look_at([0.9, 1.9, 0.8], [0, 0, 0], [0, 0, 1]).scale(0.2)
+    return _stage(
+        picture=_light([0.3, 2.3, 0], [0, -1, 0], (1.5, 1.5), (1, 1, 1))
+        | {"emitter": {"type": "area", "radiance": picture}},
+        bulb=_sphere([-0.9, 1.5, 0.5], 0.2, _diffuse(0.3, 0.3, 0.3)) | glows(9, 7, 5),
+        tube={"type": "cylinder", "p0": [-0.8, 1.8, 0.2], "p1": [0.3, 1.9, 0.4], "radius": 0.08, **glows(8, 7, 5)},
+        disk={"type": "disk", "to_world": over, **glows(15, 13, 10)},
+        cube=_box([0.5, 0.2, 0.9], [0.2, 0.2, 0.2], 30, _diffuse(0.2, 0.2, 0.2)) | glows(2, 1, 3),
+        glass=_sphere([0.6, 0.75, 0.3], 0.3, {"type": "dielectric"}),
+    )
+
+
+def sky():
+    """An environment with a sun, a lamp before it, and choices of unequal weight."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _diffuse, _rgb, _sky, _sphere
+
+    bulb = _sphere([-0.3, 1.9, 0.5], 0.25, _diffuse(0.3, 0.3, 0.3))
+    return _stage(
+        sky={"type": "envmap", "bitmap": mi.Bitmap(_sky(16, 32)), "sampling_weight": 2.0},
+        bulb=bulb | {"emitter": {"type": "area", "radiance": _rgb(9, 7, 5)}},
+        glass=_sphere([0.6, 0.35, 0.6], 0.3, {"type": "dielectric"}),
+    )
+
+
+def hidden_sky():
+    """A sky that hides from the camera, but not from mirrors and glass."""
+    scene = sky()
+    scene["integrator"]["hide_emitters"] = True
+    return scene
+
+
+SCENES = {
+    "points": points,
+    "areas": areas,
+    "sky": sky,
+    "glass": glass,
+    "hidden_lamp": hidden_lamp,
+    "hidden_sky": hidden_sky,
+    "plenty": plenty,
+    "furnace": furnace,
+    "caustics": caustics,
+    "polished": lambda: polished(0.05),
+    "diffuse": "diffuse",
+    "glossy": "glossy",
+    "environment": "environment",
+    "lens": "lens",
+}
