@@ -68,6 +68,7 @@ def through_medium(medium, ray, length, sampler, steps: int):
     """
     transmittance = mi.unpolarized_spectrum(mi.Spectrum(1))
     albedo = mi.unpolarized_spectrum(mi.Spectrum(0))
+    spectrum = type(albedo)
     # Where the density of a grid is not 0; all of a ray in a medium without bounds.
     inside = medium != None  # noqa: E711 - a comparison of arrays of pointers
     hit, first, end = medium.intersect_aabb(ray)
@@ -84,8 +85,9 @@ def through_medium(medium, ray, length, sampler, steps: int):
         scattering, _, extinction = medium.get_scattering_coefficients(mei, inside)
         passed = dr.exp(-mi.unpolarized_spectrum(extinction) * step)
         own = mi.unpolarized_spectrum(scattering) / mi.unpolarized_spectrum(extinction)
-        albedo += transmittance * (1 - passed) * dr.select(extinction > 0, own, 0)
-        transmittance *= passed
+        # Spectra become plain arrays where they meet masks; loops want what they began with.
+        albedo = spectrum(albedo + transmittance * (1 - passed) * dr.select(own > 0, own, 0))
+        transmittance = spectrum(transmittance * passed)
         i += 1
     return transmittance, albedo
 
@@ -117,7 +119,7 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
             # Light that escapes has come from far, but not from so far that float32 has no number for it.
             length = dr.minimum(si.t, 1e9)
             passed, albedo = through_medium(medium, ray, length, sampler, steps)
-            scattered += tint * albedo
+            scattered = type(scattered)(scattered + tint * albedo)
             tint *= passed
         bsdf = si.bsdf(mi.RayDifferential3f(ray))
         flags = bsdf.flags()
