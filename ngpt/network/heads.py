@@ -175,7 +175,8 @@ class Pyramid(Head):
     and a_s is averaged over the pixels of the resolution.
 
     ``demodulate``  they average the image over the reflectance, which is multiplied again afterwards: what of the image
-                    is texture is not averaged
+                    is texture is not averaged. A pixel counts by its reflectance then, as it does in a fit of the
+                    image to the reflectance: a lamp, whose albedo is 0, would spread ten times its light otherwise
     """
 
     normalise = True
@@ -209,6 +210,7 @@ class Pyramid(Head):
         weight = (torch.sigmoid(prediction[:, :1]) + LEAST_TRUST) / (1 + image.abs().mean(1, keepdim=True))
         if self.demodulate:
             image = image / images[-1]
+            weight = weight * images[-1].mean(1, keepdim=True)
         rest, taps = prediction[:, 1:], self.size**2
         filtered, shares = [], []
         for scale in range(self.scales):
@@ -252,6 +254,7 @@ class Pyramid(Head):
         weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / (op.ReduceMean(abs(image), [1], keepdims=1) + 1.0)
         if self.demodulate:
             image = image / images[-1]
+            weight = weight * op.ReduceMean(images[-1], [1], keepdims=1)
         rest, taps, border = part(prediction, 1, self.outputs), self.size**2, [self.size // 2] * 4
         filtered, shares = [], []
         for scale in range(self.scales):
