@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import gc
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
@@ -68,6 +70,8 @@ def render_passes(
     if batch:
         most = 1
     start = now = time.perf_counter()
+    # Scenes that are no longer used would make kernels larger: those call what any living scene consists of.
+    gc.collect()
 
     def report(finished: bool = False) -> None:
         if seconds is None:
@@ -83,8 +87,9 @@ def render_passes(
         # What is left over at the end is a block of its own.
         n = left if left < block else block * max(1, min(blocks, most, left // block))
         begin = now
-        sample(CameraSamples(sensor, seed, n, film.samples, min(n, block)), film)
-        film.end_pass(min(n, block))
+        with recording():
+            sample(CameraSamples(sensor, seed, n, film.samples, min(n, block)), film)
+            film.end_pass(min(n, block))
         dr.sync_thread()
         now = time.perf_counter()
         time_left = float("inf") if seconds is None else seconds - (now - start)
@@ -95,6 +100,23 @@ def render_passes(
             break
         blocks = int(min(time_left, _PASS_SECONDS) / each)
     return film
+
+
+@contextmanager
+def recording() -> Iterator[None]:
+    """While kernels are recorded in it, Python frees no scene that is left over from before.
+
+    A call of Dr.Jit holds one function for each object (material, lamp ...) that lives at that moment. Were a second
+    scene freed amid a kernel, a lamp could be one of two in one call and the only one in the next. Dr.Jit 1.5 takes the
+    two ways to call for two functions, gives both one name ("invalid redefinition of function"), and ends the process.
+    """
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def block_of_samples(pixels: int) -> int:

@@ -7,14 +7,6 @@ from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
-# They come last. After hundreds of other scenes in one process, Dr.Jit 1.5 may name a function of a later kernel twice
-# ("invalid redefinition of function"), and ends the process.
-_LAST = ("test_bdpt", "test_builtin_media", "test_gpt_media", "test_procedural_variety")
-
-
-def pytest_collection_modifyitems(items):
-    items.sort(key=lambda item: item.path.stem.startswith(_LAST))
-
 
 @pytest.fixture
 def rng():

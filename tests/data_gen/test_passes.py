@@ -1,5 +1,7 @@
 """How a render is split into passes: never seen in its bits, bounded in memory and time."""
 
+import subprocess
+import sys
 import time
 
 import numpy as np
@@ -112,3 +114,33 @@ def test_a_million_samples_of_one_pixel(renderer):
     assert stack.attributes["ngpt:spp"] == 1 << 20
     assert np.allclose(np.linalg.norm(stack["normal"]), 1, atol=1)
     assert (stack["primal_var"] < 1e-4 * stack["primal"] ** 2).all()
+
+
+# A scene is left over, in a cycle, amid a kernel, and Python looks for such wherever it is allowed to.
+LEFT_OVER = """
+import gc
+from data_gen.backend import use_variant
+use_variant()
+import mitsuba as mi
+from data_gen.render import render_stack
+from data_gen.scenes.load import load_scene
+
+held = [load_scene("diffuse", (8, 8))]
+held.append(held)
+
+def asked(*arguments, asks=mi.Scene.sample_emitter_direction):
+    global held
+    answer, held = asks(*arguments), None
+    if gc.isenabled():
+        gc.collect()
+    return answer
+
+mi.Scene.sample_emitter_direction = asked
+print(render_stack(load_scene("diffuse", (8, 8)), 1, seed=1, sampler="gpt")["primal"].shape)
+assert gc.isenabled()
+"""
+
+
+def test_no_scene_dies_while_a_kernel_is_recorded(renderer):
+    run = subprocess.run([sys.executable, "-c", LEFT_OVER], capture_output=True, text=True)
+    assert (run.returncode, run.stdout) == (0, "(8, 8, 3)\n"), run.stderr[-300:]
