@@ -238,7 +238,8 @@ def test_light_vertices_are_kept_where_they_belong(renderer):
     """Dr.Jit 1.5 (LLVM) loses what lanes write to different places of local memory: all light behind glass, once."""
     import drjit as dr
 
-    _, kept, count = light_vertices(renderer, load(renderer, glass, (16, 16)), 16)
+    scene = load(renderer, glass, (16, 16))
+    _, kept, count = light_vertices(renderer, scene, 16)
     depths = [kept.read(renderer.UInt32(i)).depth for i in range(5)]
     dr.eval(depths, count)
     depths, count = np.stack([np.array(depth) for depth in depths], axis=1), np.array(count)[:, None]
