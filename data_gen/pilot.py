@@ -30,16 +30,16 @@ from data_gen.scenes.load import set_film_size
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
-from ngpt.stack import GradientStack
 
-# Samples per pixel of each of the two stacks: two batches of samplers that have them.
+# Samples per pixel of each of the two stacks; of a sampler with batches at least two of those
 SPP = 8
 # Pixels of a pilot; larger images are rendered smaller.
 _PIXELS = 1 << 16
 # Of what the whole render may take
 SHARE = 0.05
-# Less than this is hardly enough to compile the kernels of a second sampler.
-_LEAST_SECONDS = 5.0
+# Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
+# of which a core or two make a million a second
+_LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.25
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
@@ -55,13 +55,11 @@ class Trial:
     ``images``   its two images, (H, W, 3), reconstructed where it has gradients
     ``primals``  the same as they were rendered
     ``seconds``  of one of them, kernels compiled
-    ``stack``    one of the two
     """
 
     images: tuple[np.ndarray, np.ndarray]
     primals: tuple[np.ndarray, np.ndarray]
     seconds: float
-    stack: GradientStack
 
 
 @dataclass(frozen=True)
@@ -85,28 +83,25 @@ def candidates(scene: mi.Scene) -> list[str]:
 def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None) -> Choice:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
-    The description alone decides, at no cost, where one sampler alone can render the scene, and where 5 % of the render
-    are too short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has
-    the bits of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene.
+    The description alone decides, at no cost, where one sampler alone can render the scene, and where the render is too
+    short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has the bits
+    of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene.
     """
     start = time.perf_counter()
     sampler, reason = choose(scene_facts(scene))
     names = candidates(scene)
     if len(names) == 1:
         return Choice(sampler, reason)
-    if seconds is not None and SHARE * seconds < _LEAST_SECONDS:
+    paths = math.inf if spp is None else spp * math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+    if paths < _LEAST_PATHS or (seconds is not None and seconds < _LEAST_SECONDS):
         return Choice(sampler, f"{reason}; the render is too short to try others")
     with _at_most(scene, _PIXELS) as scale:
         first = try_out(scene, sampler)
         if first is None:
             return Choice(sampler, reason, time.perf_counter() - start)
-        whole = seconds if seconds is not None else math.inf
-        if spp is not None:
-            whole = min(whole, first.seconds * spp / SPP * scale)
-        if SHARE * whole < _LEAST_SECONDS:
-            spent = time.perf_counter() - start
-            return Choice(sampler, f"{reason}; the render is too short to try others", spent)
-        trials = compare_with(scene, names, first, lambda: time.perf_counter() - start < SHARE * whole)
+        by_samples = math.inf if spp is None else first.seconds * spp / SPP * scale
+        limit = start + SHARE * min(by_samples, math.inf if seconds is None else seconds)
+        trials = compare_with(scene, names, first, lambda: time.perf_counter() < limit)
     best, why = judge(sampler, times_to_an_error(trials))
     return Choice(best, why, time.perf_counter() - start)
 
@@ -130,14 +125,15 @@ def try_out(scene: mi.Scene, sampler: str, seed: int = _SEED) -> Trial | None:
         render_stack(scene, 1, seed, sampler)  # compiles
     except NgptError:
         return None
+    spp = max(SPP, 2 * SAMPLERS[sampler].batch)
     stacks, seconds = [], []
     for i in range(2):
         start = time.perf_counter()
-        stacks.append(render_stack(scene, SPP, seed + i, sampler))
+        stacks.append(render_stack(scene, spp, seed + i, sampler))
         seconds.append(time.perf_counter() - start)
     method = "wcv" if SAMPLERS[sampler].gradients else "primal"
     images, primals = ([reconstruct(stack, m).image for stack in stacks] for m in (method, "primal"))
-    return Trial((images[0], images[1]), (primals[0], primals[1]), min(seconds), stacks[0])
+    return Trial((images[0], images[1]), (primals[0], primals[1]), min(seconds))
 
 
 def times_to_an_error(trials: dict[str, Trial]) -> dict[str, float]:

@@ -4,8 +4,6 @@ import numpy as np
 import pytest
 from unbiased import load
 
-from ngpt.stack import GradientStack
-
 SHAPE = (32, 48, 3)
 
 
@@ -18,8 +16,7 @@ def trial(sampler_noise, seconds, error=None, bias=0.0):
     images = primals
     if error is not None:
         images = tuple(1 + bias + rng.normal(0, error**0.5, SHAPE) for _ in range(2))
-    layers = {"primal": primals[0].astype(np.float32)}
-    return Trial(images, primals, seconds, GradientStack(layers))
+    return Trial(images, primals, seconds)
 
 
 def test_the_least_time_to_an_error_is_chosen(renderer):
@@ -64,11 +61,10 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
     from data_gen import pilot
 
     scene = load(renderer, "diffuse", (16, 12))
-    # By their samples, and by their time, of which nothing is spent
-    assert "too short" in pilot.choose_by_pilot(scene, 1, None).reason
     monkeypatch.setattr(pilot, "try_out", None)
-    choice = pilot.choose_by_pilot(scene, 1 << 20, 10.0)
-    assert choice.sampler == "gpt" and "too short" in choice.reason and choice.seconds == 0
+    for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
+        choice = pilot.choose_by_pilot(scene, spp, seconds)
+        assert choice.sampler == "gpt" and "too short" in choice.reason and choice.seconds == 0
 
 
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
@@ -77,14 +73,13 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
 
     scene = load(renderer, "diffuse", (32, 24))
     before = render_stack(scene, 2, 0, "gpt")
-    monkeypatch.setattr(pilot, "_LEAST_SECONDS", 0.0)
     monkeypatch.setattr(pilot, "_PIXELS", 16 * 12)
     sizes = []
     tried = pilot.try_out
     monkeypatch.setattr(
         pilot, "try_out", lambda scene, *a: (sizes.append(tuple(scene.sensors()[0].film().size())), tried(scene, *a))[1]
     )
-    choice = pilot.choose_by_pilot(scene, 1 << 20, 1e6)
+    choice = pilot.choose_by_pilot(scene, 1 << 30, 1e6)
     assert choice.sampler in pilot.candidates(scene) and choice.reason.startswith("chosen by a pilot: to a given error")
     assert len(sizes) == len(pilot.candidates(scene)) and {tuple(map(int, size)) for size in sizes} == {(16, 12)}
     after = render_stack(scene, 2, 0, "gpt")
