@@ -1,5 +1,7 @@
 """``ngpt advise``: which sampler and method, and how many samples, for the time there is or the error to reach."""
 
+from __future__ import annotations
+
 import argparse
 import shlex
 import time
