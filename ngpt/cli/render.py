@@ -56,6 +56,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.pilot import choose_by_pilot
     from data_gen.render import check_options, render_stack
     from data_gen.scenes.load import load_scene
 
@@ -64,14 +65,20 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Before the scene is loaded, which may take long.
     check_options(spp, args.seed, args.sampler, args.time, memory)
     scene = load_scene(args.scene, args.size, dict(args.define))
+    sampler, seconds = args.sampler, args.time
+    if sampler == "auto":
+        choice = choose_by_pilot(scene, spp, seconds)
+        sampler = choice.sampler
+        console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
+        seconds = seconds and max(seconds - choice.seconds, 1e-3)
     with console.progress(f"render {args.scene}", "s" if args.time else "spp") as progress, stop_on_ctrl_c() as stop:
         stack = render_stack(
             scene,
             spp,
             args.seed,
-            args.sampler,
+            sampler,
             progress,
-            seconds=args.time,
+            seconds=seconds,
             memory=memory,
             stop=stop,
             diagnostics=args.diagnostics,
@@ -79,11 +86,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
-    done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
+    done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
     interrupted = stop() and done != spp
     if interrupted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
-    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {seconds:.2f} s")
+    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if args.json:
         ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
         print_json({"output": str(target), "width": stack.width, "height": stack.height, "layers": stack.names} | ours)
