@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
-# Of one that has splats of all four differences as well, which are kept per pixel: a quarter of it a lane, with 4 a pass
+# Of one that splats all four differences as well, which are kept per pixel: a quarter of it for a lane, of 4 a pass
 _GBDPT_BYTES = PATH_BYTES + 320
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
@@ -155,7 +155,9 @@ def _notes_on_bdpt(facts: Facts) -> list[str]:
 def _notes_on_gbdpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
     if facts.mirrors:
-        lines.append("mirrors or clear glass: shifted in front of the camera, not behind other surfaces: noisy gradients")
+        lines.append(
+            "mirrors or clear glass: shifted in front of the camera, not behind other surfaces: noisy gradients"
+        )
     return lines
 
 

@@ -41,8 +41,8 @@ class LightEnds:
         for emitter, kind in zip(emitters, kinds, strict=True):
             if kind is None:
                 raise NgptError(
-                    f"sampler '{sampler}' cannot render this scene: light cannot be traced from emitter '{emitter.id()}' "
-                    f"({emitter.class_name()}); use --sampler gpt, or primal"
+                    f"sampler '{sampler}' cannot render this scene: light cannot be traced from emitter "
+                    f"'{emitter.id()}' ({emitter.class_name()}); use --sampler gpt, or primal"
                 )
         box = scene.bbox()
         self.center = mi.ScalarPoint3f(box.center())

@@ -30,14 +30,13 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
 from data_gen.samplers.bdpt.lights import LightEnds
-from data_gen.samplers.bdpt.strategies import connection, emission_at, to_camera, to_light
+from data_gen.samplers.bdpt.strategies import connection, to_camera
 from data_gen.samplers.bdpt.vertex import (
     IMPORTANCE,
-    RADIANCE,
     Vertex,
     adjoint,
     context,
@@ -49,8 +48,10 @@ from data_gen.samplers.bdpt.vertex import (
     scatters_smoothly,
 )
 from data_gen.samplers.common import like_path
+from data_gen.samplers.gbdpt.base_path import Plan, base_step
 from data_gen.samplers.gbdpt.light_shift import Splatted, differences
-from data_gen.samplers.gbdpt.offset_path import Step, brightest_of, connect, start, take_step, with_differences
+from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
+from data_gen.samplers.gbdpt.pairs import weighted
 
 
 class GBDPT(BDPT):
@@ -69,24 +70,21 @@ class GBDPT(BDPT):
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, "gbdpt")
-        lights, materials = LightEnds(scene, "gbdpt"), Materials(scene, self.roughness_threshold)
-        return lambda camera, film: self.gradient_pass(scene, lights, materials, camera, film)
+        materials = Materials(scene, self.roughness_threshold)
+        longest = min(self.max_depth, self.joined_depth)
+        plan = Plan(LightEnds(scene, "gbdpt"), materials, self.max_depth, self.rr_depth, longest)
+        return lambda camera, film: self.gradient_pass(scene, plan, camera, film)
 
-    def gradient_pass(self, scene, lights, materials, camera: CameraSamples, film: GradientFilm) -> None:
+    def gradient_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one path from the camera and one from a light, and all their shifts, for each camera sample."""
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         random = camera.random.clone()
-        longest = min(self.max_depth, self.joined_depth)
         kept, count = None, mi.UInt32(0)
-        if longest > 1 and lights.emitters is not None:
+        if plan.longest > 1 and plan.lights.emitters is not None:
             splats = {name: film.splats(name) for name in ("primal", *SHIFTS)}
-            kept, count, random = self.shifted_light_path(
-                scene, lights, materials, camera, random, ray, importance, longest, splats
-            )
-        L, Le, Δ = self.shifted_camera_path(
-            scene, lights, materials, camera, random, ray, importance, shifted, kept, count, longest
-        )
+            kept, count, random = self.shifted_light_path(scene, plan, camera, random, ray, importance, splats)
+        L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         Δ, inside = [to_rgb(one, ray.wavelengths) for one in Δ], [inside for _, _, inside in shifted]
@@ -97,8 +95,9 @@ class GBDPT(BDPT):
             film.put(name, value, active)
 
     @dr.syntax
-    def shifted_light_path(self, scene, lights, materials, camera, random, camera_ray, importance, longest, splats):
+    def shifted_light_path(self, scene, plan, camera, random, camera_ray, importance, splats):
         """``BDPT.light_path``, with the differences of all that it splats."""
+        lights, materials, longest = plan.lights, plan.materials, plan.longest
         size, lens = camera.size, camera.sensor.needs_aperture_sample()
         start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
         ray, β = start.ray, start.β
@@ -129,7 +128,7 @@ class GBDPT(BDPT):
             C, others, uv = to_camera(
                 camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
             )
-            light = to_rgb(C * importance / (1 + others), camera_ray.wavelengths)
+            light = to_rgb(weighted(C, others) * importance, camera_ray.wavelengths)
             pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
             splats["primal"].add(pixel, list(light), dr.max(C) > 0)
 
@@ -137,10 +136,8 @@ class GBDPT(BDPT):
             first = depth == 1
             before = recall(kept.read(dr.maximum(depth, 2) - 2), camera_ray.time, camera_ray.wavelengths)
             allowed = materials.connectable(bsdf) & (first | (left_smoothly & materials.connectable(before.si.bsdf())))
-            path = Splatted(
-                y, ray.d, uv, on_lens, C, others, first, start, before, p_before, survival_before, allowed
-            )
-            Δ = differences(scene, lights, materials, camera, path, self.first_hit)
+            path = Splatted(y, ray.d, uv, on_lens, C, others, first, start, before, p_before, survival_before, allowed)
+            Δ = differences(scene, plan, camera, path, self.first_hit)
             for name in SHIFTS:
                 one, on_film = Δ[name]
                 splats[name].add(pixel, list(to_rgb(one * importance, camera_ray.wavelengths)), on_film)
@@ -167,9 +164,7 @@ class GBDPT(BDPT):
         return kept, count, random
 
     @dr.syntax
-    def shifted_camera_path(
-        self, scene, lights, materials, camera, random, ray, importance, shifted, kept, count, longest
-    ):
+    def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):
         """``BDPT.camera_path``, and Δ of its four offset paths."""
         ray = mi.Ray3f(ray)
         si = self.first_hit(scene, ray).compute_surface_interaction(ray)
@@ -183,125 +178,37 @@ class GBDPT(BDPT):
         Le = importance * si.emitter(scene).eval(si, shown)
         L = dr.zeros(mi.Spectrum, dr.width(ray))
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
-        active = si.is_valid() & (depth < self.max_depth)
+        active = si.is_valid() & (depth < plan.max_depth)
         _, density = camera.sensor.sample_direction(si, camera.lens, active)
         end = mis.begin_camera(density[0], cosine(si, ray.d))
         while dr.hint(active, label="camera path"):
             z = Vertex(si, β, end, depth)
-            bsdf = si.bsdf()
-            smooth = active & scatters_smoothly(bsdf)
-            connectable = active & materials.connectable(bsdf)
-            joins = depth + 1 <= longest
-
-            # --------------------- To a light ------------------------
-            u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
-            u_survival = random.next_1d()
-            light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
-            lit = smooth & (light.pdf > 0)
-            wo = si.to_local(light.d)
-            f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
-            f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
-            lit &= dr.max(f * weight) > 0
-            q = reverse_density(si, bsdf, wo, lit)
-            z.end = mis.Partial(dr.select(joins, end.vcm, 0), dr.select(joins, end.vc, 0))
-            C, others = to_light(lights, z, light, weight, f, p, q)
-            z.end = end
-            lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
-            C = dr.select(lit, C, 0)
-            L += dr.select(lit, C / (1 + others), 0)
-            cos_light = dr.abs(dr.dot(light.n, light.d))
-            e_light = lights.emission(lights.index_of(light.emitter), light.pdf, cos_light, dr.square(light.dist))
-
-            # ---------------- To the light path ----------------------
+            step, η, sky_seen = base_step(scene, plan, random, z, active, η, sky_seen, brightest(offsets))
+            L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
             if dr.hint(kept is not None, mode="scalar"):
-                L, offsets = self.shifted_connections(
-                    scene, materials, z, bsdf, smooth & joins, connectable, kept, count, longest, ray, L, offsets
-                )
-
-            # -------------------- Next vertex ------------------------
-            found = active & (sample.pdf > 0)
-            kind = event_kind(sample.sampled_type)
-            sky_seen |= found & (kind != NULL)
-            η = dr.select(found, η * sample.eta, η)
-            d = si.to_world(sample.wo)
-            q_next = reverse_density(si, bsdf, sample.wo, found & (kind == SMOOTH))
-            end = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH)
-            β *= f_p
-            largest = brightest_of(β, offsets)
-            # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
-            survives = dr.select(depth < self.rr_depth, 1, dr.fmin(largest * dr.square(η), 0.95))
-            active = found & (dr.max(β) > 0) & (u_survival < survives)
-            survival = dr.rcp(survives)
-            β *= survival
+                joins = active & scatters_smoothly(si.bsdf()) & step.joins
+                L, Δ = self.shifted_connections(scene, plan, step, joins, kept, count, ray, L, offsets)
+                offsets = with_differences(offsets, Δ)
+            offsets = take_step(scene, plan, step, offsets)
+            si, β, end = step.x1, step.β1, step.end1
             depth += 1
-            ray = si.spawn_ray(d)
-            reached = scene.ray_intersect(ray, active)
-
-            # ----------------- Emission met by chance ----------------
-            met = active & (reached.is_valid() | sky_seen)
-            Le_met, p_met, e_met = emission_at(scene, lights, reached, si, met)
-            # Longer paths are not found by light paths.
-            counted = depth <= longest
-            end.vc = dr.select(counted, end.vc, 0)
-            others_met = mis.others_emitted(end, e_met, p_met)
-            C_met = dr.select(met, β * Le_met, 0)
-            L += C_met / (1 + others_met)
-
-            # --------------------- Offset paths ----------------------
-            step = Step(
-                z=z,
-                connectable=connectable,
-                light=light,
-                weight=weight,
-                C_light=C,
-                others_light=others,
-                e_light=e_light,
-                f_light=f,
-                p_light=p,
-                q_light=q,
-                joins=joins,
-                u_lobe=u_lobe,
-                u_direction=u_direction,
-                wo=sample.wo,
-                d=d,
-                kind=kind,
-                p=sample.pdf,
-                q=q_next,
-                f_p=f_p * survival,
-                survival=survival,
-                goes_on=active,
-                x1=reached,
-                x1_connectable=materials.connectable(reached.bsdf()),
-                met=met,
-                C_met=C_met,
-                others_met=dr.select(met, others_met, 0),
-                Le=Le_met,
-                p_met=p_met,
-                e_met=e_met,
-                counted=counted,
-            )
-            offsets = take_step(scene, lights, materials, step, offsets)
-
-            si = reached
-            active &= si.is_valid() & (depth < self.max_depth)
-            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+            active = step.goes_on & si.is_valid() & (depth < plan.max_depth)
         return L, Le, [offset.Δ for offset in offsets]
 
     @dr.syntax
-    def shifted_connections(
-        self, scene, materials, z, bsdf, active, connectable, kept, count, longest, ray, L, offsets
-    ):
-        """Adds to ``L`` and to Δ all paths that join vertex ``z`` to one of those ``kept``."""
-        Δ = [offset.Δ for offset in offsets]
+    def shifted_connections(self, scene, plan, step, active, kept, count, ray, L, offsets):
+        """``L`` and Δ, and with them all paths that join the vertex of ``step`` to one of those ``kept``."""
+        z, Δ = step.z, [offset.Δ for offset in offsets]
+        bsdf = z.si.bsdf()
         i = mi.UInt32(0)
         while dr.hint(active & (i < count), label="connections"):
             y = recall(kept.read(i), ray.time, ray.wavelengths)
-            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= longest)
+            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= plan.longest)
             found = connection(scene, z, bsdf, y, joins)
-            C, others, Δ = connect(scene, materials, z, connectable, y, found, offsets, Δ)
-            L += dr.select(dr.max(C) > 0, C / (1 + others), 0)
+            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, offsets, Δ)
+            L += weighted(C, others)
             i += 1
-        return L, with_differences(offsets, Δ)
+        return L, Δ
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

@@ -12,11 +12,11 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS
-from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.lights import LightEnds, LightRay
+from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate
+from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.pairs import difference
 
 
@@ -39,7 +39,7 @@ class Splatted:
 
 
 def differences(
-    scene, lights: LightEnds, materials: Materials, camera, path: Splatted, first_hit: Callable
+    scene, plan: Plan, camera, path: Splatted, first_hit: Callable
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
     """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film."""
     shifts = list(SHIFTS.values())
@@ -52,7 +52,7 @@ def differences(
         active = lit & inside(camera, uv)
 
         def pair(_):
-            C, r, others = shifted(scene, lights, materials, camera, path, uv, active & path.allowed, first_hit)
+            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit)
             return difference(path.C, path.others, C, r, others)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), active, pair, lambda none: none)
@@ -63,7 +63,7 @@ def differences(
     return dict(zip(SHIFTS, zip(Δ, on_film, strict=True), strict=True))
 
 
-def shifted(scene, lights, materials, camera, path: Splatted, uv, active, first_hit):
+def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
     """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
     sensor, y = camera.sensor, path.y
@@ -71,7 +71,7 @@ def shifted(scene, lights, materials, camera, path: Splatted, uv, active, first_
     ray, _ = sensor.sample_ray(camera.time, camera.wavelength, uv / size, path.lens)
     x = first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
     bsdf = x.bsdf()
-    active = active & x.is_valid() & materials.connectable(bsdf)
+    active = active & x.is_valid() & plan.materials.connectable(bsdf)
     toward, importance = sensor.sample_direction(x, path.lens, active)
     toward0, importance0 = sensor.sample_direction(y.si, path.lens, active)
     # Per area, the film's density at either vertex is importance times cosine: J is their ratio.
@@ -81,13 +81,13 @@ def shifted(scene, lights, materials, camera, path: Splatted, uv, active, first_
     edge = (mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.Ray3f(ray))
 
     def from_start(*_):
-        moved, ratio, per_distance2 = lights.redirected(scene, path.start, x)
-        _, _, per_distance2_0 = lights.redirected(scene, path.start, y.si)
+        moved, ratio, per_distance2 = plan.lights.redirected(scene, path.start, x)
+        _, _, per_distance2_0 = plan.lights.redirected(scene, path.start, y.si)
         d = moved.ray.d
-        e, p = lights.densities(scene, moved, x)
+        e, p = plan.lights.densities(scene, moved, x)
         end = mis.begin_light(e, p, moved.delta, cosine(x, d))
         G = cosine(x, d) / cosine(y.si, path.d) * (per_distance2 / per_distance2_0)
-        shadow = dr.select(lights.far(path.start.index), x.spawn_ray(-d), x.spawn_ray_to(moved.end.p))
+        shadow = dr.select(plan.lights.far(path.start.index), x.spawn_ray(-d), x.spawn_ray_to(moved.end.p))
         return d, moved.β * G, ratio * G, end.vcm, end.vc, shadow
 
     def from_before(*_):

@@ -13,12 +13,12 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.shift import reconnection_jacobian
-from data_gen.paths.vertex import SMOOTH, Materials, event_kind, seen_from
+from data_gen.paths.vertex import SMOOTH, event_kind, seen_from
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import connection, emission_at
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, evaluate
+from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
 from data_gen.samplers.gbdpt.pairs import difference
 
 
@@ -34,45 +34,6 @@ class Offset:
     apart: mi.Bool
     joined: mi.Bool
     Δ: mi.Spectrum
-
-
-@dataclass
-class Step:
-    """What the base path does at its vertex ``z``; x1 is the next one."""
-
-    z: Vertex
-    connectable: mi.Bool
-    # A sampled point of an emitter
-    light: mi.DirectionSample3f
-    weight: mi.Spectrum  # Le / p
-    C_light: mi.Spectrum
-    others_light: mi.Float
-    e_light: mi.Float
-    f_light: mi.Spectrum
-    p_light: mi.Float  # of sampling that direction
-    q_light: mi.Float
-    joins: mi.Bool  # light paths may find paths that end here
-    # The sampled direction
-    u_lobe: mi.Float
-    u_direction: mi.Point2f
-    wo: mi.Vector3f
-    d: mi.Vector3f
-    kind: mi.UInt32
-    p: mi.Float
-    q: mi.Float
-    f_p: mi.Spectrum  # f / p, survival included
-    survival: mi.Float  # 1 / probability
-    goes_on: mi.Bool
-    # The next vertex, and emission there
-    x1: mi.SurfaceInteraction3f
-    x1_connectable: mi.Bool
-    met: mi.Bool
-    C_met: mi.Spectrum
-    others_met: mi.Float
-    Le: mi.Spectrum
-    p_met: mi.Float  # of connecting to it
-    e_met: mi.Float
-    counted: mi.Bool  # light paths may find paths that end there
 
 
 def start(sensor, lens, x, ray, hit, β, inside) -> Offset:
@@ -100,9 +61,9 @@ def own_vertex(offset: Offset, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteract
     return dr.select(offset.apart, own, seen_from(x, offset.ray.d))
 
 
-def brightest_of(β: mi.Spectrum, offsets: list[Offset]) -> mi.Float:
-    """What Russian roulette goes by: the most that any of the five paths may yet bring, so that none is starved."""
-    largest = dr.max(β)
+def brightest(offsets: list[Offset]) -> mi.Float:
+    """The most that any of the offset paths may yet bring to Δ."""
+    largest = mi.Float(0)
     for y in offsets:
         largest = dr.fmax(largest, dr.max(y.β) / (1 + y.r))
     return largest
@@ -113,7 +74,7 @@ def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offse
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
-def connect(scene, materials: Materials, z: Vertex, z_connectable, y: Vertex, found, offsets, Δ) -> tuple:
+def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, offsets, Δ) -> tuple:
     """C and ``others`` of the connection of ``z`` to ``y``, a vertex of the light path; and the sums Δ with it.
 
     ``found`` is what ``strategies.connection`` has found for the base path.
@@ -128,7 +89,7 @@ def connect(scene, materials: Materials, z: Vertex, z_connectable, y: Vertex, fo
         others1 = mis.others_connected(offset.end, *known[:3], y.end, *known[3:])
         sums.append(Δ_before + dr.select(~own, difference(C, others, offset.β * g, offset.r, others1), 0))
     # What a shift to y needs of the materials, but for the offset path's own
-    both = z_connectable & materials.connectable(y.si.bsdf())
+    both = z_connectable & plan.materials.connectable(y.si.bsdf())
 
     def one(i, *Δ):
         offset = pick(offsets, i)
@@ -136,7 +97,7 @@ def connect(scene, materials: Materials, z: Vertex, z_connectable, y: Vertex, fo
         def own(Δ1):
             v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
             bsdf = v.si.bsdf()
-            good = lit & (offset.joined | (both & materials.connectable(bsdf)))
+            good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
             g1, known1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
             others1 = mis.others_connected(v.end, *known1[:3], y.end, *known1[3:])
             return difference(C, others, v.β * g1, offset.r, others1)
@@ -149,7 +110,7 @@ def connect(scene, materials: Materials, z: Vertex, z_connectable, y: Vertex, fo
     return C, others, list(Δ)
 
 
-def take_step(scene, lights: LightEnds, materials: Materials, step: Step, offsets: list[Offset]) -> list[Offset]:
+def take_step(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
     """Takes all offset paths along a step of their base path; connections to the light path are not in it."""
     busy = mi.Bool(False)
     for offset in offsets:
@@ -158,7 +119,7 @@ def take_step(scene, lights: LightEnds, materials: Materials, step: Step, offset
 
     def rotate(i, y, *others):
         own = y.apart | y.joined
-        y = dr.if_stmt((y,), own, lambda y: step_own(scene, lights, materials, step, y), lambda y: y)
+        y = dr.if_stmt((y,), own, lambda y: step_own(scene, plan, step, y), lambda y: y)
         return i + 1, *others, y
 
     state = (mi.UInt32(0), *offsets)
@@ -179,7 +140,7 @@ def settled(step: Step, y: Offset) -> Offset:
     β = y.β * step.f_p
     end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH)
     # ------------------ Emission met by chance -------------------
-    others = mis.others_emitted(Partial(end.vcm, dr.select(step.counted, end.vc, 0)), step.e_met, step.p_met)
+    others = mis.others_emitted(known_met(end, step.counted), step.e_met, step.p_met)
     Δ += difference(step.C_met, step.others_met, β * step.Le, y.r, others)
     end = mis.arrive(end, cosine(step.x1, step.d), dr.square(step.x1.t))
     return Offset(
@@ -194,16 +155,16 @@ def settled(step: Step, y: Offset) -> Offset:
     )
 
 
-def step_own(scene, lights: LightEnds, materials: Materials, step: Step, y: Offset) -> Offset:
+def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
     """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
     # ------------------------ The vertex -------------------------
     si = own_vertex(y, step.z.si)
     bsdf = si.bsdf()
-    connectable = materials.connectable(bsdf)
+    connectable = plan.materials.connectable(bsdf)
 
     # ------------------------ To a light -------------------------
     lit = (dr.max(step.C_light) > 0) & step.connectable & connectable
-    C, r, others = to_same_light(scene, lights, step, y, si, bsdf, lit)
+    C, r, others = to_same_light(scene, plan, step, y, si, bsdf, lit)
     Δ = y.Δ + difference(step.C_light, step.others_light, C, y.r * r, others)
 
     # ------------- Next vertex: reconnect, or replay -------------
@@ -213,10 +174,10 @@ def step_own(scene, lights: LightEnds, materials: Materials, step: Step, y: Offs
     # What neither does is rejected: β = 0.
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
     state = (none, mi.Spectrum(0), mi.Float(0))
-    state = dr.if_stmt(state, joins, lambda *_: reconnect(scene, lights, step, y, none, si, bsdf), lambda *old: old)
+    state = dr.if_stmt(state, joins, lambda *_: reconnect(scene, plan, step, y, none, si, bsdf), lambda *old: old)
     # Where all is smooth there is nothing to replay.
-    if not materials.all_connectable:
-        state = dr.if_stmt(state, replays, lambda *_: replay(scene, lights, step, y, none, si, bsdf), lambda *old: old)
+    if not plan.materials.all_connectable:
+        state = dr.if_stmt(state, replays, lambda *_: replay(scene, plan, step, y, none, si, bsdf), lambda *old: old)
     moved, C, others = state
 
     # ------------------ Emission met by chance -------------------
@@ -224,7 +185,7 @@ def step_own(scene, lights: LightEnds, materials: Materials, step: Step, y: Offs
     return moved
 
 
-def reconnect(scene, lights, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """Straight to the base path's next vertex, or, where that escapes, along with it; and emission there."""
     # ------------------------ The segment ------------------------
     x, x1 = step.z.si, step.x1
@@ -245,8 +206,8 @@ def reconnect(scene, lights, step: Step, y: Offset, none: Offset, si, bsdf) -> t
 
     # ----------------------- Emission at x1 ----------------------
     y1 = seen_from(x1, d)
-    Le, p_met, e = emission_at(scene, lights, y1, si, good & step.met)
-    others = mis.others_emitted(Partial(end.vcm, dr.select(step.counted, end.vc, 0)), e, p_met)
+    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(x1, d), distance2)
     # Behind vertices that are not connectable the shift is rejected, but they may emit.
     lives = good & reaches & (y.joined | step.x1_connectable)
@@ -255,7 +216,7 @@ def reconnect(scene, lights, step: Step, y: Offset, none: Offset, si, bsdf) -> t
     return moved, β * Le, others
 
 
-def replay(scene, lights, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+def replay(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """By the mirror, glass or hole that the base path's random numbers find here; and emission at its next vertex.
 
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
@@ -270,30 +231,25 @@ def replay(scene, lights, step: Step, y: Offset, none: Offset, si, bsdf) -> tupl
     β = dr.select(good, y.β * f_p * step.survival, 0)
     β = dr.select(dr.isfinite(dr.sum(β)), β, 0)
     end = mis.leave(y.end, cosine(si, d), sample.pdf, mi.Float(0), mi.Bool(True))
-    Le, p_met, e = emission_at(scene, lights, y1, si, good & step.met)
-    others = mis.others_emitted(Partial(end.vcm, dr.select(step.counted, end.vc, 0)), e, p_met)
+    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(y1, d), dr.square(y1.t))
     lives = good & y1.is_valid() & step.x1.is_valid()
     return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ), β * Le, others
 
 
-def to_same_light(scene, lights: LightEnds, step: Step, y: Offset, si, bsdf, active):
+def to_same_light(scene, plan: Plan, step: Step, y: Offset, si, bsdf, active):
     """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
     base = step.light
-    light, weight, r = lights.seen_from_elsewhere(scene, base, step.weight, si, active)
+    light, weight, r = plan.lights.seen_from_elsewhere(scene, base, step.weight, si, active)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
     C = y.β * f * weight
     lit = active & (dr.max(C) > 0)
     C = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit & y.apart), C, 0)
     cos = dr.abs(dr.dot(light.n, light.d))
-    e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
+    e = plan.lights.emission(plan.lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)
     return C, r, mis.others_to_light(known_end(y.end, step.joins), e, p_light, cosine(si, light.d), p, q)
-
-
-def known_end(end: Partial, joins: mi.Bool) -> Partial:
-    """Longer paths than light paths find are weighted as if there were none."""
-    return Partial(dr.select(joins, end.vcm, 0), dr.select(joins, end.vc, 0))
 
 
 def pick(offsets: list[Offset], i: mi.UInt32) -> Offset:

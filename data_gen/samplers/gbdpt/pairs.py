@@ -27,3 +27,8 @@ def difference(C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Flo
     whole = (dr.max(shifted) > 0) & dr.isfinite(dr.sum(shifted)) & dr.isfinite(rW)
     Δ = dr.select(whole, (shifted - C) * (2 / (W + rW)), C * (-2 / W))
     return dr.select(dr.max(C) > 0, Δ, 0)
+
+
+def weighted(C: mi.Spectrum, others: mi.Float) -> mi.Spectrum:
+    """C(x) / W(x): what one path adds to the image."""
+    return dr.select(dr.max(C) > 0, C / (1 + others), 0)
