@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
-# Of one that splats all four differences as well, which are kept per pixel: a quarter of it for a lane, of 4 a pass
-_GBDPT_BYTES = PATH_BYTES + 320
+# Of one that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a pass
+_GBDPT_BYTES = PATH_BYTES + 160
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -221,7 +221,7 @@ for _sampler in (
             "joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera",
             "roughness_threshold": "the microfacet roughness above which materials are connectable",
         },
-        batch=4,
+        batch=8,
         lane_bytes=_GBDPT_BYTES,
         module=_GBDPT,
     ),
