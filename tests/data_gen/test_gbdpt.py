@@ -248,9 +248,11 @@ def test_copies_of_paths_to_a_light(paths, t):
     paths.compare(step.C_light, (C, r, others), paths.brute(base, lamp), paths.brute(copy, lamp), 1, good)
 
 
-@pytest.mark.parametrize("s", [1, 2])
-@pytest.mark.parametrize("t", [1, 2, 3])
-def test_copies_of_paths_joined_to_light_paths(paths, t, s):
+def joined(paths, t, s, end=None):
+    """Arguments of ``compare`` for camera paths of ``t`` vertices connected to light paths of ``s``.
+
+    ``end`` is what the copy's partial sums of weights are, if they are not its own.
+    """
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.strategies import connection
     from data_gen.samplers.bdpt.vertex import Vertex
@@ -264,14 +266,33 @@ def test_copies_of_paths_joined_to_light_paths(paths, t, s):
     for _, _, smooth, *_ in paths.from_light[: s - 1]:
         good &= smooth
     g, known = connection(paths.scene, step.z, step.z.si.bsdf(), y, good)
-    C, end = step.z.β * g, offset.end
+    C, end = step.z.β * g, end or offset.end
     if t < 3:
         v = Vertex(own_vertex(offset, step.z.si), offset.β, end, step.z.depth)
         g, known = connection(paths.scene, v, v.si.bsdf(), y, good, seen=offset.joined)
     others = mis.others_connected(end, *known[:3], y.end, *known[3:])
     lamp = (paths.first.end.p, paths.first.end.n)
-    found = (offset.β * g, offset.r, others)
-    paths.compare(C, found, paths.brute(base + behind, lamp), paths.brute(copy + behind, lamp), s + 1, good)
+    brute = paths.brute(base + behind, lamp), paths.brute(copy + behind, lamp)
+    return C, (offset.β * g, offset.r, others), *brute, s + 1, good
+
+
+@pytest.mark.parametrize("s", [1, 2])
+@pytest.mark.parametrize("t", [1, 2, 3])
+def test_copies_of_paths_joined_to_light_paths(paths, t, s):
+    paths.compare(*joined(paths, t, s))
+
+
+@pytest.mark.parametrize("t", [2, 3])
+def test_planted_errors_are_found(paths, t):
+    """Those of which no z-test is sure to tell: the first passes it over one pixel and over eight."""
+    with pytest.raises(AssertionError):
+        paths.compare(*joined(paths, t, 1, paths.steps[t - 1].z.end))
+    C, (shifted, r, others), base, copy, s, good = joined(paths, t, 1)
+    J = (base[2] / copy[2]).astype(np.float32)
+    without_J = paths.mi.Float(1 / J)
+    for wrong in ((shifted * without_J, r, others), (shifted, r * without_J, others), (shifted, r, others * 5)):
+        with pytest.raises(AssertionError):
+            paths.compare(C, wrong, base, copy, s, good)
 
 
 def splatted(paths, s):
