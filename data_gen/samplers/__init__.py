@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
+# Of one that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a pass
+_GBDPT_BYTES = PATH_BYTES + 160
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -152,8 +154,18 @@ def _notes_on_bdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _PRIMAL = (
-    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "primal")
+def _notes_on_gbdpt(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
+    if facts.mirrors:
+        lines.append(
+            "mirrors or clear glass: shifted in front of the camera, not behind other surfaces: noisy gradients"
+        )
+    return lines
+
+
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PRIMAL = (
+    f"data_gen.samplers.{name}"
+    for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "gbdpt.integrator", "primal")
 )
 
 for _sampler in (
@@ -202,6 +214,20 @@ for _sampler in (
         gradients=False,
         batch=4,
         module=_BDPT,
+    ),
+    Sampler(
+        "gbdpt",
+        "gradients of paths from the camera and from the lights (hidden lamps)",
+        _from_module(_GBDPT),
+        lambda facts: _refused_but_for_surfaces(facts, "gbdpt"),
+        _notes_on_gbdpt,
+        {
+            "joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera",
+            "roughness_threshold": "the microfacet roughness above which materials are connectable",
+        },
+        batch=8,
+        lane_bytes=_GBDPT_BYTES,
+        module=_GBDPT,
     ),
     Sampler(
         "primal",

@@ -240,17 +240,17 @@ class BDPT(GradientIntegrator):
         return L
 
 
-def refuse(scene) -> None:
-    """Raises NgptError for a variant or a camera that light paths cannot reach."""
+def refuse(scene, sampler: str = "bdpt") -> None:
+    """Raises NgptError, in the name of the ``sampler``, for a variant or a camera that light paths cannot reach."""
     if mi.is_polarized:
         raise NgptError(
-            f"sampler 'bdpt' does not follow polarised light (variant '{mi.variant()}'); "
+            f"sampler '{sampler}' does not follow polarised light (variant '{mi.variant()}'); "
             f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
         )
     camera = scene.sensors()[0]
     if camera.class_name() not in _CAMERAS:
         raise NgptError(
-            f"sampler 'bdpt' cannot render this scene: light paths cannot reach a camera of type "
+            f"sampler '{sampler}' cannot render this scene: light paths cannot reach a camera of type "
             f"{camera.class_name()}, but perspective and thin lens; use --sampler gpt, or primal"
         )
 
