@@ -38,6 +38,7 @@ data_gen.passes
 data_gen.samplers
 data_gen.backend
 data_gen.render data_gen.inspect
+data_gen.frames
 data_gen.costs
 data_gen.dataset
 ngpt.evaluation
