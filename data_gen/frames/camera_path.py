@@ -6,6 +6,7 @@ import json
 import math
 from bisect import bisect_right
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -101,7 +102,7 @@ def read_camera_path(path: str | Path) -> CameraPath:
     if not isinstance(entries, list) or not entries:
         raise NgptError(f'{path}: holds no camera keys; write {{"keys": [{{"frame": 0, "origin": ...}}, ...]}}')
     keys = [_key(entry, number, f"{path}: key {number}") for number, entry in enumerate(entries)]
-    for one, other in zip(keys, keys[1:], strict=False):
+    for one, other in pairwise(keys):
         if not one.frame < other.frame:
             raise NgptError(f"{path}: frame {other.frame:g} comes after frame {one.frame:g}; sort keys by frame")
         if (one.fov is None) != (other.fov is None) or one.fov_axis != other.fov_axis:

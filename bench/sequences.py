@@ -1,0 +1,113 @@
+"""Frames of a moving camera: error and flicker of results made frame by frame, and over time.
+
+    python -m bench.sequences --folder SCENES --scenes diffuse glossy coffee --out OUT
+
+Each shot moves a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
+sees in the median) and ``fast`` (8 pixels a frame). Stacks and references are rendered once and kept in OUT. relMSE is
+against references without temporal mode, flicker is ``ngpt.measure.flicker``; both are means over all frames but the
+first. ``+ temporal`` is `ngpt denoise --temporal`.
+"""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from bench.common import metadata, save
+from ngpt.measure.flicker import flicker
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.methods import METHODS
+from ngpt.temporal import Temporal
+
+SPEEDS = {"static": 0.0, "slow": 0.5, "fast": 8.0}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, help="folder of scenes: NAME/scene.xml")
+    parser.add_argument("--scenes", nargs="*", default=["diffuse", "glossy"])
+    parser.add_argument("--shots", nargs="*", default=list(SPEEDS), choices=SPEEDS)
+    parser.add_argument("--methods", nargs="*", default=["wcv", "ngpt-fast", "oidn"], choices=METHODS)
+    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--size", default="128x72")
+    parser.add_argument("--spp", type=int, default=8)
+    parser.add_argument("--reference-spp", type=int, default=1024)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    rows = []
+    for scene in args.scenes:
+        for shot in args.shots:
+            folder = args.out / scene / shot
+            render_shot(args, scene, SPEEDS[shot], folder)
+            stacks, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in ("in", "ref"))
+            for method in args.methods:
+                for row in judge(stacks, [reference["primal"] for reference in references], method):
+                    rows.append({"scene": scene, "shot": shot} | row)
+                    print(line(rows[-1]), flush=True)
+    save(args.out / "sequences.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
+
+
+def judge(stacks: list, references: list[np.ndarray], method: str) -> list[dict]:
+    """Rows of a method, frame by frame and over time."""
+    results = [ngpt.reconstruct(stack, method) for stack in stacks]
+    temporal = Temporal()
+    images = {
+        method: [result.image for result in results],
+        f"{method} + temporal": [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)],
+    }
+    motions = [stack["motion"] for stack in stacks]
+    return [
+        {
+            "method": name,
+            "relMSE": float(np.mean([relmse_trimmed(i, r) for i, r in zip(found[1:], references[1:], strict=True)])),
+            "flicker": flicker(found, references, motions),
+        }
+        for name, found in images.items()
+    ]
+
+
+def line(row: dict) -> str:
+    return f"| {row['scene']} | {row['shot']} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |"
+
+
+def render_shot(args: argparse.Namespace, scene: str, speed: float, folder: Path) -> None:
+    """Stacks in ``folder/in``, references in ``folder/ref``; what is there already is kept."""
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(DEFAULT_VARIANT)
+    from data_gen.frames.sequence import Shot, render_sequence
+
+    size = tuple(map(int, args.size.split("x")))
+    name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
+    path = sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
+    for kind, options in (
+        ("in", {"spp": args.spp, "seed": 1, "sampler": "gpt"}),
+        ("ref", {"spp": args.reference_spp, "seed": 2, "sampler": "primal", "with_features": False}),
+    ):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+        target = {frame: folder / kind / f"{frame:04d}.exr" for frame in range(args.frames)}
+        shot = Shot(lambda frame: (name, {}), size, path)
+        for frame, stack in render_sequence(shot, range(args.frames), skip=lambda f, t=target: t[f].exists(), **options):
+            ngpt.write(target[frame], stack)
+
+
+def sideways(scene, speed: float):
+    """A path on which the camera moves to its right by ``speed`` pixels a frame, as seen at the median distance."""
+    from data_gen.frames.camera_path import CameraPath, Key
+    from data_gen.frames.motion import seen, snapshot
+
+    film = snapshot(scene).film
+    what = seen(scene)
+    hits = what.points[what.shape >= 0]
+    pixels_per_unit = np.linalg.norm(film[0, :3]) / np.median(hits @ film[3])
+    sensor = scene.sensors()[0]
+    start = np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4, -1)[..., 0]
+    left = start[:3, 0] / np.linalg.norm(start[:3, 0])
+    end = start.copy()
+    end[:3, 3] -= left * 1000 * speed / pixels_per_unit
+    return CameraPath([Key(-1, start), Key(999, end)])
+
+
+if __name__ == "__main__":
+    main()
