@@ -55,7 +55,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="FRAMES",
         help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9",
     )
-    shot.add_argument("--camera", metavar="PATH.json", help="key frames of the camera (see docs/sequences.md)")
+    shot.add_argument(
+        "--camera",
+        metavar="PATH",
+        help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
+    )
+    shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
@@ -130,6 +135,7 @@ def run_frames(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.frames.camera_path import read_camera_path
+    from data_gen.frames.gltf import read_gltf_camera
     from data_gen.frames.sequence import Shot, render_sequence
     from data_gen.passes import DEFAULT_MEMORY
     from data_gen.render import check_options
@@ -137,7 +143,10 @@ def run_frames(args: argparse.Namespace, console: Console) -> int:
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)
     memory = args.memory or DEFAULT_MEMORY
     check_options(spp, args.seed, args.sampler, args.time, memory)
-    camera = read_camera_path(args.camera) if args.camera else None
+    camera = None
+    if args.camera:
+        animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")
+        camera = read_gltf_camera(args.camera, args.fps) if animated else read_camera_path(args.camera)
     shot = Shot(describe, args.size, camera)
     reports, skipped = [], 0
 
