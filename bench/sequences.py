@@ -29,10 +29,10 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="*", default=["diffuse", "glossy"])
     parser.add_argument("--shots", nargs="*", default=list(SPEEDS), choices=SPEEDS)
     parser.add_argument("--methods", nargs="*", default=["wcv", "ngpt-fast", "oidn"], choices=METHODS)
-    parser.add_argument("--frames", type=int, default=12)
-    parser.add_argument("--size", default="128x72")
+    parser.add_argument("--frames", type=int, default=10)
+    parser.add_argument("--size", default="96x54")
     parser.add_argument("--spp", type=int, default=8)
-    parser.add_argument("--reference-spp", type=int, default=1024)
+    parser.add_argument("--reference-spp", type=int, default=512)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     rows = []
@@ -41,8 +41,10 @@ def main() -> None:
             folder = args.out / scene / shot
             render_shot(args, scene, SPEEDS[shot], folder)
             stacks, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in ("in", "ref"))
+            truth = [reference["primal"] for reference in references]
+            truth *= len(stacks) // len(truth)
             for method in args.methods:
-                for row in judge(stacks, [reference["primal"] for reference in references], method):
+                for row in judge(stacks, truth, method):
                     rows.append({"scene": scene, "shot": shot} | row)
                     print(line(rows[-1]), flush=True)
     save(args.out / "sequences.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
@@ -83,14 +85,18 @@ def render_shot(args: argparse.Namespace, scene: str, speed: float, folder: Path
     path = sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
     for kind, options in (
         ("in", {"spp": args.spp, "seed": 1, "sampler": "gpt"}),
-        ("ref", {"spp": args.reference_spp, "seed": 2, "sampler": "primal", "with_features": False}),
+        (
+            "ref",
+            {"spp": args.reference_spp * (1 if speed else 4), "seed": 2, "sampler": "primal", "with_features": False},
+        ),
     ):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-        target = {frame: folder / kind / f"{frame:04d}.exr" for frame in range(args.frames)}
+        # A shot at rest has one reference.
+        frames = range(args.frames if speed or kind == "in" else 1)
+        target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         shot = Shot(lambda frame: (name, {}), size, path)
-        for frame, stack in render_sequence(
-            shot, range(args.frames), skip=lambda f, t=target: t[f].exists(), **options
-        ):
+        missing = [frame for frame, file in target.items() if not file.exists()]
+        for frame, stack in render_sequence(shot, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
 
 

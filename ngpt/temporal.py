@@ -33,11 +33,15 @@ from ngpt.warp import warped
 
 # Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
 LONGEST = 16
+# Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
+FAST = 0.01
 # Pixels, of the window of the evidence (standard deviation).
 WINDOW = 4.0
 # What b may be off from that of the variances, before there is evidence (standard deviation).
-DOUBT = 0.25
+DOUBT = 0.12
 # Differences of features beyond those around a pixel, at which history counts exp(-1) = 0.37.
+# Times the change around it, from which a pixel's counts the less.
+UNUSUAL = 15.0
 ALBEDO, NORMAL, DEPTH = 0.05, 0.1, 0.03
 
 
@@ -80,8 +84,9 @@ class Temporal:
             history, found = warped(before.light, motion, sharp=True)
             spread = warped(before.variance[..., None], motion)[0][..., 0]
             trust = found * _agreement(data.features, before.features, motion, found)
-            spread = np.maximum(spread, 1 / LONGEST)
-            b = trust * _share(now, history, data.image, data.noise, trust, 1 / (1 + spread))
+            speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
+            spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
+            b = _share(now, history, data.image, data.noise, trust, 1 / (1 + spread))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             now = now + b[..., None] * (history - now)
             self.weight = b
@@ -126,6 +131,7 @@ def _share(
     # That of single pixels is known no better than they are, and goes with their values.
     noise = _noise(variance, rest)
     rest = np.clip(rest, -4 * np.sqrt(noise), 4 * np.sqrt(noise))
+    trust = trust * _usual((np.square(change) / noise).mean(axis=-1), trust)
     weight = trust[..., None] / noise
     kept = _kept(rest, noise, trust)
     squares = _mean((weight * np.square(change)).sum(axis=-1))
@@ -136,7 +142,17 @@ def _share(
         evidence, doubt = above / squares, spread / np.square(squares)
         precise = np.where(squares > 0, 1 / np.maximum(doubt, 1e-12), 0)
     b = (np.where(squares > 0, evidence, 0) * precise + first / DOUBT**2) / (precise + 1 / DOUBT**2)
-    return np.clip(b, 0, first)
+    return trust * np.clip(b, 0, first)
+
+
+def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
+    """1 where history differs from now as it does around a pixel, less where by more: edges that were seen otherwise.
+
+    Around a pixel is the geometric mean, which single ones do not move.
+    """
+    tiny = 1e-6 * change.mean() + 1e-30
+    around = _mean(trust * np.log(change + tiny)) / np.maximum(_mean(trust), 1e-6)
+    return np.minimum(1, UNUSUAL * np.exp(around) / (change + tiny))
 
 
 def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
