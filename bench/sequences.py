@@ -5,7 +5,8 @@
 Each shot moves a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
 sees in the median) and ``fast`` (8 pixels a frame, to and fro). Stacks and references are rendered once and kept in
 OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all
-frames but the first. ``+ temporal`` is `ngpt denoise --temporal`.
+frames but the first. What the references' own noise adds to both, by their variances, is taken off. ``+ temporal`` is
+`ngpt denoise --temporal`.
 """
 
 import argparse
@@ -41,17 +42,19 @@ def main() -> None:
             folder = args.out / scene / shot
             render_shot(args, scene, SPEEDS[shot], folder)
             stacks, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in ("in", "ref"))
-            truth = [reference["primal"] for reference in references]
-            truth *= len(stacks) // len(truth)
             for method in args.methods:
-                for row in judge(stacks, truth, method):
+                for row in judge(stacks, references, method):
                     rows.append({"scene": scene, "shot": shot} | row)
                     print(line(rows[-1]), flush=True)
     save(args.out / "sequences.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
 
 
-def judge(stacks: list, references: list[np.ndarray], method: str) -> list[dict]:
-    """Rows of a method, frame by frame and over time."""
+def judge(stacks: list, references: list, method: str) -> list[dict]:
+    """Rows of a method, frame by frame and over time; ``references`` are stacks, one alone for a shot at rest."""
+    truth = [reference["primal"] for reference in references]
+    rng = np.random.default_rng(0)
+    noise = [np.sqrt(reference["primal_var"]) * rng.standard_normal(truth[0].shape) for reference in references]
+    truth, noise = ([*images] * (len(stacks) // len(images)) for images in (truth, noise))
     results = [ngpt.reconstruct(stack, method) for stack in stacks]
     temporal = Temporal()
     images = {
@@ -59,14 +62,17 @@ def judge(stacks: list, references: list[np.ndarray], method: str) -> list[dict]
         f"{method} + temporal": [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)],
     }
     motions = [stack["motion"] for stack in stacks]
-    return [
-        {
-            "method": name,
-            "relMSE": float(np.mean([relmse_trimmed(i, r) for i, r in zip(found[1:], references[1:], strict=True)])),
-            "flicker": flicker(found, references, motions),
-        }
-        for name, found in images.items()
-    ]
+
+    def measured(found: list[np.ndarray]) -> tuple[float, float]:
+        errors = [relmse_trimmed(image, reference) for image, reference in zip(found[1:], truth[1:], strict=True)]
+        return float(np.mean(errors)), flicker(found, truth, motions)
+
+    floor = measured([reference + own for reference, own in zip(truth, noise, strict=True)])
+    rows = []
+    for name, found in images.items():
+        error, change = measured(found)
+        rows.append({"method": name, "relMSE": error - floor[0], "flicker": change - floor[1], "floor": floor})
+    return rows
 
 
 def line(row: dict) -> str:

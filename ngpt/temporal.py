@@ -34,7 +34,7 @@ from ngpt.warp import warped
 # Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
 LONGEST = 16
 # Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
-FAST = 0.01
+FAST = 0.005
 # Pixels, of the window of the evidence (standard deviation).
 WINDOW = 4.0
 # What b may be off from that of the variances, before there is evidence (standard deviation).
