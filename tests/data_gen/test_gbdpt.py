@@ -31,6 +31,27 @@ def long_passes(monkeypatch):
     monkeypatch.setitem(SAMPLERS, "gbdpt", replace(SAMPLERS["gbdpt"], batch=64))
 
 
+def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
+    """Mitsuba 3.9 forgets the emitter of a direction sample that is copied: then all weights are of the first one."""
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.samplers.bdpt.lights import LightEnds
+
+    mi, scene = renderer, load(renderer, SCENES["points"], (16, 16))
+    lights, camera = LightEnds(scene), CameraSamples(scene.sensors()[0], 0, 16)
+    x, y = (scene.ray_intersect(mi.Ray3f(camera.rays(shift)[0])) for shift in ((0, 0), (3, 2)))
+    both, u = x.is_valid() & y.is_valid(), camera.random.clone().next_2d()
+    light, weight = scene.sample_emitter_direction(x, u, False, both)
+    expected, expected_weight = scene.sample_emitter_direction(y, u, False, both)
+    ours, ours_weight, r = lights.seen_from_elsewhere(scene, light, weight, y, both)
+    both = np.array(both & (light.pdf > 0))
+    index = np.array(lights.index_of(light.emitter))
+    assert set(index[both]) == {0, 1, 2}
+    assert np.array_equal(np.array(lights.index_of(ours.emitter))[both], index[both])
+    assert np.allclose(np.array(ours.p)[:, both], np.array(expected.p)[:, both], atol=1e-5)
+    assert np.allclose(np.array(ours_weight)[:, both], np.array(expected_weight)[:, both], rtol=1e-4)
+    assert np.array(r).ravel().tolist() == [1]
+
+
 @pytest.mark.parametrize("name", ["points", "sky"])
 def test_unbiased_far_away(renderer, long_passes, name):
     """All kinds of lights; ``diffuse`` has none but a rectangle."""
@@ -407,7 +428,8 @@ def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monk
         return none, renderer.Spectrum(0), renderer.Float(0)
 
     monkeypatch.setattr(offset_path, "replay", reject)
-    assert followed < 0.5 * noise()
+    # What splats and the rest of the room add is the same in both.
+    assert followed < 0.8 * noise()
 
 
 def test_options_and_refusals(renderer):

@@ -186,6 +186,7 @@ class LightEnds:
         kind = dr.gather(mi.UInt32, self.kind, index, active)
         far = kind == _FAR
         other = mi.DirectionSample3f(light)
+        other.emitter = light.emitter  # which Mitsuba 3.9 does not copy
         to = mi.Vector3f(light.p - si.p)
         distance = dr.norm(to)
         other.d, other.dist = dr.select(far, light.d, to / distance), dr.select(far, light.dist, distance)
