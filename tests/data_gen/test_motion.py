@@ -108,6 +108,21 @@ def test_any_deformation_of_a_mesh_is_followed(renderer):
     assert np.allclose(motion[6:18, 16, 1], 0, atol=1e-3)
 
 
+def test_instances_move_by_their_own_matrix(renderer):
+    mi = renderer
+    from data_gen.frames.motion import motion_vectors, snapshot
+
+    def scene(shift):
+        instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([shift, 0, 0])}
+        instance["shapegroup"] = {"type": "ref", "id": "group"}
+        return scene_of(mi, group={"type": "shapegroup", "one": {"type": "cube"}}, wall=wall(mi, -1), thing=instance)
+
+    step = 2 * pixel_width(4)  # of its front, 4 from the camera
+    now = scene(step)
+    motion = motion_vectors(now, snapshot(now), snapshot(scene(0)))
+    assert np.allclose(motion[12, 16], [-2, 0], atol=1e-2) and np.allclose(motion[1, 1], 0)
+
+
 def test_what_is_seen_here_was_seen_there(renderer):
     """Under a turn and a move of camera and box: the hit's place in the scene before is that of the pixel before."""
     mi = renderer
