@@ -4,10 +4,10 @@
 
 How much history counts, b, is made of
 
-    features      no history where albedo, normal and depth of the frame before are not those around this pixel now:
-                  what comes into sight takes nothing from what hid it
+    features      no history where albedo, normal and depth of the frame before are not those of this pixel now: what
+                  comes into sight takes nothing from what hid it
     variances     with r the variance of h over that of x: b = 1 / (1 + r), and y has (1 - b)² + b² r. So the first n
-                  frames of a shot at rest are averaged, up to ``LONGEST`` of them
+                  frames of a shot at rest are averaged, up to ``LONGEST`` of them, and fewer of a fast one
     evidence      h knows nothing of this frame's noisy primal p, of variance σ². In a window with weights w,
 
                       b* = [Σ w (h - x)(p - x) + k] / Σ w (h - x)²,    k = d Σ w σ²
@@ -16,6 +16,8 @@ How much history counts, b, is made of
                   the method leaves in it. What both h and x get wrong, blur above all, cancels. b* has a variance of
                   its own, and the mean of both b, weighted by their variances, is taken. Where lighting or reflections
                   change, b* falls, to 0 on fast ones
+
+    change        less history where h - x is many times what it is around: edges that were seen otherwise
 
 b* is the minimum of Stein's unbiased risk over the line from x to h; Rousselle et al. 2013, "Robust denoising using
 feature and color information", choose between filters by that risk. Where direct emission is known, the rest alone is
@@ -39,10 +41,12 @@ FAST = 0.005
 WINDOW = 4.0
 # What b may be off from that of the variances, before there is evidence (standard deviation).
 DOUBT = 0.12
-# Differences of features beyond those around a pixel, at which history counts exp(-1) = 0.37.
+# Differences of features beyond what is allowed, at which history counts exp(-1) = 0.37. A pixel that two surfaces
+# share in parts u and 1 - u has features with a standard deviation of sqrt(u (1 - u) / spp) times what they differ by.
+MIXED = 1.0
 # Times the change around it, from which a pixel's counts the less.
 UNUSUAL = 15.0
-ALBEDO, NORMAL, DEPTH = 0.05, 0.1, 0.03
+ALBEDO, NORMAL, DEPTH = 0.1, 0.2, 0.03
 
 
 @dataclass(frozen=True)
@@ -77,20 +81,24 @@ class Temporal:
         now = np.asarray(image, np.float32) - data.direct
         frame = stack.attributes.get("ngpt:frame")
         relative = np.ones(now.shape[:2], np.float32)
+        features = data.features
         self.weight = np.zeros(now.shape[:2], np.float32)
         before = self._history
         if before is not None and _follows(stack, before):
             motion = stack["motion"]
             history, found = warped(before.light, motion, sharp=True)
             spread = warped(before.variance[..., None], motion)[0][..., 0]
-            trust = found * _agreement(data.features, before.features, motion, found)
+            then = {name: warped(layer, motion)[0] for name, layer in before.features.items() if name in features}
+            trust = found * _agreement(features, then, found)
             speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
             spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
             b = _share(now, history, data.image, data.noise, trust, 1 / (1 + spread))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             now = now + b[..., None] * (history - now)
             self.weight = b
-        self._history = _History(now, relative, data.features, frame)
+            # They have noise as well, and are blended as the light is, that they stay those of its pixels.
+            features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
+        self._history = _History(now, relative, features, frame)
         return (now + data.direct).astype(np.float32)
 
 
@@ -102,21 +110,20 @@ def _follows(stack: GradientStack, before: _History) -> bool:
     return previous is None or before.frame is None or previous == before.frame
 
 
-def _agreement(
-    now: dict[str, np.ndarray], before: dict[str, np.ndarray], motion: np.ndarray, found: np.ndarray
-) -> np.ndarray:
-    """How far the features before are those around each pixel now, (H, W) from 0 to 1."""
+def _agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np.ndarray) -> np.ndarray:
+    """How far the features ``then`` are those of each pixel now, (H, W) from 0 to 1."""
     strange = np.zeros(found.shape)
     for name, scale in (("albedo", ALBEDO), ("normal", NORMAL), ("depth", DEPTH)):
-        if name not in now or name not in before:
+        if name not in then:
             continue
-        here, there = now[name], warped(before[name], motion)[0]
+        here, there = now[name], then[name]
         if name == "depth":
             here, there = (np.log(np.maximum(layer, 1e-6)) for layer in (here, there))
             # A camera that comes nearer changes all depths: alike, if not by the same factor.
             there = there + (np.median((here - there)[found]) if found.any() else 0)
         low, high = minimum_filter(here, (3, 3, 1)), maximum_filter(here, (3, 3, 1))
-        beyond = np.maximum(np.maximum(low - there, there - high), 0) / scale
+        allowed = MIXED * np.sqrt((here - low) * (high - here))
+        beyond = np.maximum(np.abs(there - here) - allowed, 0) / scale
         strange += np.square(beyond).sum(axis=-1)
     return np.exp(-strange).astype(np.float32)
 

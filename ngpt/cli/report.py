@@ -20,7 +20,10 @@ from ngpt.version import __version__
 
 # Denoising moves the mean by a fraction of this.
 _STOPS = 0.5
-FLICKER = "mean of (d - d_r)^2 / (r^2 + 0.001), d the change along motion from the frame before, d_r the reference's"
+FLICKER = (
+    "mean of (d - d_r)^2 / (m + 0.001), d the change along motion from the frame before, d_r that of the reference r, "
+    "m the mean of r^2 in both frames"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,11 +12,12 @@ from ngpt.warp import warped
 def flicker_maps(
     images: Sequence[np.ndarray], references: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
 ) -> list[np.ndarray]:
-    """(H, W, 3) for each frame but the first: (d - d_r)² / (r² + 1e-3), NaN where that is not known.
+    """(H, W, 3) for each frame but the first: (d - d_r)² / (m + 1e-3), NaN where that is not known.
 
-    d = x_t(p) - x_{t-1}(p + m) is the difference in time along motion of the images x, d_r that of the references r,
-    ``motions`` (H, W, 2) those of their frames, of which the first is not used; None and NaN: unknown. What changes in
-    the reference too, a moving shadow or a reflection, is no flicker. Raises NgptError for lists of different lengths.
+    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, d_r that of the references
+    r, m the mean of r² in both frames. ``motions`` (H, W, 2) are those of the frames, of which the first is not used;
+    None and NaN: unknown. What changes in the reference too, a moving shadow or a reflection, is no flicker. Raises
+    NgptError for lists of different lengths.
     """
     if not len(images) == len(references) == len(motions) or len(images) < 2:
         raise NgptError(
@@ -25,12 +26,16 @@ def flicker_maps(
         )
     errors = [np.asarray(image, np.float64) - reference for image, reference in zip(images, references, strict=True)]
     maps = []
-    for last, error, reference, motion in zip(errors, errors[1:], references[1:], motions[1:], strict=False):
+    squares = [np.square(reference, dtype=np.float64) for reference in references]
+    pairs = zip(errors, errors[1:], squares, squares[1:], motions[1:], strict=False)
+    for last, error, square_before, square, motion in pairs:
         if motion is None:
             maps.append(np.full(error.shape, np.nan))
             continue
         before, found = warped(last, motion)
-        relative = np.square(error - before) / (np.square(reference, dtype=np.float64) + EPSILON)
+        # Of both frames: what goes from a lamp to what is dark beside it is not worth thousands of other pixels.
+        level = (square + warped(square_before, motion)[0]) / 2
+        relative = np.square(error - before) / (level + EPSILON)
         maps.append(np.where(found[..., None], relative, np.nan))
     return maps
 

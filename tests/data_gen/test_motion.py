@@ -79,7 +79,7 @@ def test_a_sphere_moves_in_front_of_a_wall_at_rest(renderer):
     mi = renderer
     scene = scene_of(mi, wall=wall(mi, -1), ball={"type": "sphere", "radius": 0.5})
     params = mi.traverse(scene)
-    key = next(name for name in params if name.endswith("ball.to_world"))
+    key = next(filter(lambda name: name.endswith("ball.to_world"), params.keys()))
 
     def change():
         params[key] = mi.Transform4f().translate(floats([2 * pixel_width(5), 0, 0])).scale(0.5)
@@ -94,7 +94,7 @@ def test_any_deformation_of_a_mesh_is_followed(renderer):
     mi = renderer
     scene = scene_of(mi, box={"type": "cube", "to_world": mi.ScalarTransform4f().scale([1.5, 1.5, 0.1])})
     params = mi.traverse(scene)
-    key = next(name for name in params if name.endswith("box.vertex_positions"))
+    key = next(filter(lambda name: name.endswith("box.vertex_positions"), params.keys()))
     points = np.array(params[key]).reshape(-1, 3)
 
     def change():
@@ -106,6 +106,21 @@ def test_any_deformation_of_a_mesh_is_followed(renderer):
     y = (11.5 - np.arange(24)) * pixel_width(4.9)
     assert np.allclose(motion[6:18, 16, 0], -0.1 * y[6:18] / pixel_width(4.9), atol=1e-2)
     assert np.allclose(motion[6:18, 16, 1], 0, atol=1e-3)
+
+
+def test_instances_move_by_their_own_matrix(renderer):
+    mi = renderer
+    from data_gen.frames.motion import motion_vectors, snapshot
+
+    def scene(shift):
+        instance = {"type": "instance", "to_world": mi.ScalarTransform4f().translate([shift, 0, 0])}
+        instance["shapegroup"] = {"type": "ref", "id": "group"}
+        return scene_of(mi, group={"type": "shapegroup", "one": {"type": "cube"}}, wall=wall(mi, -1), thing=instance)
+
+    step = 2 * pixel_width(4)  # of its front, 4 from the camera
+    now = scene(step)
+    motion = motion_vectors(now, snapshot(now), snapshot(scene(0)))
+    assert np.allclose(motion[12, 16], [-2, 0], atol=1e-2) and np.allclose(motion[1, 1], 0)
 
 
 def test_what_is_seen_here_was_seen_there(renderer):

@@ -61,7 +61,7 @@ def test_a_scene_is_loaded_again_only_where_its_parameters_change(renderer, tmp_
 
 def test_parameters_can_be_set_in_place(renderer, tmp_path):
     def update(params, frame):
-        key = next(name for name in params if name.endswith("vertex_positions"))
+        key = next(filter(lambda name: name.endswith("vertex_positions"), params.keys()))
         start.setdefault(key, np.array(params[key]))
         params[key] = start[key] + 0.1 * frame
 
