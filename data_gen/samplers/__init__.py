@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
+# Of one that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a pass
+_GBDPT_BYTES = PATH_BYTES + 160
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -37,6 +39,7 @@ class Sampler:
     ``options``     the options that ``make`` takes: name -> what it does
     ``gradients``   whether it renders dx and dy
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
+    ``tried``       whether the pilot of "auto" tries it too, where it can render the scene (``data_gen.pilot``)
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
@@ -51,6 +54,7 @@ class Sampler:
     options: Mapping[str, str] = field(default_factory=dict)
     gradients: bool = True
     rank: int = 0
+    tried: bool = True
     batch: int = 0
     lane_bytes: int = PATH_BYTES
     module: str = ""
@@ -79,7 +83,7 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler that "auto" stands for, and why."""
+    """The sampler that "auto" stands for by the description alone, and why."""
     reasons = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:
@@ -150,8 +154,18 @@ def _notes_on_bdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _PRIMAL = (
-    f"data_gen.samplers.{name}" for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "primal")
+def _notes_on_gbdpt(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
+    if facts.mirrors:
+        lines.append(
+            "mirrors or clear glass: shifted in front of the camera, not behind other surfaces: noisy gradients"
+        )
+    return lines
+
+
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PRIMAL = (
+    f"data_gen.samplers.{name}"
+    for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "gbdpt.integrator", "primal")
 )
 
 for _sampler in (
@@ -178,6 +192,7 @@ for _sampler in (
         _from_module(_BASIC),
         notes=_notes_on_replay,
         rank=9,
+        tried=False,
         module=_BASIC,
     ),
     Sampler(
@@ -186,6 +201,7 @@ for _sampler in (
         _from_module(_SIMPLE),
         _refused_by_gpt_simple,
         lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
+        tried=False,
         module=_SIMPLE,
     ),
     Sampler(
@@ -198,6 +214,20 @@ for _sampler in (
         gradients=False,
         batch=4,
         module=_BDPT,
+    ),
+    Sampler(
+        "gbdpt",
+        "gradients of paths from the camera and from the lights (hidden lamps)",
+        _from_module(_GBDPT),
+        lambda facts: _refused_but_for_surfaces(facts, "gbdpt"),
+        _notes_on_gbdpt,
+        {
+            "joined_depth": "edges of a path, up to which it is found from both ends (10); longer ones from the camera",
+            "roughness_threshold": "the microfacet roughness above which materials are connectable",
+        },
+        batch=8,
+        lane_bytes=_GBDPT_BYTES,
+        module=_GBDPT,
     ),
     Sampler(
         "primal",

@@ -32,17 +32,17 @@ class LightEnds:
     Points on areas are sampled as Mitsuba's emitters do, with a cosine distribution of directions; the directions of
     what is infinitely far away as well, on a disk that covers the scene; points light all around, spots their cone.
 
-    Raises NgptError for a scene with emitters that Mitsuba does not tell enough of.
+    Raises NgptError, in the name of the ``sampler``, for a scene with emitters that Mitsuba does not tell enough of.
     """
 
-    def __init__(self, scene: mi.Scene):
+    def __init__(self, scene: mi.Scene, sampler: str = "bdpt"):
         emitters = scene.emitters()
         kinds = [_kind(emitter) for emitter in emitters]
         for emitter, kind in zip(emitters, kinds, strict=True):
             if kind is None:
                 raise NgptError(
-                    f"sampler 'bdpt' cannot render this scene: light cannot be traced from emitter '{emitter.id()}' "
-                    f"({emitter.class_name()}); use --sampler gpt, or primal"
+                    f"sampler '{sampler}' cannot render this scene: light cannot be traced from emitter "
+                    f"'{emitter.id()}' ({emitter.class_name()}); use --sampler gpt, or primal"
                 )
         box = scene.bbox()
         self.center = mi.ScalarPoint3f(box.center())
@@ -66,6 +66,10 @@ class LightEnds:
     def index_of(self, emitter: mi.EmitterPtr, active=True) -> mi.UInt32:
         """The number of an emitter in the scene."""
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
+
+    def far(self, index: mi.UInt32) -> mi.Bool:
+        """Whether the emitter with that number is infinitely far away."""
+        return dr.gather(mi.UInt32, self.kind, index) == _FAR
 
     def emission(self, index: mi.UInt32, p: mi.Float, cos: mi.Float, distance2: mi.Float) -> mi.Float:
         """``e`` of ``mis``, of the emitter with that number.
@@ -144,6 +148,64 @@ class LightEnds:
             ball = area & (dr.gather(mi.Float, self.of_ball, start.index) > 0)
             p = dr.select(ball, scene.pdf_emitter_direction(y, end, ball), p)
         return self.emission(start.index, p, cos, distance2), p
+
+    def redirected(self, scene, start: LightRay, y: mi.SurfaceInteraction3f) -> tuple[LightRay, mi.Float, mi.Float]:
+        """``start`` shifted: the same end, but the edge to vertex ``y``.
+
+        Its β is Le cos / p with the p of ``start``. With it come p' / p, and dω / dA cos, of the cosine at y: the
+        inverse of the squared distance, or 1 if it is infinite.
+        """
+        kind = dr.gather(mi.UInt32, self.kind, start.index)
+        far = kind == _FAR
+        to = mi.Vector3f(y.p - start.end.p)
+        per_distance2 = dr.select(far, 1, dr.rcp(dr.squared_norm(to)))
+        d = dr.select(far, start.ray.d, dr.normalize(to))
+        β, ratio = mi.Spectrum(start.β), mi.Float(1)
+        if _AREA in self.kinds:
+            # Of a cosine distribution; behind the emitter there is no light.
+            cosines = dr.dot(start.end.n, d) / dr.dot(start.end.n, start.ray.d)
+            ratio = dr.select(kind == _AREA, dr.select(cosines > 0, cosines, 0), ratio)
+            β *= ratio
+        if _POINT in self.kinds:
+            here = kind == _POINT
+            beside = _somewhere(start.end.p + d, y.time, y.wavelengths)
+            _, intensity = start.emitter.sample_direction(beside, mi.Point2f(0.5), here)
+            density = scene.pdf_emitter(start.index) * _cone_density(dr.gather(mi.Float, self.cutoff, start.index))
+            β = dr.select(here, intensity / density, β)
+        ray = mi.Ray3f(start.ray.o, d, y.time, y.wavelengths)
+        return LightRay(ray, β, start.emitter, start.index, start.end, start.delta), ratio, per_distance2
+
+    def seen_from_elsewhere(
+        self, scene, light: mi.DirectionSample3f, weight: mi.Spectrum, si: mi.SurfaceInteraction3f, active
+    ) -> tuple[mi.DirectionSample3f, mi.Spectrum, mi.Float]:
+        """A sampled ``light`` of ``weight`` Le / p shifted: the same point of the emitter seen from ``si``.
+
+        The weight that is returned is Le J / p with the p of ``light``. With it comes p' J / p; J = dω' / dω.
+        """
+        index = self.index_of(light.emitter, active)
+        kind = dr.gather(mi.UInt32, self.kind, index, active)
+        far = kind == _FAR
+        other = mi.DirectionSample3f(light)
+        to = mi.Vector3f(light.p - si.p)
+        distance = dr.norm(to)
+        other.d, other.dist = dr.select(far, light.d, to / distance), dr.select(far, light.dist, distance)
+        other.p = dr.select(far, si.p + light.d * light.dist, light.p)
+        weight, r = mi.Spectrum(weight), mi.Float(1)
+        if _AREA in self.kinds:
+            here = kind == _AREA
+            facing = dr.dot(light.n, other.d) / dr.dot(light.n, light.d)
+            J = dr.select(facing > 0, facing * dr.square(light.dist / distance), 0)
+            weight *= dr.select(here, J, 1)
+            other.pdf = dr.select(here, dr.select(J > 0, light.pdf / J, 0), light.pdf)
+            if self.balls:
+                ball = active & here & (dr.gather(mi.Float, self.of_ball, index, active) > 0)
+                other.pdf = dr.select(ball, scene.pdf_emitter_direction(si, other, ball), other.pdf)
+                r = dr.select(ball, other.pdf * J / light.pdf, r)
+        if _POINT in self.kinds:
+            here = active & (kind == _POINT)
+            _, intensity = light.emitter.sample_direction(si, mi.Point2f(0.5), here)
+            weight = dr.select(here, intensity / scene.pdf_emitter(index, here), weight)
+        return other, weight, r
 
 
 def _kind(emitter: mi.Emitter) -> int | None:

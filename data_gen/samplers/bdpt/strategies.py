@@ -37,17 +37,25 @@ def to_light(lights: LightEnds, z: Vertex, light, weight, f, p, q) -> tuple[mi.S
 
 def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
     """s, t > 1, occlusion included."""
+    C, known = connection(scene, z, z_bsdf, y, active)
+    return z.β * C, mis.others_connected(z.end, *known[:3], y.end, *known[3:])
+
+
+def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, tuple]:
+    """The same without the camera path's throughput, and what else its MIS weight is made of.
+
+    Where it is known that the vertices see each other, ``seen``, no ray is traced.
+    """
     to = mi.Vector3f(y.si.p - z.si.p)
     distance2 = dr.squared_norm(to)
     d = to * dr.rsqrt(distance2)
     f, p_z, q_z = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(d), active)
     g, p_y, q_y = evaluate(IMPORTANCE, y.si, y.si.bsdf(), y.si.to_local(-d), active)
-    C = z.β * y.β * f * g / distance2
+    C = y.β * f * g / distance2
     # Vertices in one place are no path: their density is infinite.
-    lit = active & (dr.max(C) > 0) & (distance2 > 0)
-    C = dr.select(lit & ~scene.ray_test(z.si.spawn_ray_to(y.si.p), lit), C, 0)
-    cosines = cosine(z.si, d), cosine(y.si, d)
-    return C, mis.others_connected(z.end, cosines[0], p_z, q_z, y.end, cosines[1], p_y, q_y, distance2)
+    lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
+    C = dr.select(lit & ~scene.ray_test(z.si.spawn_ray_to(y.si.p), lit & ~mi.Bool(seen)), C, 0)
+    return C, (cosine(z.si, d), p_z, q_z, cosine(y.si, d), p_y, q_y, distance2)
 
 
 def to_camera(sensor, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:

@@ -1,0 +1,219 @@
+r"""Gradient-domain bidirectional path tracing: ``bdpt``, and each of its paths shifted to four neighbouring pixels.
+
+Every path is found by one of many strategies, and shifted by one map that does not know which it was. So a path and
+its copy share one weight over all strategies of both: see ``pairs``.
+
+    x, y = T(x)       a path and its copy through the neighbouring pixel, with the same sub-pixel and lens samples
+    b, b'             f(x) / p_s(x), and f(y) |J| / p_s(x): both with the density of the strategy that has found x
+    r                 p_s(y) |J| / p_s(x)
+    others            Σ p_j / p_s over all other strategies, of x or of y; of offset paths by the recursion of ``mis``
+                      along y itself, as if y were a base path
+    Δ                 gradient sample, the sum over all strategies and lengths
+
+The map: mirrors, clear glass and holes in front of the camera are replayed; the first vertex behind them is the copy's
+own, and from there it goes straight to the next vertex of the path, which both share with all further ones. It is
+rejected, alike by all strategies, where one of these three vertices is not connectable, where a mirror leaves one of
+them, or where the copy is occluded or black. What is completed by connecting the camera path's first vertices is
+shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
+
+[Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain
+Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 14-15]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import SHIFTS, GradientFilm
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.integrator import BDPT, refuse
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.bdpt.strategies import connection, to_camera
+from data_gen.samplers.bdpt.vertex import (
+    IMPORTANCE,
+    Vertex,
+    adjoint,
+    context,
+    cosine,
+    recall,
+    record,
+    record_class,
+    reverse_density,
+    scatters_smoothly,
+)
+from data_gen.samplers.common import like_path
+from data_gen.samplers.gbdpt.base_path import Plan, base_step
+from data_gen.samplers.gbdpt.light_shift import Splatted, differences
+from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
+from data_gen.samplers.gbdpt.pairs import weighted
+
+
+class GBDPT(BDPT):
+    """Gradient-domain bidirectional path tracing, for surfaces.
+
+    Plugin ``gbdpt``. Parameters are those of ``bdpt``, and
+
+    ``roughness_threshold``  0.05, the microfacet roughness above which materials are connectable
+
+    Not handled: what ``bdpt`` does not handle.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene, "gbdpt")
+        materials = Materials(scene, self.roughness_threshold)
+        longest = min(self.max_depth, self.joined_depth)
+        plan = Plan(LightEnds(scene, "gbdpt"), materials, self.max_depth, self.rr_depth, longest)
+        return lambda camera, film: self.gradient_pass(scene, plan, camera, film)
+
+    def gradient_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
+        """Takes one path from the camera and one from a light, and all their shifts, for each camera sample."""
+        ray, importance, _ = camera.rays()
+        shifted = [camera.rays(shift) for shift in SHIFTS.values()]
+        random = camera.random.clone()
+        kept, count = None, mi.UInt32(0)
+        if plan.longest > 1 and plan.lights.emitters is not None:
+            splats = {name: film.splats(name) for name in ("primal", *SHIFTS)}
+            kept, count, random = self.shifted_light_path(scene, plan, camera, random, ray, importance, splats)
+        L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
+        values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
+        values |= features(scene, camera.sensor, camera.random.clone(), ray)
+        Δ, inside = [to_rgb(one, ray.wavelengths) for one in Δ], [inside for _, _, inside in shifted]
+        # One kernel for all of it: each value read on its own would trace the paths again.
+        dr.eval(values, Δ, inside)
+        film.put_all(values)
+        for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
+            film.put(name, value, active)
+
+    @dr.syntax
+    def shifted_light_path(self, scene, plan, camera, random, camera_ray, importance, splats):
+        """``BDPT.light_path``, with the differences of all that it splats."""
+        lights, materials, longest = plan.lights, plan.materials, plan.longest
+        size, lens = camera.size, camera.sensor.needs_aperture_sample()
+        start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
+        ray, β = start.ray, start.β
+        active = dr.max(β) > 0
+        brightest = dr.rcp(dr.max(β))
+        hit = scene.ray_intersect_preliminary(ray, active=active)
+        si = hit.compute_surface_interaction(ray)
+        active &= si.is_valid()
+        e, p_light = lights.densities(scene, start, si)
+        end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
+        depth, count = mi.UInt32(1), mi.UInt32(0)
+        # How the vertex before was left
+        p_before, survival_before, left_smoothly = mi.Float(1), mi.Float(1), mi.Bool(True)
+        Record = record_class(mi.variant())
+        kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
+        while dr.hint(active, label="light path"):
+            y = Vertex(si, β, end, depth)
+            bsdf = si.bsdf()
+            smooth = active & scatters_smoothly(bsdf)
+            # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
+            kept.write(record(ray, hit, y, smooth), depth - 1, active)
+            count = dr.select(active, depth, count)
+
+            # ------------------- To the camera -----------------------
+            on_lens = mi.Point2f(0.5)
+            if dr.hint(lens, mode="scalar"):
+                on_lens = random.next_2d()
+            C, others, uv = to_camera(
+                camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
+            )
+            light = to_rgb(weighted(C, others) * importance, camera_ray.wavelengths)
+            pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
+            splats["primal"].add(pixel, list(light), dr.max(C) > 0)
+
+            # ----------------- Its four shifts -----------------------
+            first = depth == 1
+            before = recall(kept.read(dr.maximum(depth, 2) - 2), camera_ray.time, camera_ray.wavelengths)
+            allowed = materials.connectable(bsdf) & (first | (left_smoothly & materials.connectable(before.si.bsdf())))
+            path = Splatted(y, ray.d, uv, on_lens, C, others, first, start, before, p_before, survival_before, allowed)
+            Δ = differences(scene, plan, camera, path, self.first_hit)
+            for name in SHIFTS:
+                one, on_film = Δ[name]
+                splats[name].add(pixel, list(to_rgb(one * importance, camera_ray.wavelengths)), on_film)
+
+            # -------------------- Next vertex ------------------------
+            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+            sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
+            left_smoothly = event_kind(sample.sampled_type) == SMOOTH
+            d, p_before = si.to_world(sample.wo), mi.Float(sample.pdf)
+            q = reverse_density(si, bsdf, sample.wo, active & left_smoothly)
+            end = mis.leave(end, cosine(si, d), sample.pdf, q, ~left_smoothly)
+            β *= f_p * adjoint(si, sample.wo)
+            # By what is left of the light that the path began with
+            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
+            active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
+            survival_before = dr.rcp(survival)
+            β *= survival_before
+            depth += 1
+            ray = si.spawn_ray(d)
+            hit = scene.ray_intersect_preliminary(ray, active=active)
+            si = hit.compute_surface_interaction(ray)
+            active &= si.is_valid()
+            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+        return kept, count, random
+
+    @dr.syntax
+    def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):
+        """``BDPT.camera_path``, and Δ of its four offset paths."""
+        ray = mi.Ray3f(ray)
+        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
+        offsets = []
+        for offset_ray, offset_importance, inside in shifted:
+            hit = self.first_hit(scene, offset_ray)
+            offsets.append(start(camera.sensor, camera.lens, si, offset_ray, hit, offset_importance, inside))
+        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+        sky_seen = mi.Bool(not self.hide_emitters)
+        shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
+        Le = importance * si.emitter(scene).eval(si, shown)
+        L = dr.zeros(mi.Spectrum, dr.width(ray))
+        β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+        active = si.is_valid() & (depth < plan.max_depth)
+        _, density = camera.sensor.sample_direction(si, camera.lens, active)
+        end = mis.begin_camera(density[0], cosine(si, ray.d))
+        while dr.hint(active, label="camera path"):
+            z = Vertex(si, β, end, depth)
+            step, η, sky_seen = base_step(scene, plan, random, z, active, η, sky_seen, brightest(offsets))
+            L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
+            if dr.hint(kept is not None, mode="scalar"):
+                joins = active & scatters_smoothly(si.bsdf()) & step.joins
+                L, Δ = self.shifted_connections(scene, plan, step, joins, kept, count, ray, L, offsets)
+                offsets = with_differences(offsets, Δ)
+            offsets = take_step(scene, plan, step, offsets)
+            si, β, end = step.x1, step.β1, step.end1
+            depth += 1
+            active = step.goes_on & si.is_valid() & (depth < plan.max_depth)
+        return L, Le, [offset.Δ for offset in offsets]
+
+    @dr.syntax
+    def shifted_connections(self, scene, plan, step, active, kept, count, ray, L, offsets):
+        """``L`` and Δ, and with them all paths that join the vertex of ``step`` to one of those ``kept``."""
+        z, Δ = step.z, [offset.Δ for offset in offsets]
+        bsdf = z.si.bsdf()
+        i = mi.UInt32(0)
+        while dr.hint(active & (i < count), label="connections"):
+            y = recall(kept.read(i), ray.time, ray.wavelengths)
+            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= plan.longest)
+            found = connection(scene, z, bsdf, y, joins)
+            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, offsets, Δ)
+            L += weighted(C, others)
+            i += 1
+        return L, Δ
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``gbdpt``, with the parameters of the scene's own ``path``."""
+    return like_path(scene, "gbdpt", **options).prepare(scene)
+
+
+mi.register_integrator("gbdpt", lambda props: GBDPT(props))

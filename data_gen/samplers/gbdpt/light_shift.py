@@ -1,0 +1,125 @@
+"""Light paths that end at the camera, shifted: the last vertex moves to where a neighbouring pixel looks.
+
+The vertex before it stays. So it is the same shift as that of camera paths, seen from the other end.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import SHIFTS
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.lights import LightRay
+from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate
+from data_gen.samplers.gbdpt.base_path import Plan
+from data_gen.samplers.gbdpt.pairs import difference
+
+
+@dataclass
+class Splatted:
+    """A light path that ends at the camera, and what of it a shift needs."""
+
+    y: Vertex  # the last vertex
+    d: mi.Vector3f  # the direction in which the path came there
+    uv: mi.Point2f  # its place on the film, in pixels
+    lens: mi.Point2f
+    C: mi.Spectrum
+    others: mi.Float
+    first: mi.Bool  # the vertex before the last is the light's end, ``start``; else ``before``
+    start: LightRay
+    before: Vertex
+    p: mi.Float  # density with which ``before`` was left
+    survival: mi.Float  # 1 / probability to survive Russian roulette there
+    allowed: mi.Bool  # both vertices are connectable, and ``before`` was left by a smooth event
+
+
+def differences(
+    scene, plan: Plan, camera, path: Splatted, first_hit: Callable
+) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
+    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film."""
+    shifts = list(SHIFTS.values())
+    lit = dr.max(path.C) > 0
+    state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))
+
+    def one(i, *Δ):
+        shift = mi.Vector2f(choose(i, [x for x, _ in shifts]), choose(i, [y for _, y in shifts]))
+        uv = path.uv + shift
+        active = lit & inside(camera, uv)
+
+        def pair(_):
+            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit)
+            return difference(path.C, path.others, C, r, others)
+
+        Δ1 = dr.if_stmt((mi.Spectrum(0),), active, pair, lambda none: none)
+        return i + 1, *(dr.select(i == k, Δ1, old) for k, old in enumerate(Δ))
+
+    Δ = dr.while_loop(state, lambda i, *_: lit & (i < len(shifts)), one, label="shifts to the camera")[1:]
+    on_film = [lit & inside(camera, path.uv + mi.Vector2f(*shift)) for shift in shifts]
+    return dict(zip(SHIFTS, zip(Δ, on_film, strict=True), strict=True))
+
+
+def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
+    """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
+    # --------------------- The last vertex -----------------------
+    sensor, y = camera.sensor, path.y
+    size = mi.Vector2f(camera.size)
+    ray, _ = sensor.sample_ray(camera.time, camera.wavelength, uv / size, path.lens)
+    x = first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
+    bsdf = x.bsdf()
+    active = active & x.is_valid() & plan.materials.connectable(bsdf)
+    toward, importance = sensor.sample_direction(x, path.lens, active)
+    toward0, importance0 = sensor.sample_direction(y.si, path.lens, active)
+    # Per area, the film's density at either vertex is importance times cosine: J is their ratio.
+    J = importance0[0] * cosine(y.si, toward0.d) / (importance[0] * cosine(x, toward.d))
+
+    # ---------------- The edge to the one before -----------------
+    edge = (mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.Ray3f(ray))
+
+    def from_start(*_):
+        moved, ratio, per_distance2 = plan.lights.redirected(scene, path.start, x)
+        _, _, per_distance2_0 = plan.lights.redirected(scene, path.start, y.si)
+        d = moved.ray.d
+        e, p = plan.lights.densities(scene, moved, x)
+        end = mis.begin_light(e, p, moved.delta, cosine(x, d))
+        G = cosine(x, d) / cosine(y.si, path.d) * (per_distance2 / per_distance2_0)
+        shadow = dr.select(plan.lights.far(path.start.index), x.spawn_ray(-d), x.spawn_ray_to(moved.end.p))
+        return d, moved.β * G, ratio * G, end.vcm, end.vc, shadow
+
+    def from_before(*_):
+        before = path.before
+        to = mi.Vector3f(x.p - before.si.p)
+        distance2 = dr.squared_norm(to)
+        d = to * dr.rsqrt(distance2)
+        f, p, q = evaluate(IMPORTANCE, before.si, before.si.bsdf(), before.si.to_local(d), active)
+        end = mis.leave(before.end, cosine(before.si, d), p, q, mi.Bool(False))
+        end = mis.arrive(end, cosine(x, d), distance2)
+        G = cosine(x, d) / cosine(y.si, path.d) * (dr.squared_norm(y.si.p - before.si.p) / distance2)
+        β = before.β * f * (G * path.survival / path.p)
+        return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p)
+
+    d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
+
+    # ----------------------- To the camera -----------------------
+    x.wi = x.to_local(-d)
+    f, _, q = evaluate(IMPORTANCE, x, bsdf, x.to_local(toward.d), active)
+    C = β * f * importance * J
+    seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
+    C = dr.select(seen & ~scene.ray_test(shadow, seen), C, 0)
+    return C, r * J, mis.others_to_camera(Partial(vcm, vc), importance[0], cosine(x, toward.d), q)
+
+
+def inside(camera, uv: mi.Point2f) -> mi.Bool:
+    return (uv.x >= 0) & (uv.y >= 0) & (uv.x < camera.size.x) & (uv.y < camera.size.y)
+
+
+def choose(i: mi.UInt32, values: list[float]) -> mi.Float:
+    """The value of that number."""
+    found = mi.Float(0)
+    for k, value in enumerate(values):
+        found = dr.select(i == k, mi.Float(value), found)
+    return found

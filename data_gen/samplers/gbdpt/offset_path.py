@@ -1,0 +1,260 @@
+"""The four camera paths beside that of a sample: how each is shifted, and completed by every strategy.
+
+An offset path is *apart* while it has vertices of its own, *joined* at the vertex that it shares but has come to from
+elsewhere, and *settled* from there on: it differs from its base path by β, r and the partial sums of its weights alone.
+It has ended where β is 0. Symbols as in ``gbdpt``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.shift import reconnection_jacobian
+from data_gen.paths.vertex import SMOOTH, event_kind, seen_from
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.strategies import connection, emission_at
+from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, evaluate
+from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
+from data_gen.samplers.gbdpt.pairs import difference
+
+
+@dataclass
+class Offset:
+    """The state of one offset path at the current vertex of its base path."""
+
+    ray: mi.Ray3f  # apart: led to the offset path's own vertex; joined: to the shared one
+    hit: mi.PreliminaryIntersection3f  # apart: that vertex
+    β: mi.Spectrum  # f J / p of the base path
+    r: mi.Float
+    end: Partial  # of the offset path, as if it were a base path
+    apart: mi.Bool
+    joined: mi.Bool
+    Δ: mi.Spectrum
+
+
+def start(sensor, lens, x, ray, hit, β, inside) -> Offset:
+    """An offset path up to its first vertex; none where there is no base path."""
+    y = hit.compute_surface_interaction(ray)
+    lives = inside & hit.is_valid() & x.is_valid()
+    _, density = sensor.sample_direction(y, lens, lives)
+    end = mis.begin_camera(density[0], cosine(y, ray.d))
+    n = dr.width(hit.t)
+    return Offset(
+        ray=mi.Ray3f(ray),
+        hit=hit,
+        β=dr.select(lives, mi.Spectrum(β), 0),
+        r=mi.Float(1),
+        end=Partial(dr.select(lives, end.vcm, 0), mi.Float(0)),
+        apart=lives,
+        joined=mi.Bool(False),
+        Δ=dr.zeros(mi.Spectrum, n),
+    )
+
+
+def own_vertex(offset: Offset, x: mi.SurfaceInteraction3f) -> mi.SurfaceInteraction3f:
+    """Where an offset path is that is not settled; ``x`` is the base path's vertex."""
+    own = offset.hit.compute_surface_interaction(offset.ray, active=offset.apart)
+    return dr.select(offset.apart, own, seen_from(x, offset.ray.d))
+
+
+def brightest(offsets: list[Offset]) -> mi.Float:
+    """The most that any of the offset paths may yet bring to Δ."""
+    largest = mi.Float(0)
+    for y in offsets:
+        largest = dr.fmax(largest, dr.max(y.β) / (1 + y.r))
+    return largest
+
+
+def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offset]:
+    """The same offset paths, with these sums of Δ."""
+    return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
+
+
+def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, offsets, Δ) -> tuple:
+    """C and ``others`` of the connection of ``z`` to ``y``, a vertex of the light path; and the sums Δ with it.
+
+    ``found`` is what ``strategies.connection`` has found for the base path.
+    """
+    g, known = found
+    C, others = z.β * g, mis.others_connected(z.end, *known[:3], y.end, *known[3:])
+    lit = dr.max(C) > 0
+    busy, sums = mi.Bool(False), []
+    for offset, Δ_before in zip(offsets, Δ, strict=True):
+        own = offset.apart | offset.joined
+        busy |= own
+        others1 = mis.others_connected(offset.end, *known[:3], y.end, *known[3:])
+        sums.append(Δ_before + dr.select(~own, difference(C, others, offset.β * g, offset.r, others1), 0))
+    # What a shift to y needs of the materials, but for the offset path's own
+    both = z_connectable & plan.materials.connectable(y.si.bsdf())
+
+    def one(i, *Δ):
+        offset = pick(offsets, i)
+
+        def own(Δ1):
+            v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
+            bsdf = v.si.bsdf()
+            good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
+            g1, known1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
+            others1 = mis.others_connected(v.end, *known1[:3], y.end, *known1[3:])
+            return difference(C, others, v.β * g1, offset.r, others1)
+
+        Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
+        return i + 1, *(dr.select(i == k, old + Δ1, old) for k, old in enumerate(Δ))
+
+    state = (mi.UInt32(0), *sums)
+    Δ = dr.while_loop(state, lambda i, *_: busy & lit & (i < len(offsets)), one, label="connected offsets")[1:]
+    return C, others, list(Δ)
+
+
+def take_step(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
+    """Takes all offset paths along a step of their base path; connections to the light path are not in it."""
+    busy = mi.Bool(False)
+    for offset in offsets:
+        busy |= offset.apart | offset.joined
+    offsets = [settled(step, offset) for offset in offsets]
+
+    def rotate(i, y, *others):
+        own = y.apart | y.joined
+        y = dr.if_stmt((y,), own, lambda y: step_own(scene, plan, step, y), lambda y: y)
+        return i + 1, *others, y
+
+    state = (mi.UInt32(0), *offsets)
+    return list(dr.while_loop(state, lambda i, *_: busy & (i < len(offsets)), rotate, label="offset steps")[1:])
+
+
+def settled(step: Step, y: Offset) -> Offset:
+    """A step that both paths take alike; for offset paths that are not settled, nothing."""
+    here = ~(y.apart | y.joined)
+    x = step.z.si
+    # ------------------------ To a light -------------------------
+    end = known_end(y.end, step.joins)
+    cos = cosine(x, step.light.d)
+    p_light = dr.select(step.light.delta, 0, step.light.pdf)
+    others = mis.others_to_light(end, step.e_light, p_light, cos, step.p_light, step.q_light)
+    Δ = difference(step.C_light, step.others_light, y.β * step.f_light * step.weight, y.r, others)
+    # ----------------------- Next vertex -------------------------
+    β = y.β * step.f_p
+    end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH)
+    # ------------------ Emission met by chance -------------------
+    others = mis.others_emitted(known_met(end, step.counted), step.e_met, step.p_met)
+    Δ += difference(step.C_met, step.others_met, β * step.Le, y.r, others)
+    end = mis.arrive(end, cosine(step.x1, step.d), dr.square(step.x1.t))
+    return Offset(
+        ray=y.ray,
+        hit=y.hit,
+        β=dr.select(here, dr.select(step.goes_on, β, 0), y.β),
+        r=y.r,
+        end=Partial(dr.select(here, end.vcm, y.end.vcm), dr.select(here, end.vc, y.end.vc)),
+        apart=y.apart,
+        joined=y.joined,
+        Δ=y.Δ + dr.select(here, Δ, 0),
+    )
+
+
+def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
+    """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
+    # ------------------------ The vertex -------------------------
+    si = own_vertex(y, step.z.si)
+    bsdf = si.bsdf()
+    connectable = plan.materials.connectable(bsdf)
+
+    # ------------------------ To a light -------------------------
+    lit = (dr.max(step.C_light) > 0) & step.connectable & connectable
+    C, r, others = to_same_light(scene, plan, step, y, si, bsdf, lit)
+    Δ = y.Δ + difference(step.C_light, step.others_light, C, y.r * r, others)
+
+    # ------------- Next vertex: reconnect, or replay -------------
+    smooth = step.kind == SMOOTH
+    joins = step.goes_on & smooth & step.connectable & connectable
+    replays = step.goes_on & ~smooth & y.apart
+    # What neither does is rejected: β = 0.
+    none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
+    state = (none, mi.Spectrum(0), mi.Float(0))
+    state = dr.if_stmt(state, joins, lambda *_: reconnect(scene, plan, step, y, none, si, bsdf), lambda *old: old)
+    # Where all is smooth there is nothing to replay.
+    if not plan.materials.all_connectable:
+        state = dr.if_stmt(state, replays, lambda *_: replay(scene, plan, step, y, none, si, bsdf), lambda *old: old)
+    moved, C, others = state
+
+    # ------------------ Emission met by chance -------------------
+    moved.Δ = moved.Δ + difference(step.C_met, step.others_met, C, moved.r, others)
+    return moved
+
+
+def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+    """Straight to the base path's next vertex, or, where that escapes, along with it; and emission there."""
+    # ------------------------ The segment ------------------------
+    x, x1 = step.z.si, step.x1
+    reaches = x1.is_valid()
+    to = mi.Vector3f(x1.p - si.p)
+    distance2 = dr.squared_norm(to)
+    d = dr.select(reaches, to * dr.rsqrt(distance2), step.d)
+    J = dr.select(reaches, reconnection_jacobian(x.p, si.p, x1.p, x1.n), 1)
+    f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(d))
+    ray = dr.select(reaches, si.spawn_ray_to(x1.p), si.spawn_ray(d))
+    good = (p > 0) & dr.isfinite(J) & (dr.max(f) > 0)
+    # A joined path goes the way of its base path.
+    good &= ~scene.ray_test(ray, good & y.apart)
+    β, r = y.β * f * (J / step.p * step.survival), y.r * (J * p / step.p)
+    good &= dr.isfinite(dr.sum(β)) & dr.isfinite(r)
+    β, r = dr.select(good, β, 0), dr.select(good, r, 0)
+    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False))
+
+    # ----------------------- Emission at x1 ----------------------
+    y1 = seen_from(x1, d)
+    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    others = mis.others_emitted(known_met(end, step.counted), e, p_met)
+    end = mis.arrive(end, cosine(x1, d), distance2)
+    # Behind vertices that are not connectable the shift is rejected, but they may emit.
+    lives = good & reaches & (y.joined | step.x1_connectable)
+    ray = mi.Ray3f(si.p, d, si.time, si.wavelengths)
+    moved = Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives & y.apart, none.Δ)
+    return moved, β * Le, others
+
+
+def replay(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+    """By the mirror, glass or hole that the base path's random numbers find here; and emission at its next vertex.
+
+    Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
+    the path for every strategy that finds it: r = 1, and the shift is a function of the path.
+    """
+    sample, f_p = bsdf.sample(context(RADIANCE), si, step.u_lobe, step.u_direction)
+    good = (sample.pdf > 0) & (event_kind(sample.sampled_type) == step.kind)
+    d = si.to_world(sample.wo)
+    ray = si.spawn_ray(d)
+    hit = scene.ray_intersect_preliminary(ray, active=good)
+    y1 = hit.compute_surface_interaction(ray)
+    β = dr.select(good, y.β * f_p * step.survival, 0)
+    β = dr.select(dr.isfinite(dr.sum(β)), β, 0)
+    end = mis.leave(y.end, cosine(si, d), sample.pdf, mi.Float(0), mi.Bool(True))
+    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    others = mis.others_emitted(known_met(end, step.counted), e, p_met)
+    end = mis.arrive(end, cosine(y1, d), dr.square(y1.t))
+    lives = good & y1.is_valid() & step.x1.is_valid()
+    return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ), β * Le, others
+
+
+def to_same_light(scene, plan: Plan, step: Step, y: Offset, si, bsdf, active):
+    """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
+    base = step.light
+    light, weight, r = plan.lights.seen_from_elsewhere(scene, base, step.weight, si, active)
+    f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
+    C = y.β * f * weight
+    lit = active & (dr.max(C) > 0)
+    C = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit & y.apart), C, 0)
+    cos = dr.abs(dr.dot(light.n, light.d))
+    e = plan.lights.emission(plan.lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
+    p_light = dr.select(light.delta, 0, light.pdf)
+    return C, r, mis.others_to_light(known_end(y.end, step.joins), e, p_light, cosine(si, light.d), p, q)
+
+
+def pick(offsets: list[Offset], i: mi.UInt32) -> Offset:
+    """The offset path of that number."""
+    found = offsets[0]
+    for k, offset in enumerate(offsets[1:], 1):
+        found = dr.select(i == k, offset, found)
+    return found
