@@ -33,8 +33,8 @@ from ngpt.methods import reconstruct
 
 # Samples per pixel of each of the two stacks; of a sampler with batches at least two of those
 SPP = 8
-# Pixels of a pilot; larger images are rendered smaller.
-_PIXELS = 1 << 16
+# Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
+_PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # Of what the whole render may take
 SHARE = 0.05
 # Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
@@ -75,6 +75,8 @@ def candidates(scene: mi.Scene) -> list[str]:
     """What could render the scene: the sampler that its description stands for, and then those to be compared with."""
     facts = scene_facts(scene)
     first, _ = choose(facts)
+    if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
+        return [first]
     return [first] + [
         name for name, sampler in SAMPLERS.items() if name != first and sampler.tried and not sampler.refuses(facts)
     ]

@@ -51,16 +51,17 @@ def test_a_choice_needs_a_margin():
 def test_candidates_are_those_of_the_registry(renderer):
     from data_gen.pilot import candidates
 
-    names = candidates(load(renderer, "diffuse", (8, 8)))
+    names = candidates(load(renderer, "diffuse", (48, 32)))
     assert names[0] == "gpt" and {"bdpt", "primal"} <= set(names)
     assert not {"gpt-basic", "gpt-simple"} & set(names) and len(names) == len(set(names))
-    assert "bdpt" not in candidates(load(renderer, "haze", (8, 8)))
+    assert candidates(load(renderer, "diffuse", (16, 12))) == ["gpt"]
+    assert "bdpt" not in candidates(load(renderer, "haze", (48, 32)))
 
 
 def test_short_renders_are_not_measured(renderer, monkeypatch):
     from data_gen import pilot
 
-    scene = load(renderer, "diffuse", (16, 12))
+    scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pilot, "try_out", None)
     for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
         choice = pilot.choose_by_pilot(scene, spp, seconds)
@@ -71,9 +72,9 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     from data_gen import pilot
     from data_gen.render import render_stack
 
-    scene = load(renderer, "diffuse", (32, 24))
+    scene = load(renderer, "diffuse", (48, 32))
     before = render_stack(scene, 2, 0, "gpt")
-    monkeypatch.setattr(pilot, "_PIXELS", 16 * 12)
+    monkeypatch.setattr(pilot, "_PIXELS", 24 * 16)
     sizes = []
     tried = pilot.try_out
     monkeypatch.setattr(
@@ -81,7 +82,7 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     )
     choice = pilot.choose_by_pilot(scene, 1 << 30, 1e6)
     assert choice.sampler in pilot.candidates(scene) and choice.reason.startswith("chosen by a pilot: to a given error")
-    assert len(sizes) == len(pilot.candidates(scene)) and {tuple(map(int, size)) for size in sizes} == {(16, 12)}
+    assert len(sizes) == len(pilot.candidates(scene)) and {tuple(map(int, size)) for size in sizes} == {(24, 16)}
     after = render_stack(scene, 2, 0, "gpt")
     assert all(np.array_equal(before[name], after[name]) for name in before.names)
 
