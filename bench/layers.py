@@ -62,7 +62,7 @@ RENDERERS: dict[str, dict[str, tuple[str, str]]] = {
     "Karma": {"primal": ("C", "RGB"), "albedo": ("albedo", "RGB"), "normal": ("N", "XYZ")},
 }
 # Our own names, which any renderer may write.
-OWN = {name: (name, "Z" if name == "depth" else "XYZ" if name == "normal" else "RGB") for name in ngpt.layers.LAYERS}
+OWN = {name: (name, "".join(layer.channels)) for name, layer in ngpt.layers.LAYERS.items()}
 FEATURES, GRADIENTS, VARIANCES = ("albedo", "normal", "depth"), ("dx", "dy"), ("primal_var", "dx_var", "dy_var")
 CHOICES: tuple[tuple[str, ...], ...] = (
     (),

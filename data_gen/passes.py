@@ -70,8 +70,6 @@ def render_passes(
     if batch:
         most = 1
     start = now = time.perf_counter()
-    # Scenes that are no longer used would make kernels larger: those call what any living scene consists of.
-    gc.collect()
 
     def report(finished: bool = False) -> None:
         if seconds is None:

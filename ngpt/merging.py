@@ -116,6 +116,12 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
                 f"{stack.path} was made by sampler '{sampler}' and {first.path} by "
                 f"'{first.attributes.get('ngpt:sampler')}'; their variances cannot be merged"
             )
+        frame = stack.attributes.get("ngpt:frame")
+        if frame != first.attributes.get("ngpt:frame"):
+            raise NgptError(
+                f"{stack.path} is frame {frame} and {first.path} is frame {first.attributes.get('ngpt:frame')}; only "
+                "stacks of one frame can be merged"
+            )
         for name in VARIANCES.values():
             if n > 1 and name not in stack and any(name in other for other in stacks):
                 raise NgptError(f"{stack.path} has no '{name}' though it has {n} samples per pixel; render it again")

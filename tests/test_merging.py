@@ -42,6 +42,16 @@ def test_merged_stacks_are_the_stack_of_all_samples(rng, counts):
     assert merged.attributes["ngpt:seconds"] == 1.5 * len(counts)
 
 
+def test_frames_are_not_merged_with_others_and_keep_their_motion(rng):
+    motion = rng.normal(size=(*SHAPE[:2], 2)).astype(np.float32)
+    motion[0, 0] = np.nan
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed, **{"ngpt:frame": 3}).replace(motion=motion) for seed in range(2))
+    assert np.array_equal(merge([a, b])["motion"], motion, equal_nan=True)
+    b.attributes["ngpt:frame"] = 4
+    with pytest.raises(NgptError, match="stacks of one frame"):
+        merge([a, b])
+
+
 def test_the_order_of_merging_does_not_matter(rng):
     a, b, c = (stack_of(rng.random((n, *SHAPE)), seed) for seed, n in enumerate((2, 5, 3)))
     left, right = merge([merge([a, b]), c]), merge([a, merge([c, b])])

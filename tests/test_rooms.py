@@ -17,7 +17,7 @@ FLOORS = """
 ngpt.errors ngpt.version
 ngpt.system
 ngpt.report.display ngpt.report.png
-ngpt.arrays ngpt.layers ngpt.testing ngpt.report.notebook
+ngpt.arrays ngpt.layers ngpt.testing ngpt.warp ngpt.report.notebook
 ngpt.stack
 ngpt.repair ngpt.io
 ngpt.merging
@@ -25,7 +25,7 @@ ngpt.classical
 ngpt.denoisers
 ngpt.network
 ngpt.methods
-ngpt.uncertainty ngpt.lightgroups
+ngpt.uncertainty ngpt.lightgroups ngpt.temporal
 ngpt.denoiser
 ngpt.report
 ngpt.measure
@@ -38,7 +38,8 @@ data_gen.passes
 data_gen.samplers
 data_gen.backend
 data_gen.render data_gen.inspect
-data_gen.costs
+data_gen.frames
+data_gen.costs data_gen.pilot
 data_gen.dataset
 ngpt.evaluation
 ngpt.cli

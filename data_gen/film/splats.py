@@ -26,8 +26,10 @@ class Splats:
 
     def __init__(self, pixels: int, channels: int):
         self.pixels = pixels
-        # Pixel after pixel, within a pixel channel by channel, within a channel the ranges from the smallest up
-        self.sums = [dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS) for _ in range(channels)]
+        self.channels = channels
+        # Pixel after pixel, within a pixel the ranges from the smallest up, within a range the channels, which then lie
+        # side by side in memory: most of the time of a splat is that of reaching it.
+        self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
 
     def add(self, pixel: mi.UInt32, components: list, active) -> None:
@@ -35,19 +37,22 @@ class Splats:
         Int64, Float64 = dr.int64_array_t(mi.Float), dr.float64_array_t(mi.Float)
         good = dr.all([dr.abs(component) < 2.0**64 for component in components])
         dr.scatter_add(self.lost, mi.UInt32(1), pixel, active & ~good)
-        for sums, component in zip(self.sums, components, strict=True):
+        for channel, component in enumerate(components):
             exponent = mi.Int32((dr.reinterpret_array(mi.UInt32, mi.Float(component)) >> 23) & 255) - 127
             range_ = dr.maximum(exponent - _LOWEST, 0) // _BITS
             digits = Int64(Float64(component) / _unit(range_))
-            dr.scatter_add(sums, digits, pixel * BINS + mi.UInt32(range_), active & good)
+            place = (pixel * BINS + mi.UInt32(range_)) * self.channels + channel
+            # Side by side, lanes hardly ever meet at a pixel: to look for those that do costs more than it saves.
+            dr.scatter_add(self.sums, digits, place, active & good, mode=dr.ReduceMode.Direct)
 
     def totals(self) -> list:
         """The sums as Float64, (pixels) a channel."""
         Int64, Float64 = dr.int64_array_t(mi.Float), dr.float64_array_t(mi.Float)
         pixel = dr.arange(mi.UInt32, self.pixels) * BINS
         totals = []
-        for sums in self.sums:
-            parts = [Float64(dr.gather(Int64, sums, pixel + i)) * _unit(mi.Int32(i)) for i in range(BINS)]
+        for channel in range(self.channels):
+            places = ((pixel + i) * self.channels + channel for i in range(BINS))
+            parts = [Float64(dr.gather(Int64, self.sums, p)) * _unit(mi.Int32(i)) for i, p in enumerate(places)]
             # From the smallest up: little is rounded off before the last step.
             totals.append(sum(parts[1:], parts[0]))
         dr.eval(totals)

@@ -31,13 +31,20 @@ class Materials:
     shifted copy then agree on it, which keeps the shift invertible. Textured roughness counts with its smallest texel.
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
 
-    Shapes that are ``passed`` have no vertices, and do not count.
+    Shapes that are ``passed`` have no vertices, and do not count. With ``media`` in the scene rough glass is not
+    connectable, however rough: light that leaves a medium by it is found by few paths, see docs/media.md.
 
     ``unconnectable`` lists the materials, as "shape.material (class)", at which a vertex is not connectable or an event
     may be other than smooth; ``all_connectable`` is True where there are none.
     """
 
-    def __init__(self, scene: mi.Scene, threshold: float, passed: Callable[[mi.Shape], bool] = lambda shape: False):
+    def __init__(
+        self,
+        scene: mi.Scene,
+        threshold: float,
+        passed: Callable[[mi.Shape], bool] = lambda shape: False,
+        media: bool = False,
+    ):
         shapes = [shape for shape in scene.shapes() if not passed(shape)]
         # By Dr.Jit's number of each material, one of the shapes that are made of it
         users = {dr_number(shape.bsdf()): shape for shape in shapes if shape.bsdf() is not None}
@@ -45,7 +52,8 @@ class Materials:
         self.unconnectable: list[str] = []
         for number, shape in users.items():
             bsdf = shape.bsdf()
-            table[number] = smallest_roughness(bsdf) > threshold
+            frosted = media and mi.has_flag(bsdf.flags(), mi.BSDFFlags.GlossyTransmission)
+            table[number] = smallest_roughness(bsdf) > threshold and not frosted
             sharp = any(mi.has_flag(bsdf.flags(), flag) for flag in (mi.BSDFFlags.Delta, mi.BSDFFlags.Null))
             if sharp or not (table[number] and mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)):
                 name = ".".join(filter(None, (shape.id(), bsdf.id())))

@@ -39,6 +39,7 @@ class Sampler:
     ``options``     the options that ``make`` takes: name -> what it does
     ``gradients``   whether it renders dx and dy
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
+    ``tried``       whether the pilot of "auto" tries it too, where it can render the scene (``data_gen.pilot``)
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
@@ -53,6 +54,7 @@ class Sampler:
     options: Mapping[str, str] = field(default_factory=dict)
     gradients: bool = True
     rank: int = 0
+    tried: bool = True
     batch: int = 0
     lane_bytes: int = PATH_BYTES
     module: str = ""
@@ -81,7 +83,7 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
 
 
 def choose(facts: Facts) -> tuple[str, str]:
-    """The sampler that "auto" stands for, and why."""
+    """The sampler that "auto" stands for by the description alone, and why."""
     reasons = []
     for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
         if not sampler.rank:
@@ -190,6 +192,7 @@ for _sampler in (
         _from_module(_BASIC),
         notes=_notes_on_replay,
         rank=9,
+        tried=False,
         module=_BASIC,
     ),
     Sampler(
@@ -198,6 +201,7 @@ for _sampler in (
         _from_module(_SIMPLE),
         _refused_by_gpt_simple,
         lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
+        tried=False,
         module=_SIMPLE,
     ),
     Sampler(

@@ -1,16 +1,22 @@
-"""``ngpt advise``: which method, and how many samples, for the time there is or the error to reach."""
+"""``ngpt advise``: which sampler and method, and how many samples, for the time there is or the error to reach."""
+
+from __future__ import annotations
 
 import argparse
 import shlex
 import time
 from dataclasses import asdict
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from ngpt.cli.arguments import add_json, assignment, duration, natural, positive, print_json, size
 from ngpt.errors import NgptError
-from ngpt.measure.advice import Advice, advise, describe, read_table
+from ngpt.measure.advice import Advice, advise, describe, read_table, relative_noise
 from ngpt.methods import METHODS
 from ngpt.system.console import Console
+
+if TYPE_CHECKING:
+    from data_gen.pilot import Choice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -35,32 +41,29 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.costs import measure
-    from data_gen.samplers import choose
-    from data_gen.scenes.facts import scene_facts
     from data_gen.scenes.load import load_scene
-    from ngpt.evaluation.renders import DEFAULTS
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))
-    sampler, reason = choose(scene_facts(scene))
-    # Gradients first, whose stack is the pilot.
-    seconds, pilot = measure(
-        scene, {render.name: render.options for render in DEFAULTS}, max(args.pilot, 2), 1, args.seed
-    )
+    choice = choose_sampler(scene, set(table["methods"].values()))
+    seconds, pilot, described = measured(scene, choice, args)
     pixels = pilot.width * pilot.height
     cost = {kind: min(values) / pixels for kind, values in seconds.items()}
-    advices = advise(table, describe(pilot), cost, pixels, seconds=args.seconds, error=args.error)
+    sampler, reason = choice.sampler, choice.reason
+    advices = advise(table, described, cost, pixels, seconds=args.seconds, error=args.error)
     console.say(
         f"{args.scene}: pilot of {max(args.pilot, 2)} spp, {time.perf_counter() - start:.1f} s with compilation"
     )
     lacks = {a.method: absence(call(a.method, table)[0]) for a in advices}
     if args.json:
         report = {"scene": args.scene, "size": [pilot.width, pilot.height], "sampler": sampler}
-        rows = [asdict(a) | {"missing": lacks[a.method], "commands": commands(a, args, table)} for a in advices]
+        report["because"] = reason
+        rows = [
+            asdict(a) | {"missing": lacks[a.method], "commands": commands(a, args, table, sampler)} for a in advices
+        ]
         print_json(report | {"advice": rows})
         return 0
-    console.say(f"{args.scene}: gradients by sampler '{sampler}': {reason}")
+    console.say(f"{args.scene}: sampler '{sampler}': {reason}")
     print(
         f"{'method':18}{'stack':11}{'spp':>7}{'seconds':>9}{table.get('metric', 'error'):>16}{'likely':>20}{'best':>7}"
     )
@@ -72,8 +75,54 @@ def run(args: argparse.Namespace, console: Console) -> int:
     best = next((a for a in advices if not lacks[a.method]), None)
     if best is None:
         raise NgptError(f"none of these methods runs here; {advices[0].method}: {lacks[advices[0].method]}")
-    print("", *commands(best, args, table), sep="\n")
+    print("", *commands(best, args, table, sampler), sep="\n")
     return 0
+
+
+def choose_sampler(scene, kinds: set[str]) -> Choice:
+    """The sampler of the scene, compared with others by a pilot; of those alone that render the ``kinds`` of stacks
+    that methods read."""
+    from data_gen.pilot import Choice, candidates, compare_with, judge, times_to_an_error, try_out
+    from data_gen.samplers import SAMPLERS, choose
+    from data_gen.scenes.facts import scene_facts
+
+    default, reason = choose(scene_facts(scene))
+    names = [
+        name
+        for name in candidates(scene)
+        if name == default or ("gradients" in kinds if SAMPLERS[name].gradients else kinds - {"gradients"})
+    ]
+    if len(names) == 1 or (first := try_out(scene, default)) is None:
+        return Choice(default, reason)
+    return Choice(*judge(default, times_to_an_error(compare_with(scene, names, first))))
+
+
+def measured(scene, choice: Choice, args: argparse.Namespace):
+    """Seconds per sample by kind of stack, a stack of the chosen sampler, and what pilots tell of the scene.
+
+    A sampler without gradients renders the other kinds in place of ``primal``; there is nothing to win by gradients
+    then, since a pilot has compared its images with theirs.
+    """
+    from data_gen.costs import measure
+    from data_gen.samplers import SAMPLERS
+    from ngpt.evaluation.renders import DEFAULTS
+
+    entry = SAMPLERS[choice.sampler]
+    spp = max(args.pilot, 2, 2 * entry.batch)
+    renders = {render.kind: render.options for render in DEFAULTS}
+    if entry.gradients:
+        # Gradients first, whose stack is the pilot.
+        renders["gradients"] = {"sampler": entry.name}
+        seconds, pilot = measure(scene, renders, spp, 1, args.seed)
+        return seconds, pilot, describe(pilot)
+    seconds, gradients = measure(scene, {"gradients": renders["gradients"]}, spp, 1, args.seed)
+    if entry.name == "primal":
+        renders.pop("gradients")
+        seconds, pilot = measure(scene, renders, spp, 1, args.seed)
+    else:
+        seconds, pilot = measure(scene, {"features": {"sampler": entry.name}}, spp, 1, args.seed)
+        seconds["path"] = seconds["features"]
+    return seconds, pilot, describe(gradients) | {"noise": relative_noise(pilot)}
 
 
 def call(name: str, table: dict) -> tuple[str, dict]:
@@ -87,12 +136,14 @@ def absence(method: str) -> str:
     return METHODS[method].missing() if method in METHODS else f"this version has no method '{method}'"
 
 
-def commands(advice: Advice, args: argparse.Namespace, table: dict) -> list[str]:
+def commands(advice: Advice, args: argparse.Namespace, table: dict, sampler: str) -> list[str]:
     """What to type to follow the advice: a line that renders the stack, and one that denoises it."""
+    from data_gen.samplers import SAMPLERS
+
     stem = f"{Path(args.scene).stem}-{advice.spp}spp"
     render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(advice.spp)]
-    if advice.stack != "gradients":
-        render += ["--sampler", "primal"]
+    # Gradients that are not wanted are not rendered.
+    render += ["--sampler", "primal" if SAMPLERS[sampler].gradients and advice.stack != "gradients" else sampler]
     if args.size:
         render += ["--size", "{}x{}".format(*args.size)]
     if args.variant:

@@ -2,7 +2,10 @@
 
 import argparse
 import os
+import time
+from collections.abc import Container
 from contextlib import closing, nullcontext
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -31,6 +34,7 @@ from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
+from ngpt.temporal import Temporal
 from ngpt.uncertainty import reconstruct_with_error
 from ngpt.version import __version__
 
@@ -83,6 +87,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help="a light group of another name, * for any letters; may be repeated",
     )
+    parser.add_argument(
+        "--temporal",
+        action="store_true",
+        help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before",
+    )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
     add_layers(parser)
@@ -106,6 +115,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_output(target, args.force or args.skip_existing)
         if target.suffix.lower() != ".exr":
             raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+    if args.temporal:
+        for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
+            if given:
+                raise NgptError(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+    # Their results are there, but later frames are made of them.
+    missing = [i for i, (_, target) in enumerate(pairs) if not target.exists()] if args.temporal else []
+    again = {target for _, target in pairs[: missing[-1]]} if missing else set()
     reference = read_image(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
@@ -115,8 +131,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
     shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     frames = overlapped(
         pairs,
-        partial(read_frame, args=args, files=files),
-        partial(compute_frame, args=args, options=options, reference=reference),
+        partial(read_frame, args=args, files=files, again=again),
+        partial(
+            compute_frame,
+            args=args,
+            options=options,
+            reference=reference,
+            temporal=Temporal() if args.temporal else None,
+        ),
         partial(write_frame, overwrite=args.force),
     )
     reports = []
@@ -146,7 +168,7 @@ def _unseen(done: int, total: int) -> None:
 
 
 class Frame(NamedTuple):
-    """A stack on its way from its file to that of its result; without ``stack`` its result was there already."""
+    """A stack on its way from its file to that of its result; with ``there`` its result was there already."""
 
     source: Path
     target: Path
@@ -154,38 +176,57 @@ class Frame(NamedTuple):
     result: Result | None = None
     metrics: dict[str, float] | None = None
     groups: tuple[str, ...] = ()
+    there: bool = False
+    history: float | None = None
 
 
-def read_frame(pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str]) -> Frame:
+def read_frame(
+    pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str], again: Container[Path]
+) -> Frame:
+    """``again``: results that are made again where they are there, since others build on them."""
     source, target = pair
     # Only now, for several machines may be at work on one folder.
-    if args.skip_existing and target.exists():
-        return Frame(source, target, None)
-    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files))
+    there = args.skip_existing and target.exists()
+    if there and target not in again:
+        return Frame(source, target, None, there=True)
+    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there)
 
 
-def compute_frame(frame: Frame, args: argparse.Namespace, options: dict, reference: np.ndarray | None) -> Frame:
+def compute_frame(
+    frame: Frame,
+    args: argparse.Namespace,
+    options: dict,
+    reference: np.ndarray | None,
+    temporal: Temporal | None,
+) -> Frame:
     stack = frame.stack
     if stack is None:
         return frame
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
     result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
+    history = None
+    if temporal is not None:
+        begun = time.perf_counter()
+        image = temporal.next(stack, result.image)
+        seconds = result.seconds + time.perf_counter() - begun
+        result, history = replace(result, image=image, seconds=seconds), temporal.share
     metrics = compare(result.image, reference) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups))
+    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), history=history)
 
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups = frame
+    source, target, stack, result, metrics, groups, there, history = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
-    if stack is None or result is None:
+    if there or stack is None or result is None:
         return report | {"skipped": True}
-    write(target, result.image, like=stack, overwrite=overwrite, attributes=result.attributes)
+    made = result.attributes | ({} if history is None else {"ngpt:history": history})
+    write(target, result.image, like=stack, overwrite=overwrite, attributes=made)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -200,6 +241,7 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "standard error": result.error is not None,
         "groups": list(groups),
     }
+    report |= {} if history is None else {"history": history}
     return report | ({"metrics": metrics} if metrics else {})
 
 
@@ -239,6 +281,8 @@ def describe(report: dict) -> str:
     text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
         text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if "history" in report:
+        text += f", {report['history']:.0%} history"
     if report["groups"]:
         text += f", light groups {', '.join(report['groups'])}"
     if "metrics" in report:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from data_gen.samplers import summaries
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, positive, print_json, size
+from ngpt.cli.frames import filled, frames, targets, varies
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.system.console import Console
@@ -43,11 +44,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )
-    add_force(parser)
+    shot = parser.add_argument_group(
+        "sequences",
+        "SCENE, the values of -D and the output may hold {frame}, {frame:04d} or {10 + frame * 3:.2f}. The output may "
+        "be a folder.",
+    )
+    shot.add_argument(
+        "--frames",
+        type=frames,
+        metavar="FRAMES",
+        help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9",
+    )
+    shot.add_argument(
+        "--camera",
+        metavar="PATH",
+        help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
+    )
+    shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
+    existing = parser.add_mutually_exclusive_group()
+    add_force(existing)
+    existing.add_argument(
+        "--skip-existing", action="store_true", help="leave frames out whose stacks are there: goes on with a sequence"
+    )
     add_json(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    if args.frames:
+        return run_frames(args, console)
+    for option, given in (("--camera", args.camera), ("--skip-existing", args.skip_existing)):
+        if given:
+            raise NgptError(f"{option} belongs to a sequence; name its frames: --frames 0:120")
+    for text in (args.scene, *(value for _, value in args.define)):
+        if varies(text):
+            raise NgptError(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
     target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force)
     if target.suffix.lower() != ".exr":
         raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
@@ -56,6 +86,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.pilot import choose_by_pilot
     from data_gen.render import check_options, render_stack
     from data_gen.scenes.load import load_scene
 
@@ -64,14 +95,20 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Before the scene is loaded, which may take long.
     check_options(spp, args.seed, args.sampler, args.time, memory)
     scene = load_scene(args.scene, args.size, dict(args.define))
+    sampler, seconds = args.sampler, args.time
+    if sampler == "auto":
+        choice = choose_by_pilot(scene, spp, seconds)
+        sampler = choice.sampler
+        console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
+        seconds = seconds and max(seconds - choice.seconds, 1e-3)
     with console.progress(f"render {args.scene}", "s" if args.time else "spp") as progress, stop_on_ctrl_c() as stop:
         stack = render_stack(
             scene,
             spp,
             args.seed,
-            args.sampler,
+            sampler,
             progress,
-            seconds=args.time,
+            seconds=seconds,
             memory=memory,
             stop=stop,
             diagnostics=args.diagnostics,
@@ -79,15 +116,88 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
-    done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
+    done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
     interrupted = stop() and done != spp
     if interrupted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
-    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {seconds:.2f} s")
+    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if args.json:
         ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
         print_json({"output": str(target), "width": stack.width, "height": stack.height, "layers": stack.names} | ours)
     return 130 if interrupted else 0
+
+
+def run_frames(args: argparse.Namespace, console: Console) -> int:
+    """``--frames``: a stack for each."""
+    places = targets(args.output, args.scene, args.frames)
+    for target in places.values():
+        check_output(target, args.force or args.skip_existing)
+    define = dict(args.define)
+
+    def describe(frame: int) -> tuple[str, dict[str, str]]:
+        return filled(args.scene, frame), {name: filled(text, frame) for name, text in define.items()}
+
+    describe(args.frames[0])
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(args.variant or DEFAULT_VARIANT)
+    from data_gen.frames.camera_path import read_camera_path
+    from data_gen.frames.gltf import read_gltf_camera
+    from data_gen.frames.sequence import Shot, render_sequence
+    from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.render import check_options
+
+    spp = args.spp or (DEFAULT_SPP if args.time is None else None)
+    memory = args.memory or DEFAULT_MEMORY
+    check_options(spp, args.seed, args.sampler, args.time, memory)
+    camera = None
+    if args.camera:
+        animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")
+        camera = read_gltf_camera(args.camera, args.fps) if animated else read_camera_path(args.camera)
+    shot = Shot(describe, args.size, camera)
+    reports, skipped = [], 0
+
+    def skip(frame: int) -> bool:
+        # Only when its turn has come, for several machines may be at work on one sequence.
+        nonlocal skipped
+        there = args.skip_existing and places[frame].exists()
+        skipped += there
+        return there
+
+    with console.progress(f"render {args.scene}", "frames") as progress, stop_on_ctrl_c() as stop:
+        progress(0, len(places))
+        for frame, stack in render_sequence(
+            shot,
+            args.frames,
+            spp,
+            args.seed,
+            skip,
+            sampler=args.sampler,
+            seconds=args.time,
+            memory=memory,
+            stop=stop,
+            diagnostics=args.diagnostics,
+        ):
+            done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
+            if stop():
+                console.error(f"interrupted: frame {frame} is left out; --skip-existing goes on with it")
+                return 130
+            if stack.attributes["ngpt:discarded"]:
+                console.say(f"frame {frame}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
+            target = places[frame]
+            # Another machine may have been faster.
+            if not (args.skip_existing and target.exists()):
+                write(target, stack, overwrite=args.force)
+            size = f"{stack.width}x{stack.height}"
+            console.say(f"{describe(frame)[0]} frame {frame} -> {target}: {size}, {done} spp, {seconds:.2f} s")
+            ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
+            reports.append({"output": str(target), "width": stack.width, "height": stack.height} | ours)
+            progress(len(reports) + skipped, len(places))
+    if skipped:
+        console.say(f"{skipped} of {len(places)} frames were skipped: their stacks are there")
+    if args.json:
+        print_json({"frames": reports, "skipped": skipped})
+    return 0
 
 
 @contextmanager

@@ -8,7 +8,8 @@ import numpy as np
 
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError
-from ngpt.io.exr import read_image
+from ngpt.io.exr import read, read_image
+from ngpt.measure.flicker import flicker, flicker_maps
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
@@ -19,13 +20,25 @@ from ngpt.version import __version__
 
 # Denoising moves the mean by a fraction of this.
 _STOPS = 0.5
+FLICKER = (
+    "mean of (d - d_r)^2 / (m + 0.001), d the change along motion from the frame before, d_r that of the reference r, "
+    "m the mean of r^2 in both frames"
+)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files."
-    parser.add_argument("images", nargs="+", metavar="IMAGE.exr", help="images of one size, of any renderer")
+    parser.epilog = (
+        "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
+        "Folders are sequences: each frame is a tab, and with a folder of references there is a table of errors and "
+        "flicker."
+    )
     parser.add_argument(
-        "--ref", metavar="REF.exr", help="what they should look like: adds errors, SSIM, FLIP, and maps"
+        "images", nargs="+", metavar="IMAGE.exr", help="images of one size, of any renderer; or folders of frames"
+    )
+    parser.add_argument(
+        "--ref",
+        metavar="REF.exr",
+        help="what they should look like: adds errors, SSIM, FLIP, and maps; of folders a folder",
     )
     parser.add_argument(
         "-o", "--output", default="report.html", metavar="PAGE.html", help="page to write (default: report.html)"
@@ -36,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
     names = labels(args.images)
+    if any(os.path.isdir(path) for path in args.images):
+        return run_sequences(args, names, target, console)
     images = [read_image(path) for path in args.images]
     reference = read_image(args.ref) if args.ref else None
     for path, image in zip([*args.images[1:], args.ref], [*images[1:], reference], strict=True):
@@ -69,6 +84,80 @@ def run(args: argparse.Namespace, console: Console) -> int:
         console.say(large)
     console.say(f"{target}: open it in a browser")
     return 0
+
+
+def run_sequences(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
+    """Folders of frames of equal names: a tab for each frame, and what is measured over all of them."""
+    folders = [*args.images, *([args.ref] if args.ref else [])]
+    frames = frames_of(folders)
+    first = read_image(Path(folders[0]) / frames[0])
+    metrics, lacks = available(*first.shape[:2]) if args.ref else ([], [])
+    for lack in lacks:
+        console.say(lack)
+    scenes, motions = [], []
+    with console.progress("report", "frames") as progress:
+        for done, frame in enumerate(frames):
+            progress(done, len(frames))
+            paths = [str(Path(folder) / frame) for folder in folders]
+            images = [read_image(path) for path in paths]
+            for path, image in zip(paths, images, strict=True):
+                check_size(path, image, str(Path(folders[0]) / frames[0]), first)
+            reference = images.pop() if args.ref else None
+            entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+            if reference is not None:
+                motions.append(motion_of(paths))
+                for entry, path in zip(entries, paths, strict=False):
+                    add_errors(entry, metrics, reference, path, paths[-1])
+            rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
+            size = f"{first.shape[1]}x{first.shape[0]}"
+            scenes.append(Scene(Path(frame).stem, f"{frame}, {size}", reference, entries, rising=rising))
+    tables = {}
+    if args.ref and len(frames) > 1:
+        references = [np.asarray(scene.reference) for scene in scenes]
+        rows = [["", *metrics, "flicker"]]
+        for place, name in enumerate(names):
+            images = [scene.entries[place].image for scene in scenes]
+            for scene, changes in zip(scenes[1:], flicker_maps(images, references, motions), strict=True):
+                scene.entries[place].maps["flicker"] = np.clip(np.sqrt(np.nan_to_num(changes.mean(axis=-1))), 0, 1)
+            means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
+            rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
+        tables = {f"Means over {len(frames)} frames": rows}
+        for row in rows:
+            print(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
+    formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
+    overview = Overview(tables=tables, formulas=formulas)
+    title = f"{', '.join(names)}: {len(frames)} frames"
+    facts = {"ngpt": __version__}
+    write_report(target, title, scenes, command=args.command, footer=facts, overview=overview, overwrite=args.force)
+    if large := oversize(target):
+        console.say(large)
+    console.say(f"{target}: open it in a browser")
+    return 0
+
+
+def motion_of(paths: list[str]) -> np.ndarray | None:
+    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them."""
+    for path in paths:
+        layers = read(path).layers
+        if "motion" in layers:
+            return layers["motion"]
+    return None
+
+
+def frames_of(folders: list[str]) -> list[str]:
+    """The names of the frames, which all folders must have. Raises NgptError for files among folders, and lacks."""
+    found = []
+    for folder in folders:
+        if not os.path.isdir(folder):
+            raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+        found.append({path.name for path in Path(folder).iterdir() if path.suffix.lower() == ".exr"})
+        if not found[-1]:
+            raise NgptError(f"{folder}: no .exr files there")
+        if differ := found[-1] ^ found[0]:
+            name = min(differ)
+            has, lacks = (folder, folders[0]) if name in found[-1] else (folders[0], folder)
+            raise NgptError(f"{has} has {name} and {lacks} has not; give folders of the same frames")
+    return sorted(found[0])
 
 
 def labels(paths: list[str]) -> list[str]:

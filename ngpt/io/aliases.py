@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from ngpt.errors import NgptError
-from ngpt.layers import LAYERS, RGB, XYZ, Layer
+from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
 
 class Alias(NamedTuple):
@@ -76,6 +76,7 @@ _SPELLINGS = {
     RGB: (_COLOUR,),
     # Tools that write an (H, W, 3) array name its channels R G B whatever it holds.
     XYZ: ((("X", "x"), ("Y", "y"), ("Z", "z")), _COLOUR),
+    XY: ((("X", "x"), ("Y", "y")),),
     ("Z",): ((("Z", "z", "V", "v", "T", "t", "Y", "y", "D", "d", "R", "r", ""),),),
     ("A",): ((("A", "a", "alpha", ""),),),
 }

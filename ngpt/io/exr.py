@@ -44,7 +44,14 @@ _STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWin
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
 # Attributes that say what made a result; those of the stack are others, and stay.
-MADE_BY = ("ngpt:method", "ngpt:weights", "ngpt:options", "ngpt:estimated", "ngpt:reconstructSeconds")
+MADE_BY = (
+    "ngpt:method",
+    "ngpt:weights",
+    "ngpt:options",
+    "ngpt:estimated",
+    "ngpt:reconstructSeconds",
+    "ngpt:history",
+)
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
 _ROWS = 16  # that are gathered at a time

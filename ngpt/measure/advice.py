@@ -54,19 +54,12 @@ class Advice:
 def describe(stack: GradientStack) -> dict[str, float]:
     """What a pilot, a gradient stack with variances, tells of a scene: ``noise`` and ``gain``, both positive.
 
-    ``noise``  mean over pixels of σ² / (r² + 1e-3), σ² the variance of one sample and r the primal, averaged over 7x7
-               pixels; without the largest 1 % of the pixels
+    ``noise``  that of ``relative_noise``
     ``gain``   variance of independent differences of neighbours over that of the gradients, summed over the image
     """
     stack.require("primal_var", "dx_var", "dy_var", why="advice")
-    spp = float(stack.attributes.get("ngpt:spp", 1))
     # Gradients are compared with what they are the differences of, which is not all light that is noise.
-    layers = stack["primal"], variance_of_primal(stack), stack["primal_var"]
-    primal, whole, variance = (np.nan_to_num(layer, nan=0.0, posinf=0.0) for layer in layers)
-    mean = uniform_filter(primal.astype(np.float64), (7, 7, 1))
-    local = uniform_filter(whole.astype(np.float64), (7, 7, 1))
-    relative = np.sort((local / (mean**2 + EPSILON)).mean(axis=-1), axis=None)
-    noise = float(relative[: max(1, int(0.99 * relative.size))].mean()) * spp
+    variance = np.nan_to_num(stack["primal_var"], nan=0.0, posinf=0.0)
     independent = gradient = 0.0
     for name, here, there in (("dx_var", np.s_[:, :-1], np.s_[:, 1:]), ("dy_var", np.s_[:-1], np.s_[1:])):
         sums, ours = (variance[here] + variance[there]).sum(axis=-1), np.nan_to_num(stack[name][here]).sum(axis=-1)
@@ -75,7 +68,21 @@ def describe(stack: GradientStack) -> dict[str, float]:
         independent += float(sums[kept].sum(dtype=np.float64))
         gradient += float(ours[kept].sum(dtype=np.float64))
     gain = independent / gradient if gradient > 0 and independent > 0 else 1.0
-    return {"noise": max(noise, 1e-12), "gain": gain}
+    return {"noise": relative_noise(stack), "gain": gain}
+
+
+def relative_noise(stack: GradientStack) -> float:
+    """Mean over pixels of σ² / (r² + 1e-3), σ² the variance of one sample and r the primal, averaged over 7x7 pixels;
+    without the largest 1 % of the pixels. The ``stack`` needs the variance of its primal."""
+    stack.require("primal_var", why="advice")
+    spp = float(stack.attributes.get("ngpt:spp", 1))
+    primal, whole = (
+        np.nan_to_num(layer, nan=0.0, posinf=0.0) for layer in (stack["primal"], variance_of_primal(stack))
+    )
+    mean = uniform_filter(primal.astype(np.float64), (7, 7, 1))
+    local = uniform_filter(whole.astype(np.float64), (7, 7, 1))
+    relative = np.sort((local / (mean**2 + EPSILON)).mean(axis=-1), axis=None)
+    return max(float(relative[: max(1, int(0.99 * relative.size))].mean()) * spp, 1e-12)
 
 
 def make_table(results: dict[str, Any]) -> dict[str, Any]:
@@ -179,16 +186,18 @@ def advise(
 ) -> list[Advice]:
     """All methods of the table, the one to take first.
 
-    ``pilot`` is what ``describe`` gives, ``cost`` seconds per sample and pixel by kind of stack. With ``seconds`` each
-    method has the samples that fit into them, and the lowest error comes first; with ``error`` those that reach it, and
-    the shortest time comes first. Raises NgptError unless one of the two is given and something fits.
+    ``pilot`` is what ``describe`` gives, ``cost`` seconds per sample and pixel by kind of stack; methods for stacks of
+    another kind are left out. With ``seconds`` each method has the samples that fit into them, and the lowest error
+    comes first; with ``error`` those that reach it, and the shortest time comes first. Raises NgptError unless one of
+    the two is given and something fits.
     """
     if (seconds is None) == (error is None):
         raise NgptError("say either how many seconds there are or which error to reach")
     laws = Laws(table, left_out)
     spread = residuals(table, left_out)
     found = []
-    for method, stack in table["methods"].items():
+    usable = {method: stack for method, stack in table["methods"].items() if stack in cost}
+    for method, stack in usable.items():
         each, after = cost[stack] * pixels, laws.reconstruct(method) * pixels
         if seconds is not None:
             spp = int((seconds - after) / each)
@@ -200,7 +209,7 @@ def advise(
             deviation = math.exp(float(np.std(spread[method])))
             found.append((method, stack, spp, after + spp * each, expected, expected / deviation, expected * deviation))
     if not found:
-        cheapest = min((2 * cost[s] + laws.reconstruct(m)) * pixels for m, s in table["methods"].items())
+        cheapest = min((2 * cost[s] + laws.reconstruct(m)) * pixels for m, s in usable.items())
         raise NgptError(
             f"nothing fits into {seconds:g} s: the cheapest takes {cheapest:.2g} s"
             if seconds is not None

@@ -36,6 +36,9 @@ class Augmentation:
     ``quieter``     factors of noise, log-uniform between these, one for each crop: shows its best input once more, with
                     so much less noise (``quieter``). Networks learn from it what to make of more samples than anyone
                     renders for training. [] for none
+    ``rarer``       k of ``rarer``, log-uniform between these, one for each crop: shows its best input once more, as if
+                    most of its light were found by one path in k. Networks learn from it what to make of rooms lit
+                    through curtains, bulbs and gaps, which take too long to render for training. [] for none
     """
 
     geometry: bool = True
@@ -44,9 +47,13 @@ class Augmentation:
     depth: tuple[float, float] = (0.1, 1.1)
     quieter: tuple[float, ...] = ()
     absent: float = 0.0
+    rarer: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "quieter", tuple(self.quieter))
+        object.__setattr__(self, "rarer", tuple(self.rarer))
+        if self.rarer and not (len(self.rarer) == 2 and 1 <= self.rarer[0] <= self.rarer[1]):
+            raise NgptError(f"[augmentation]: rarer = {list(self.rarer)}: must be two numbers, 1 <= least <= most")
         if self.quieter and not (len(self.quieter) == 2 and 0 < self.quieter[0] <= self.quieter[1] <= 1):
             raise NgptError(
                 f"[augmentation]: quieter = {list(self.quieter)}: must be two factors, 0 < least <= most <= 1"
@@ -93,6 +100,32 @@ def quieter(
     }
     layers = {name: factor * stack[name] + (1 - factor) * truth[name] for name in truth if name in stack}
     layers |= {name: factor**2 * stack[name] for name in _VARIANCES if name in stack}
+    return stack.replace(**layers)
+
+
+def rarer(stack: GradientStack, k: float, share: float, rng: np.random.Generator) -> GradientStack:
+    """The stack as if ``share`` of the light in each pixel were found by one path in ``k``, then k times as bright.
+
+    With B = 1 at probability 1/k, else 0, in each pixel, its light is multiplied by w = 1 - share + share k B, of mean
+    1. A difference is made of the paths of both its pixels, so its factor is the mean of theirs. Means stay those of
+    the stack. Those of variances are what they would be: with the variance V of an estimate X, that of w X is
+    E[w²] V + Var[w] E[X]². Emission seen directly, the layer ``caustic`` and features stay as they are.
+    """
+    height, width = stack["primal"].shape[:2]
+    found = np.float32(rng.random((height, width, 1)) * k < 1)
+    kept = sum(stack[name] for name in ("direct", "caustic") if name in stack)
+    parts = {"primal": found} | {name: (found + np.roll(found, -1, axis)) / 2 for name, axis in (("dx", 1), ("dy", 0))}
+    layers = {}
+    for name, hits in parts.items():
+        if name not in stack:
+            continue
+        beside = kept if name == "primal" else 0
+        factor, light = 1 - share + share * k * hits, stack[name] - beside
+        layers[name] = factor * light + beside
+        if f"{name}_var" in stack:
+            # Var[w] is share² (k - 1), half of that for a mean of two; it is seen where light was found.
+            spread = share**2 * (k - 1) * (1 if name == "primal" else 0.5)
+            layers[f"{name}_var"] = factor**2 * stack[f"{name}_var"] + k * hits * spread * light**2
     return stack.replace(**layers)
 
 

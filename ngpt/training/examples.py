@@ -15,7 +15,7 @@ from ngpt.network.model import ModelConfig
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
-from ngpt.training.augment import Augmentation, Layers, quieter
+from ngpt.training.augment import Augmentation, Layers, quieter, rarer
 
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
@@ -171,7 +171,7 @@ class Mixture(Sequence[Any]):
 class Examples(TorchDataset):
     """Endless training examples, each a function of its index and the seed: whoever asks, and when.
 
-    Example ``i`` is one crop with one of its inputs (or one more, ``Augmentation.quieter``), at random, normalised,
+    Example ``i`` is one crop with one of its inputs (or ``Augmentation.quieter``, ``rarer``), at random, normalised,
     augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the
     middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
     What was read and prepared once is kept in memory, up to ``cache`` bytes.
@@ -187,6 +187,9 @@ class Examples(TorchDataset):
         cache: int = 0,
     ):
         self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
+        # What makes an input of a crop that was not rendered.
+        made = {self._quieter: augmentation.quieter, self._rarer: augmentation.rarer}
+        self._made = [make for make, asked in made.items() if asked]
         self._cache: dict[tuple[int, int], Layers] = {}
         self._free = cache
 
@@ -198,7 +201,7 @@ class Examples(TorchDataset):
         # Uniform over crops, whatever the number of their inputs.
         which = int(rng.integers(len(self.crops)))
         crop = self.crops[which]
-        k = int(rng.integers(crop.inputs + bool(self.augmentation.quieter)))
+        k = int(rng.integers(crop.inputs + len(self._made)))
         layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
         layers = features.completed(layers, self.config.inputs)
         top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
@@ -211,7 +214,7 @@ class Examples(TorchDataset):
         if (which, k) in self._cache:
             return self._cache[which, k]
         crop = self.crops[which]
-        stack = crop.stack(k) if k < crop.inputs else self._quieter(which)
+        stack = crop.stack(k) if k < crop.inputs else self._made[k - crop.inputs](which)
         layers = layers_of(repair(stack, self.config.reads_gradients), self.config)
         target = target_of(crop, self.config).transpose(2, 0, 1)
         layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
@@ -227,6 +230,12 @@ class Examples(TorchDataset):
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
         return quieter(best, crop.reference, crop.reference_direct, crop.reference_caustic, factor)
+
+    def _rarer(self, which: int) -> GradientStack:
+        """The input of that crop with most samples, as of light that is harder to find."""
+        crop, rng = self.crops[which], np.random.default_rng((self.seed, which, 1))
+        k = float(np.exp(rng.uniform(*np.log(self.augmentation.rarer))))
+        return rarer(crop.stack(int(np.argmax(crop.spp))), k, float(rng.uniform(0.5, 1)), rng)
 
     def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
         height, width = layers["primal"].shape[-2:]

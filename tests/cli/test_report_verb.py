@@ -10,6 +10,7 @@ from ngpt.cli import main
 from ngpt.io.exr import write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
+from ngpt.stack import GradientStack
 
 
 @pytest.fixture
@@ -104,3 +105,29 @@ def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
     words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]
     assert main(["report", *words]) == 0
     assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err
+
+
+def test_folders_of_frames_are_sequences(tmp_path, rng, capsys):
+    image = rng.gamma(2.0, 0.5, (24, 32, 3)).astype(np.float32)
+    still = np.zeros((24, 32, 2), np.float32)
+    for folder in ("steady", "flickers", "truth"):
+        (tmp_path / folder).mkdir()
+    for i in range(3):
+        noise = 0.1 * rng.normal(size=image.shape).astype(np.float32)
+        write(tmp_path / f"steady/{i}.exr", GradientStack({"primal": 1.1 * image, "motion": still}))
+        write(tmp_path / f"flickers/{i}.exr", image + noise)
+        write(tmp_path / f"truth/{i}.exr", image)
+    words = ["report", *(str(tmp_path / folder) for folder in ("steady", "flickers"))]
+    page = tmp_path / "page.html"
+    assert main([*words, "--ref", str(tmp_path / "truth"), "-o", str(page), "-q"]) == 0
+    rows = {line.split()[0]: line.split() for line in capsys.readouterr().out.splitlines()}
+    assert float(rows["steady"][-1]) < 1e-10 and float(rows["flickers"][-1]) > 0.001
+    assert float(rows["steady"][1]) > 0.005  # relMSE, which sees no difference
+    text = page.read_text()
+    assert "Means over 3 frames" in text and "along motion" in text
+    assert main([*words, "-o", str(tmp_path / "plain.html"), "-q"]) == 0
+    (tmp_path / "flickers/1.exr").unlink()
+    assert main([*words, "-o", str(tmp_path / "other.html"), "-q"]) == 2
+    assert "has 1.exr and" in capsys.readouterr().err
+    assert main([words[0], words[1], str(tmp_path / "truth/0.exr"), "-o", str(tmp_path / "other.html")]) == 2
+    assert "is no folder, and others are" in capsys.readouterr().err

@@ -89,6 +89,34 @@ def coloured_smoke():
     return cloudy(cloud, mist={"albedo": 0.8, "sigma_t": 0.1})
 
 
+def hiding():
+    """A lamp in plain view, half behind a cloud, that hides from the camera; and mist around the camera."""
+    return glowing(cloudy(grid(1), mist={"albedo": 0.8, "sigma_t": 0.2}))
+
+
+def hiding_outside():
+    """The same in clear air."""
+    return glowing(smoke())
+
+
+def glowing(scene):
+    glow = _sphere([0.75, 0.1, 0.3], 0.25, _diffuse(0.2, 0.2, 0.2)) | {
+        "emitter": {"type": "area", "radiance": _rgb(3, 2, 1)}
+    }
+    return scene | {"glow": glow, "integrator": scene["integrator"] | {"hide_emitters": True}}
+
+
+def by_mis(scene):
+    """The same rendered by ``volpathmis``, which weights the colours against each other."""
+
+    def described():
+        description = scene()
+        return description | {"integrator": description["integrator"] | {"type": "volpathmis"}}
+
+    described.__name__ = f"{scene.__name__}_by_mis"
+    return described
+
+
 def cloudy(cloud, mist=None):
     import mitsuba as mi
 

@@ -218,22 +218,28 @@ def test_weights_are_those_of_all_densities(renderer):
         compare(others, ends.densities(0, s, area), s + 1, dr.max(C) > 0, ends.from_light[:s])
 
 
-def test_light_vertices_are_kept_where_they_belong(renderer):
-    """Dr.Jit 1.5 (LLVM) loses what lanes write to different places of local memory: all light behind glass, once."""
-    import drjit as dr
-
+def light_vertices(mi, scene, spp):
+    """Camera samples of a 16x16 image with what is kept of their light paths: (camera, kept, count)."""
     from data_gen.film.splats import Splats
     from data_gen.paths.camera import CameraSamples
     from data_gen.samplers.bdpt.lights import LightEnds
     from data_gen.samplers.common import like_path
 
-    scene = load(renderer, glass, (16, 16))
-    camera = CameraSamples(scene.sensors()[0], 0, 16)
+    camera = CameraSamples(scene.sensors()[0], 0, spp)
     ray, importance, _ = camera.rays()
     integrator = like_path(scene, "bdpt")
     kept, count, _ = integrator.light_path(
         scene, LightEnds(scene), camera, camera.random.clone(), ray, importance, 6, Splats(256, 3)
     )
+    return camera, kept, count
+
+
+def test_light_vertices_are_kept_where_they_belong(renderer):
+    """Dr.Jit 1.5 (LLVM) loses what lanes write to different places of local memory: all light behind glass, once."""
+    import drjit as dr
+
+    scene = load(renderer, glass, (16, 16))
+    _, kept, count = light_vertices(renderer, scene, 16)
     depths = [kept.read(renderer.UInt32(i)).depth for i in range(5)]
     dr.eval(depths, count)
     depths, count = np.stack([np.array(depth) for depth in depths], axis=1), np.array(count)[:, None]
@@ -242,6 +248,34 @@ def test_light_vertices_are_kept_where_they_belong(renderer):
     assert (depths[place > count] == 0).all()
     # Behind the glass: nothing was kept of the first vertices, but of the third.
     assert ((depths[:, 0] == 0) & (depths[:, 1] == 0) & (depths[:, 2] == 3)).mean() > 0.01
+
+
+def test_every_connection_counts_once_in_the_mean(renderer):
+    """One of them is made, with 1 / its probability: chance and factor cancel for each of them."""
+    import drjit as dr
+
+    from data_gen.samplers.bdpt import mis
+    from data_gen.samplers.bdpt.choice import choose
+    from data_gen.samplers.bdpt.vertex import Vertex, cosine
+
+    mi, longest = renderer, 5
+    scene = load(mi, glass, (16, 16))
+    camera, kept, count = light_vertices(mi, scene, 256)
+    ray, _, _ = camera.rays()
+    z = scene.ray_intersect(mi.Ray3f(ray))
+    _, e = camera.sensor.sample_direction(z, camera.lens)
+    vertex = Vertex(z, mi.Spectrum(1), mis.begin_camera(e[0], cosine(z, ray.d)), mi.UInt32(1))
+    chosen, times = choose(vertex, z.is_valid(), kept, count, longest, camera.random.clone().next_1d())
+    depths = [kept.read(mi.UInt32(i)).depth for i in range(5)]
+    dr.eval(chosen, times, depths, count)
+    chosen, times, count, valid = (np.array(x) for x in (chosen, times, count, z.is_valid()))
+    for i, depth in enumerate(depths):
+        here = (np.array(depth) > 0) & (i < count) & valid & (1 + i + 1 + 1 <= longest)
+        made = np.where(chosen == i, times, 0)
+        assert not made[~here].any() and (made[here] > 0).any() == here.any()
+        if here.any():
+            error = made[here].std() / np.sqrt(here.sum())
+            assert abs(made[here].mean() - 1) < 4 * error + 1e-6 and error < 0.1, (i, made[here].mean(), error)
 
 
 def test_nothing_kept_is_a_bool(renderer):

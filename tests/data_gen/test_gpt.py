@@ -259,6 +259,7 @@ def test_connectable_materials(renderer):
         "blend": ({"type": "blendbsdf", "weight": 0.5, "a": rough, "b": smooth}, 0.01, False),
         "principled": ({"type": "principled", "roughness": 0.2}, 0.04, False),
         "hole": ({"type": "mask", "opacity": 0.5, "nested": {"type": "diffuse"}}, 1, True),
+        "frosted": ({"type": "roughdielectric", "alpha": 0.4}, 0.4, True),
     }
     shapes = {name: {"type": "sphere", "bsdf": bsdf} for name, (bsdf, _, _) in materials.items()}
     scene = renderer.load_dict({"type": "scene", **shapes})
@@ -268,6 +269,11 @@ def test_connectable_materials(renderer):
         assert smallest_roughness(shape.bsdf()) == pytest.approx(roughness), shape.id()
         assert classes.connectable(renderer.BSDFPtr(shape.bsdf()))[0] == connectable, shape.id()
     assert not classes.connectable(renderer.BSDFPtr(None))[0]
+    # Light comes out of media by it, which few paths find.
+    with_media = Materials(scene, 0.05, media=True)
+    frosted = renderer.BSDFPtr(scene.shapes()[list(materials).index("frosted")].bsdf())
+    assert classes.connectable(frosted)[0] and not with_media.connectable(frosted)[0]
+    assert with_media.connectable(renderer.BSDFPtr(scene.shapes()[1].bsdf()))[0]
 
 
 def test_mean_gradients_have_no_curl(renderer):

@@ -9,15 +9,28 @@ from functools import cache
 import numpy as np
 import pytest
 from data_gen_scenes import fog, within_fog
-from media_scenes import coloured_smoke, colours, dense, forward, haze, milk, nested, smoke
+from media_scenes import (
+    by_mis,
+    coloured_smoke,
+    colours,
+    dense,
+    forward,
+    haze,
+    hiding,
+    hiding_outside,
+    milk,
+    nested,
+    smoke,
+)
 from scipy.stats import chi2, norm
 from unbiased import differences, gradient_tests, light_apart, load, render_ours, render_references
 
 from ngpt.testing import z_test
 
 SIZE, PIXELS = (16, 16), 4
-FAST = [haze, colours, smoke]
-SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, fog, within_fog]
+# Not with large budgets: those tell `volpathmis` from `volpath`.
+FAST = [haze, colours, smoke, by_mis(colours), by_mis(coloured_smoke), hiding]
+SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, fog, within_fog, hiding, hiding_outside]
 
 
 @cache
@@ -154,7 +167,7 @@ MUTANTS = [
     (cosine, haze, 16, 128),
     (no_transmittance, dense, 16, 128),
     (scattering_twice, haze, 24, 512),
-    (rejected_halves, milk, 16, 128),
+    (rejected_halves, milk, 24, 256),
     (list_forgotten, smoke, 16, 64),
     (list_without_jacobian, smoke, 16, 128),
 ]
@@ -322,6 +335,22 @@ def test_shifts_that_know_no_media_say_so(renderer):
     for shift in ("half-vector", "manifold"):
         with pytest.raises(NgptError, match=f"gpt: shift '{shift}' does not go through media"):
             render_stack(scene, 1, sampler="gpt", shift=shift)
+
+
+def test_mono_variant(renderer):
+    from data_gen.backend import use_variant
+
+    use_variant("llvm_ad_mono")
+    try:
+        import mitsuba as mi
+
+        scene = load(mi, coloured_smoke, SIZE)
+        stacks = render_ours(scene, "gpt", 12, 48, PIXELS)
+        references = np.broadcast_to(render_references(mi, scene, 12, 96), (12, *SIZE, 3))
+        for name, result in gradient_tests(stacks, references, pixels=PIXELS):
+            assert result.passed, f"{name}: {result}"
+    finally:
+        use_variant("llvm_ad_rgb")
 
 
 def test_spectral_variant(renderer):

@@ -1,7 +1,8 @@
 r"""Bidirectional path tracing: for each camera sample a path from the camera and one from a light, joined every way.
 
 Light that a camera path finds by accident alone, from lamps behind shades or through glass onto a wall, a light path
-finds at once. Every way to find a path is a strategy; all are weighted against each other (``mis``).
+finds at once. Every way to find a path is a strategy; all are weighted against each other (``mis``). A vertex of the
+camera path is connected to a lamp and to one vertex of the light path, for all of them (``choice``).
 
     z                 vertices of the camera path
     y                 vertices of the light path, kept while the camera path is traced
@@ -30,6 +31,7 @@ from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import NULL, event_kind
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connected, emission_at, to_camera, to_light
 from data_gen.samplers.bdpt.vertex import (
@@ -185,7 +187,8 @@ class BDPT(GradientIntegrator):
 
             # ---------------- To the light path ----------------------
             if dr.hint(kept is not None, mode="scalar"):
-                L += self.connections(scene, z, bsdf, smooth & joined, kept, count, longest, ray)
+                u_connection = random.next_1d()
+                L += self.connection(scene, z, bsdf, smooth & joined, kept, count, longest, ray, u_connection)
 
             # -------------------- Next vertex ------------------------
             found = active & (sample.pdf > 0)
@@ -226,16 +229,14 @@ class BDPT(GradientIntegrator):
         return on_lamp | blocked
 
     @dr.syntax
-    def connections(self, scene, z, bsdf, active, kept, count, longest, ray):
-        """The light of all paths that join vertex ``z`` to one of those ``kept``."""
+    def connection(self, scene, z, bsdf, active, kept, count, longest, ray, u):
+        """The light of all paths that join vertex ``z`` to one of those ``kept``, by one of them that ``u`` chooses."""
         L = dr.zeros(mi.Spectrum, dr.width(z.depth))
-        i = mi.UInt32(0)
-        while dr.hint(active & (i < count), label="connections"):
-            y = recall(kept.read(i), ray.time, ray.wavelengths)
-            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= longest)
-            C, others = connected(scene, z, bsdf, y, joins)
-            L += dr.select(dr.max(C) > 0, C / (1 + others), 0)
-            i += 1
+        chosen, times = choose(z, active, kept, count, longest, u)
+        if active & (times > 0):
+            y = recall(kept.read(chosen), ray.time, ray.wavelengths)
+            C, others = connected(scene, z, bsdf, y, mi.Bool(True))
+            L = dr.select(dr.max(C) > 0, C * (times / (1 + others)), 0)
         return L
 
 

@@ -38,7 +38,7 @@ def record_class(variant: str) -> type:
 
     @dataclass
     class Record:
-        """A vertex of a light path as it is kept: 20 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
+        """A vertex of a light path as it is kept: 23 words in RGB, and no Bool, with which Dr.Jit 1.5 breaks off.
 
         The interaction is computed anew from the ray that led there and what it hit.
         """
@@ -50,6 +50,7 @@ def record_class(variant: str) -> type:
         prim_index: mi.UInt32
         shape: mi.ShapePtr
         instance: mi.ShapePtr
+        n: mi.Normal3f
         β: mi.Spectrum
         vcm: mi.Float
         vc: mi.Float
@@ -65,7 +66,7 @@ def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smo
     shapes = (mi.ShapePtr(hit.shape), mi.ShapePtr(hit.instance))
     depth = dr.select(smooth, vertex.depth, 0)
     return record_class(mi.variant())(
-        *where, *shapes, mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth
+        *where, *shapes, mi.Normal3f(vertex.si.n), mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth
     )
 
 

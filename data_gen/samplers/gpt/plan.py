@@ -57,7 +57,8 @@ def make_plan(
     media = Media(scene) if volumes else None
     if media and shift != "replay":
         raise NgptError(f"gpt: shift '{shift}' does not go through media; use 'replay'")
-    materials = Materials(scene, roughness_threshold, index_matched if media else lambda shape: False)
+    passed = index_matched if media else lambda shape: False
+    materials = Materials(scene, roughness_threshold, passed, media=media is not None)
     # Where all is connectable, a replay would end at a vertex to which the reverse shift reconnects: never allowed.
     replays = not materials.all_connectable
     half_vectors = replays and shift == "half-vector"

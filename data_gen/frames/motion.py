@@ -1,0 +1,196 @@
+"""Motion vectors: where on the film what a pixel shows was one frame before.
+
+A pixel shows what the ray through its centre meets first that scatters smoothly. The hit is looked up in the scene of
+the frame before by shape, primitive and barycentric coordinates, which holds for any deformation of a mesh; shapes that
+are no meshes, and instances, move by their ``to_world``. The scene before need not be in memory: a ``Snapshot`` has its
+geometry.
+
+What is seen in mirrors and through glass stands where it seems to: at the end of the straight ray of the path's length.
+That is exact for plane mirrors in a scene at rest, and takes no notice of things that move behind curved ones. Rays
+that escape show what is infinitely far. Surfaces count, media do not.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.passes import recording
+from data_gen.paths.features import first_nonspecular_vertex
+from ngpt.errors import NgptError
+
+# Of the path's length: where a hit lies off the straight ray by more, there was a mirror or a lens on the way.
+_OFF_RAY = 1e-3
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Vertices (V, 3) and triangles (F, 3) of a shape, in the world."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+# A matrix (4, 4) to the world, or a mesh; None for shapes that show neither.
+Geometry = np.ndarray | Mesh | None
+
+
+@dataclass(frozen=True)
+class Snapshot:
+    """What motion needs of a scene in one frame.
+
+    ``shapes``  in the order of ``scene.shapes()``
+    ``film``    (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
+    """
+
+    shapes: tuple[Geometry, ...]
+    film: np.ndarray
+
+
+def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
+    """The state of a scene; ``shapes`` where they are known to be those of an earlier snapshot."""
+    if shapes is None:
+        shapes = tuple(_geometry(shape) for shape in scene.shapes())
+    return Snapshot(shapes, _film(scene.sensors()[0]))
+
+
+def _geometry(shape: mi.Shape) -> Geometry:
+    params = mi.traverse(shape)
+    if "to_world" in params:
+        return _matrix(params["to_world"])
+    if "vertex_positions" in params and "faces" in params:
+        # Copies, for a scene that is updated keeps its buffers.
+        vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
+        return Mesh(vertices, np.array(params["faces"]).reshape(-1, 3))
+    return None
+
+
+def _matrix(transform) -> np.ndarray:
+    return np.array(transform.matrix, np.float64).reshape(4, 4, -1)[..., 0]
+
+
+def _film(sensor: mi.Sensor) -> np.ndarray:
+    """The projection of a camera onto its film, in pixels of the crop window."""
+    params, film = mi.traverse(sensor), sensor.film()
+    if "x_fov" not in params:
+        raise NgptError(f"sensor '{sensor.class_name()}': motion vectors need a perspective or thinlens camera")
+    near, far = sensor.near_clip(), sensor.far_clip()
+    fov = float(np.array(params["x_fov"]).ravel()[0])
+    projection = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, near, far)
+    pixels = np.diag([*(float(n) for n in film.crop_size()), 1, 1])
+    for axis, name in enumerate(("principal_point_offset_x", "principal_point_offset_y")):
+        if name in params:
+            pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * pixels[axis, axis]
+    return pixels @ _matrix(projection) @ np.linalg.inv(_matrix(params["to_world"]))
+
+
+class _Middle:
+    """In place of random numbers: of two ways, always the likelier."""
+
+    def next_1d(self, active=True) -> mi.Float:
+        return mi.Float(0.5)
+
+    def next_2d(self, active=True) -> mi.Point2f:
+        return mi.Point2f(0.5)
+
+
+@dataclass(frozen=True)
+class Seen:
+    """What the rays through the centres of all pixels meet, row by row; arrays of N pixels.
+
+    ``points``      (N, 4) homogeneous, in the world: where it seems to be; directions where rays escape
+    ``straight``    whether it is there: no mirror and no lens on the way
+    ``shape``       its number in ``scene.shapes()``, -1 where rays escape
+    ``primitive``   the triangle, ``barycentric`` (N, 2) the weights of its second and third vertex
+    """
+
+    points: np.ndarray
+    straight: np.ndarray
+    shape: np.ndarray
+    primitive: np.ndarray
+    barycentric: np.ndarray
+
+
+def seen(scene: mi.Scene) -> Seen:
+    """What the pixels of the first sensor show, in the middle of its exposure."""
+    sensor = scene.sensors()[0]
+    width, height = (int(n) for n in sensor.film().crop_size())
+    with recording():
+        lane = dr.arange(mi.UInt32, width * height)
+        columns = dr.opaque(mi.UInt32, width)
+        centre = mi.Point2f(lane % columns, lane // columns) + 0.5
+        time = sensor.shutter_open() + 0.5 * sensor.shutter_open_time()
+        uv = centre / mi.Vector2f(dr.opaque(mi.Float, width), dr.opaque(mi.Float, height))
+        ray, _ = sensor.sample_ray_differential(time, 0.5, uv, mi.Point2f(0.5))
+        si, last, depth, _, _ = first_nonspecular_vertex(scene, _Middle(), ray)
+        valid = si.is_valid()
+        hit = scene.ray_intersect_preliminary(last, active=valid)
+        whole = dr.select(hit.instance == None, hit.shape, hit.instance)  # noqa: E711 - arrays of pointers
+        number = dr.reinterpret_array(mi.UInt32, whole)
+        place = si.p
+        dr.eval(ray.o, ray.d, place, depth, valid, number, hit.prim_index, hit.prim_uv)
+    valid = np.broadcast_to(np.array(valid), width * height)
+    o, d, place = (np.array(v, np.float64).T.reshape(-1, 3) for v in (ray.o, ray.d, place))
+    depth = np.where(valid, np.array(depth, np.float64), 0)[:, None]
+    apparent = o + d * depth
+    straight = valid & (np.abs(apparent - place).max(axis=1) <= _OFF_RAY * np.maximum(depth[:, 0], 1e-30))
+    points = np.concatenate([np.where(valid[:, None], apparent, d), valid[:, None]], axis=1)
+    ids = np.array(dr.reinterpret_array(mi.UInt32, scene.shapes_dr()))
+    numbers = np.full(max(int(ids.max(initial=0)), int(np.array(number).max(initial=0))) + 1, -1)
+    numbers[ids] = np.arange(len(ids))
+    shape = np.where(valid, numbers[np.array(number)], -1)
+    return Seen(points, straight, shape, np.array(hit.prim_index), np.array(hit.prim_uv, np.float64).T.reshape(-1, 2))
+
+
+def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot) -> np.ndarray:
+    """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
+
+    ``now`` is the snapshot of ``scene``. NaN where that is not known: behind the camera of before, or on a shape that
+    was not there. Raises NgptError for a camera without a projection.
+    """
+    what = seen(scene)
+    moved = what.points.copy()
+    unknown = np.zeros(len(moved), bool)
+    if now.shapes is not before.shapes:
+        for index in np.unique(what.shape[what.shape >= 0]):
+            here = np.flatnonzero(what.shape == index)
+            old = before.shapes[index] if index < len(before.shapes) else None
+            shift = _displacement(now.shapes[index], old, what, here)
+            if shift is None:
+                unknown[here] = True
+            else:
+                moved[here, :3] += np.where(what.straight[here, None], shift, 0)
+    (x, y, _), front = _project(now.film, what.points)
+    (x_before, y_before, _), front_before = _project(before.film, moved)
+    motion = np.stack([x_before - x, y_before - y], axis=-1)
+    motion[unknown | ~front | ~front_before] = np.nan
+    width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+    return motion.reshape(height, width, 2).astype(np.float32)
+
+
+def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:
+    """(n, 3): from where the pixels ``here`` see a shape to where that was; None where that cannot be known."""
+    if isinstance(now, Mesh) and isinstance(old, Mesh) and now.faces.shape == old.faces.shape:
+        if np.array_equal(now.vertices, old.vertices):
+            return np.zeros((len(here), 3))
+        b1, b2 = what.barycentric[here].T
+        weights = np.stack([1 - b1 - b2, b1, b2], axis=-1)[..., None]
+        triangles = what.primitive[here]
+        return ((old.vertices[old.faces[triangles]] - now.vertices[now.faces[triangles]]) * weights).sum(axis=1)
+    if isinstance(now, np.ndarray) and isinstance(old, np.ndarray):
+        if np.array_equal(now, old):
+            return np.zeros((len(here), 3))
+        points = what.points[here]
+        return ((old @ np.linalg.inv(now) @ points.T).T - points)[:, :3]
+    return None if now is not None or old is not None else np.zeros((len(here), 3))
+
+
+def _project(film: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(3, N) pixel coordinates of homogeneous points (N, 4), and which of them are in front of the camera."""
+    x, y, z, w = film @ points.T
+    front = w > 0
+    w = np.where(front, w, 1)
+    return np.stack([x / w, y / w, z / w]), front

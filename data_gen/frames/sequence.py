@@ -1,0 +1,123 @@
+"""A scene over time, and its stacks frame by frame."""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.frames.camera_path import CameraPath, horizontal
+from data_gen.frames.motion import Geometry, Snapshot, motion_vectors, snapshot
+from data_gen.render import render_stack
+from data_gen.scenes.load import load_scene
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+
+class Shot:
+    """A scene over time: ``at(frame)`` is the scene in the state of that frame.
+
+    ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
+                  they change; kernels are compiled once, as long as frames consist of the same kinds of things.
+    ``camera``    moves the first sensor
+    ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
+    """
+
+    def __init__(
+        self,
+        describe: Callable[[int], tuple[str, Mapping[str, str]]],
+        size: tuple[int, int] | None = None,
+        camera: CameraPath | None = None,
+        update: Callable[[mi.SceneParameters, int], None] | None = None,
+    ):
+        self.describe, self.size, self.camera, self.update = describe, size, camera, update
+        self._loaded: Any = None
+        self._scene: mi.Scene | None = None
+        self._shapes: tuple[Geometry, ...] | None = None
+
+    def at(self, frame: int) -> mi.Scene:
+        """The scene in the state of a frame; what was returned before changes, or is no longer used."""
+        name, parameters = self.describe(frame)
+        wanted = (name, dict(parameters))
+        if self._scene is None or wanted != self._loaded:
+            self._scene = self._shapes = None
+            gc.collect()  # two scenes in memory would make kernels larger
+            self._scene, self._loaded = load_scene(name, self.size, wanted[1]), wanted
+        scene = self._scene
+        if self.update is not None:
+            params = mi.traverse(scene)
+            self.update(params, frame)
+            params.update()
+            self._shapes = None
+        if self.camera is not None:
+            self._place_camera(scene.sensors()[0], frame)
+        return scene
+
+    def snapshot(self, frame: int) -> Snapshot:
+        """What motion needs of a frame."""
+        taken = snapshot(self.at(frame), self._shapes)
+        self._shapes = taken.shapes
+        return taken
+
+    def _place_camera(self, sensor: mi.Sensor, frame: int) -> None:
+        view, params = self.camera.at(frame), mi.traverse(sensor)
+        params["to_world"] = type(params["to_world"])(mi.ScalarTransform4f(view.to_world).matrix)
+        if view.fov is not None:
+            if "x_fov" not in params:
+                raise NgptError(f"sensor '{sensor.class_name()}' has no field of view; leave fov out of the path")
+            width, height = sensor.film().size()
+            params["x_fov"] = horizontal(view.fov, view.fov_axis, float(width) / float(height))
+        params.update()
+
+
+def frame_seed(seed: int, frame: int) -> int:
+    """The seed of a frame: one of its own, whatever other frames are rendered."""
+    # Entropy must not be negative, frames may be.
+    return int(np.random.SeedSequence([seed, frame % 2**64]).generate_state(1, np.uint64)[0])
+
+
+def render_sequence(
+    shot: Shot,
+    frames: Sequence[int],
+    spp: int | None,
+    seed: int = 0,
+    skip: Callable[[int], bool] = lambda frame: False,
+    progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
+    **options: Any,
+) -> Iterator[tuple[int, GradientStack]]:
+    """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
+
+    Stacks have the layer ``motion`` to the frame before in ``frames``; of the first, to the one that a sequence of the
+    same step would have before it, all NaN where there is none. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
+    frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
+    ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
+    """
+    before: Snapshot | None = None
+    last = None
+    step = frames[1] - frames[0] if len(frames) > 1 else 1
+    for i, frame in enumerate(frames):
+        if skip(frame):
+            continue
+        previous = frames[i - 1] if i else frame - step
+        if last != previous:
+            before = _before(shot, previous, first=i == 0)
+        now = shot.snapshot(frame)
+        scene = shot.at(frame)
+        width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+        motion = np.full((height, width, 2), np.nan) if before is None else motion_vectors(scene, now, before)
+        stack = render_stack(scene, spp, frame_seed(seed, frame), progress=progress(frame), **options)
+        stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
+        yield frame, stack.replace(motion=motion)
+        before, last = now, frame
+
+
+def _before(shot: Shot, frame: int, first: bool) -> Snapshot | None:
+    try:
+        return shot.snapshot(frame)
+    except NgptError:
+        if not first:
+            raise
+        return None

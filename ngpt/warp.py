@@ -1,0 +1,48 @@
+"""Images of one frame, as seen from another: looked up along motion vectors."""
+
+import numpy as np
+
+
+def warped(image: np.ndarray, motion: np.ndarray, sharp: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """``image`` (H, W, C) of one frame at x + motion for the pixels x of another, and where that is in the image.
+
+    ``motion`` is (H, W, 2), pixels to the right and down; where it is not finite nothing is found. Between pixels the
+    value is bilinear, or with ``sharp`` that of a Catmull-Rom spline within the range of the four pixels around: a
+    bilinear image loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W)
+    booleans.
+    """
+    height, width = motion.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    x, y = x + motion[..., 0], y + motion[..., 1]
+    with np.errstate(invalid="ignore"):
+        found = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
+    x, y = (np.where(found, v, 0) for v in (x, y))
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = ((v - whole).astype(image.dtype)[..., None] for v, whole in ((x, left), (y, top)))
+
+    def tap(i: int, j: int) -> np.ndarray:
+        return image[np.clip(top + j, 0, height - 1), np.clip(left + i, 0, width - 1)]
+
+    four = [[tap(i, j) for i in (0, 1)] for j in (0, 1)]
+    if not sharp:
+        rows = [row[0] + fx * (row[1] - row[0]) for row in four]
+        value = rows[0] + fy * (rows[1] - rows[0])
+    else:
+        across, down = _catmull_rom(fx), _catmull_rom(fy)
+        value = sum(
+            down[j] * sum(across[i] * (four[j - 1][i - 1] if {i, j} <= {1, 2} else tap(i - 1, j - 1)) for i in range(4))
+            for j in range(4)
+        )
+        around = [pixel for row in four for pixel in row]
+        value = np.clip(value, np.minimum.reduce(around), np.maximum.reduce(around))
+    return np.where(found[..., None], value, 0).astype(image.dtype, copy=False), found
+
+
+def _catmull_rom(f: np.ndarray) -> list[np.ndarray]:
+    """The weights of the four pixels around a place, a fraction ``f`` from the second to the third."""
+    return [
+        f * (-0.5 + f * (1 - 0.5 * f)),
+        1 + f * f * (-2.5 + 1.5 * f),
+        f * (0.5 + f * (2 - 1.5 * f)),
+        f * f * (-0.5 + 0.5 * f),
+    ]

@@ -1,0 +1,86 @@
+"""``ngpt render --frames``: frames, patterns, going on."""
+
+import argparse
+import json
+
+import pytest
+
+import ngpt
+from ngpt.cli import main
+from ngpt.cli.frames import filled, frames, targets
+from ngpt.errors import NgptError
+
+
+def test_frames_are_ranges_lists_and_steps():
+    assert frames("0:3") == [0, 1, 2] and frames("0:10:4") == [0, 4, 8] and frames("7") == [7]
+    assert frames("1,5:7,5") == [1, 5, 6] and frames("-2:1") == [-2, -1, 0] and frames("3:0:-1") == [3, 2, 1]
+
+
+@pytest.mark.parametrize("text", ["", "a", "1:2:3:4", "3:3", "0:5:0", "1.5", "0:10000000"])
+def test_frames_that_make_no_sense_are_refused(text):
+    with pytest.raises(argparse.ArgumentTypeError):
+        frames(text)
+
+
+def test_text_changes_from_frame_to_frame():
+    assert filled("{frame}", 7) == "7" and filled("shot.{frame:04d}.exr", 7) == "shot.0007.exr"
+    assert filled("{10 + frame * 1.5:.2f},0", 3) == "14.50,0" and filled("{sin(pi * frame / 2):.1f}", 1) == "1.0"
+    assert (
+        filled("{-(frame // 2) % 5}", 4) == "3"
+        and filled("plain", 1) == "plain"
+        and filled("{frame / 2:02d}", 4) == "02"
+    )
+
+
+@pytest.mark.parametrize(
+    "text", ["{frames}", "{frame.real}", "{__import__('os')}", "{frame / 0}", "{frame:q}", "{frame +}"]
+)
+def test_text_that_cannot_be_computed_is_refused(text):
+    with pytest.raises(NgptError, match="frame"):
+        filled(text, 3)
+
+
+def test_targets_are_patterns_and_folders(tmp_path):
+    assert targets(None, "a/box.xml", [3])[3].name == "box.0003.exr"
+    folder = tmp_path / "shot"
+    assert targets(str(folder), "shot_{frame}.xml", [3]) == {3: folder / "shot.0003.exr"}
+    with pytest.raises(NgptError, match="one file for 2 frames"):
+        targets(str(tmp_path / "a.exr"), "box", [1, 2])
+    with pytest.raises(NgptError, match="would be frame 1 and frame 2"):
+        targets("{frame // 9}.exr", "box", [1, 2])
+    with pytest.raises(NgptError, match="let the name end"):
+        targets("{frame}.png", "box", [1])
+
+
+def test_what_belongs_to_sequences_is_refused_without(tmp_path, capsys):
+    assert main(["render", "diffuse", "--camera", "x.json", "-o", str(tmp_path / "a.exr")]) == 2
+    assert "--frames" in capsys.readouterr().err
+    assert main(["render", "diffuse", "-D", "a={frame}", "-o", str(tmp_path / "a.exr")]) == 2
+    assert "changes from frame to frame" in capsys.readouterr().err
+
+
+def test_a_sequence_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
+    path = tmp_path / "path.json"
+    keys = [{"frame": f, "origin": [f / 10, 1.25, 3.9], "target": [0, 1.15, 0]} for f in (0, 2)]
+    path.write_text(json.dumps({"keys": keys}))
+    words = [
+        "--camera",
+        str(path),
+        "--size",
+        "16x12",
+        "--spp",
+        "1",
+        "--sampler",
+        "primal",
+        "-o",
+        str(tmp_path / "shot"),
+    ]
+    assert main(["render", "diffuse", "--frames", "0:2", *words]) == 0
+    first = (tmp_path / "shot/diffuse.0001.exr").read_bytes()
+    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
+    assert "2 of 3 frames were skipped" in capsys.readouterr().err
+    assert (tmp_path / "shot/diffuse.0001.exr").read_bytes() == first
+    stack = ngpt.read(tmp_path / "shot/diffuse.0002.exr")
+    assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05

@@ -1,0 +1,112 @@
+"""Cameras of glTF files."""
+
+import base64
+import json
+import struct
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from data_gen.frames.camera_path import look_at
+from data_gen.frames.gltf import read_gltf_camera
+from ngpt.errors import NgptError
+
+TIMES = np.array([0, 1], np.float32)
+MOVES = np.array([[0, 1, 4], [2, 1, 4]], np.float32)
+TURNS = np.array([[0, 0, 0, 1], Rotation.from_euler("y", 60, degrees=True).as_quat()], np.float32)
+
+
+def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS):
+    """A camera that moves and turns, in a node that stands one unit higher; and its bytes."""
+    parts = [TIMES, np.asarray(moves, np.float32), np.asarray(turns, np.float32)]
+    data, views, accessors = b"", [], []
+    for part, kind in zip(parts, ("SCALAR", "VEC3", "VEC4"), strict=True):
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": part.nbytes})
+        accessors.append({"bufferView": len(views) - 1, "componentType": 5126, "count": len(part), "type": kind})
+        data += part.tobytes()
+    channels = [
+        {"sampler": i, "target": {"node": 2, "path": path}} for i, path in enumerate(("translation", "rotation"))
+    ]
+    return {
+        "asset": {"version": "2.0"},
+        "cameras": [{"type": "perspective", "perspective": {"yfov": np.pi / 4, "znear": 0.1}}],
+        "nodes": [{"name": "thing"}, {"translation": [0, 1, 0], "children": [2]}, {"camera": 0}],
+        "animations": [
+            {"channels": channels, "samplers": [{"input": 0, "output": i, "interpolation": way} for i in (1, 2)]}
+        ],
+        "bufferViews": views,
+        "accessors": accessors,
+        "buffers": [{"byteLength": len(data)} | ({"uri": buffer(data)} if buffer else {})],
+    }, data
+
+
+def embedded(data):
+    return "data:application/octet-stream;base64," + base64.b64encode(data).decode()
+
+
+@pytest.fixture(params=["embedded", "beside", "glb"])
+def file(request, tmp_path):
+    if request.param == "glb":
+        scene, data = content(None)
+        text = json.dumps(scene).encode()
+        text += b" " * (-len(text) % 4)
+        path = tmp_path / "shot.glb"
+        chunks = struct.pack("<II", len(text), 0x4E4F534A) + text + struct.pack("<II", len(data), 0x4E4942) + data
+        path.write_bytes(b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks)
+        return path
+    path = tmp_path / "shot.gltf"
+    scene, data = content(embedded if request.param == "embedded" else lambda data: "the%20buffer.bin")
+    (tmp_path / "the buffer.bin").write_bytes(data)
+    path.write_text(json.dumps(scene))
+    return path
+
+
+def test_a_camera_moves_as_in_the_file(file):
+    path = read_gltf_camera(file, 24)
+    assert path.keys[0].frame == 0 and path.keys[-1].frame == 24 and len(path.keys) == 25
+    # It looks along -z to begin with, one unit above its own place.
+    assert np.allclose(path.at(0).to_world, look_at((0, 2, 4), (0, 2, 3), (0, 1, 0)), atol=1e-6)
+    middle = path.at(12)
+    assert np.allclose(middle.to_world[:3, 3], [1, 2, 4], atol=1e-6)
+    assert np.allclose(middle.to_world[:3, 2], [-0.5, 0, -np.sqrt(0.75)], atol=1e-6)  # turned left by 30 degrees
+    assert middle.fov == pytest.approx(45) and middle.fov_axis == "y"
+    assert np.isclose(np.linalg.det(middle.to_world), 1)
+
+
+def test_steps_and_splines(tmp_path):
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(content(embedded, "STEP")[0]))
+    assert np.allclose(read_gltf_camera(path, 10).at(9).to_world[:3, 3], [0, 2, 4])
+    rest = np.zeros((2, 3, 4))
+    rest[:, 1] = TURNS
+    moves = np.zeros((2, 3, 3))
+    moves[:, 1] = MOVES
+    scene = content(embedded, "CUBICSPLINE", moves.reshape(6, 3), rest.reshape(6, 4))[0]
+    path.write_text(json.dumps(scene))
+    spline = read_gltf_camera(path, 10)
+    # Without tangents the way eases in and out: 3 t² - 2 t³.
+    assert np.isclose(spline.at(2).to_world[0, 3], 2 * (3 * 0.04 - 2 * 0.008))
+
+
+@pytest.mark.parametrize(
+    ("change", "complaint"),
+    [
+        (lambda scene: scene["nodes"].pop(), "has no camera"),
+        (lambda scene: scene["cameras"][0].update(type="orthographic"), "must be perspective"),
+        (lambda scene: scene.pop("accessors"), "can be understood"),
+        (lambda scene: scene["accessors"][1].update(count=1000), "can be understood"),
+        (lambda scene: scene["buffers"][0].update(uri="gone.bin"), "cannot be read"),
+        (lambda scene: scene["accessors"][0].update(componentType=5123), "export them as floats"),
+    ],
+)
+def test_files_that_cannot_be_used_are_refused(tmp_path, change, complaint):
+    scene, _ = content(embedded)
+    change(scene)
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(scene))
+    with pytest.raises(NgptError, match=complaint):
+        read_gltf_camera(path, 24)
+    path.write_bytes(b"glTF123")
+    with pytest.raises(NgptError, match="can be understood"):
+        read_gltf_camera(path, 24)

@@ -1,0 +1,139 @@
+"""Sequences: a frame is the same bits whatever others are rendered, and scenes are loaded no more than they must be."""
+
+import numpy as np
+import pytest
+
+from data_gen.frames.camera_path import CameraPath, Key, horizontal, look_at, read_camera_path
+from ngpt.errors import NgptError
+
+XML = """<scene version="3.0.0"><default name="angle" value="0"/><integrator type="path"/>
+<sensor type="perspective"><transform name="to_world"><lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform>
+<film type="hdrfilm"><integer name="width" value="16"/><integer name="height" value="12"/></film></sensor>
+<emitter type="constant"/><shape type="cube"><transform name="to_world"><rotate y="1" angle="$angle"/></transform>
+</shape></scene>"""
+
+
+def look(origin, target=(0, 0, 0), up=(0, 1, 0)):
+    return np.array([origin, target, up], float)
+
+
+def shot(tmp_path, camera=None, update=None, moving=True):
+    from data_gen.frames.sequence import Shot
+
+    path = tmp_path / "scene.xml"
+    path.write_text(XML)
+    return Shot(lambda frame: (str(path), {"angle": str(5 * frame if moving else 0)}), camera=camera, update=update)
+
+
+def rendered(shot, frames, **options):
+    from data_gen.frames.sequence import render_sequence
+
+    return dict(render_sequence(shot, frames, 2, 7, sampler="primal", **options))
+
+
+def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):
+    all_of_them = rendered(shot(tmp_path), range(1, 5))
+    last = rendered(shot(tmp_path), range(1, 5), skip=lambda frame: frame < 4)
+    farm = rendered(shot(tmp_path), range(3, 5))
+    assert list(last) == [4] and list(farm) == [3, 4]
+    for frame, stack in [(4, last[4]), (3, farm[3]), (4, farm[4])]:
+        for name in stack.names:
+            assert np.array_equal(stack[name], all_of_them[frame][name], equal_nan=True), name
+    assert np.abs(all_of_them[3]["motion"]).max() > 0.1
+
+
+def test_frames_have_seeds_of_their_own_and_say_who_they_are(renderer, tmp_path):
+    stacks = rendered(shot(tmp_path, moving=False), [0, 2, 5])
+    assert not np.array_equal(stacks[0]["primal"], stacks[2]["primal"])
+    assert len({stack.attributes["ngpt:seed"] for stack in stacks.values()}) == 3
+    found = [(s.attributes["ngpt:frame"], s.attributes["ngpt:previousFrame"]) for s in stacks.values()]
+    assert found == [(0, -2), (2, 0), (5, 2)]
+
+
+def test_a_scene_is_loaded_again_only_where_its_parameters_change(renderer, tmp_path):
+    camera = CameraPath([Key(0, look_at(*look((0, 1, 4))), look((0, 1, 4))), Key(4, np.eye(4))])
+    still = shot(tmp_path, camera, moving=False)
+    assert still.at(0) is still.at(1)
+    moving = shot(tmp_path)
+    first = moving.at(0)
+    assert moving.at(1) is not first
+
+
+def test_parameters_can_be_set_in_place(renderer, tmp_path):
+    def update(params, frame):
+        key = next(filter(lambda name: name.endswith("vertex_positions"), params.keys()))
+        start.setdefault(key, np.array(params[key]))
+        params[key] = start[key] + 0.1 * frame
+
+    start = {}
+    stacks = rendered(shot(tmp_path, update=update, moving=False), range(2))
+    assert np.nanmax(np.abs(stacks[1]["motion"])) > 0.2
+
+
+def test_a_first_frame_with_nothing_before_it_has_no_motion(renderer, tmp_path):
+    from data_gen.frames.sequence import Shot
+
+    for frame in (1, 2):
+        (tmp_path / f"{frame}.xml").write_text(XML)
+    stacks = rendered(Shot(lambda frame: (str(tmp_path / f"{frame}.xml"), {})), [1, 2])
+    assert np.isnan(stacks[1]["motion"]).all() and np.array_equal(stacks[2]["motion"], np.zeros((12, 16, 2)))
+
+
+def test_cameras_between_keys():
+    path = CameraPath(
+        [Key(f, look_at(*v), v, fov) for f, v, fov in [(0, look((0, 0, 4)), 40), (4, look((4, 0, 4)), 60)]]
+    )
+    middle = path.at(1)
+    assert np.allclose(middle.to_world, look_at((1, 0, 4), (0, 0, 0), (0, 1, 0))) and middle.fov == 45
+    assert path.at(-3) is path.keys[0] and path.at(9) is path.keys[1]
+
+
+def test_matrices_turn_evenly_between_keys():
+    def turned(degrees, scale):
+        a = np.radians(degrees)
+        matrix = np.eye(4)
+        matrix[:3, :3] = scale * np.array([[np.cos(a), 0, np.sin(a)], [0, 1, 0], [-np.sin(a), 0, np.cos(a)]])
+        matrix[:3, 3] = degrees, 0, 0
+        return matrix
+
+    path = CameraPath([Key(0, turned(0, 1)), Key(2, turned(80, 3))])
+    assert np.allclose(path.at(1).to_world, turned(40, 2))
+
+
+def test_the_look_at_of_a_path_is_that_of_mitsuba(renderer):
+    ours = look_at((1, 2, 3), (-1, 0.5, 0), (0, 1, 0.2))
+    theirs = renderer.ScalarTransform4f().look_at(origin=[1, 2, 3], target=[-1, 0.5, 0], up=[0, 1, 0.2])
+    assert np.allclose(ours, np.array(theirs.matrix), atol=1e-6)
+
+
+def test_fields_of_view_of_the_height_are_turned_into_those_of_the_width():
+    assert horizontal(40, "x", 2) == 40
+    assert np.isclose(np.tan(np.radians(horizontal(40, "y", 2) / 2)), 2 * np.tan(np.radians(20)))
+
+
+@pytest.mark.parametrize(
+    ("text", "complaint"),
+    [
+        ("{", "is not JSON"),
+        ("{}", "holds no camera keys"),
+        ("[5]", "key 0 is 5"),
+        ('[{"frame": 0, "fow": 3}]', "has 'fow'; known are"),
+        ('[{"origin": [0, 0, 1]}]', "key 0 has no target"),
+        ('[{"origin": [0, 0, 1], "target": [0, 0]}]', "target is .*must be 3 finite numbers"),
+        ('[{"origin": [0, 0, 1], "target": [0, 0, 1]}]', "at its target"),
+        ('[{"to_world": [[1, 0, 0, 0]]}]', "must be 4 x 4"),
+        ('[{"to_world": [[0,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "cannot be inverted"),
+        ('[{"origin": [0, 0, 1], "target": [0, 0, 0], "fov": 190}]', "between 0 and 180"),
+        ('[{"origin": [0, 0, 1], "target": [0, 0, 0], "fov": NaN}]', "finite number"),
+        (
+            '[{"frame": 2, "origin": [0,0,1], "target": [0,0,0]}, {"frame": 2, "origin": [0,0,1], "target": [0,0,0]}]',
+            "sort",
+        ),
+        ('[{"origin": [0,0,1], "target": [0,0,0]}, {"origin": [0,0,1], "target": [0,0,0], "fov": 3}]', "no fov"),
+    ],
+)
+def test_a_wrong_path_is_refused_with_its_place(tmp_path, text, complaint):
+    path = tmp_path / "path.json"
+    path.write_text(text)
+    with pytest.raises(NgptError, match=complaint):
+        read_camera_path(path)
