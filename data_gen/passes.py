@@ -62,13 +62,8 @@ def render_passes(
 
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
-    width, height = (int(n) for n in sensor.film().crop_size())
-    film = GradientFilm(width, height, batches=bool(batch))
     total = spp if spp is not None else 1 << 31
-    block = batch or block_of_samples(film.pixels)
-    most = blocks_within(memory, film, min(block, total), lane_bytes)
-    if batch:
-        most = 1
+    film, block, most = film_within(memory, sensor, total, lane_bytes, batch)
     start = now = time.perf_counter()
 
     def report(finished: bool = False) -> None:
@@ -98,6 +93,20 @@ def render_passes(
             break
         blocks = int(min(time_left, _PASS_SECONDS) / each)
     return film
+
+
+def film_within(
+    memory: int, sensor: mi.Sensor, spp: int, lane_bytes: int = LANE_BYTES, batch: int = 0
+) -> tuple[GradientFilm, int, int]:
+    """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
+
+    Raises NgptError where one block of samples does not fit into ``memory``.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    film = GradientFilm(width, height, batches=bool(batch))
+    block = batch or block_of_samples(film.pixels)
+    most = blocks_within(memory, film, min(block, spp), lane_bytes)
+    return film, block, 1 if batch else most
 
 
 @contextmanager

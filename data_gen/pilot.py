@@ -23,6 +23,7 @@ import mitsuba as mi
 import numpy as np
 from scipy.ndimage import uniform_filter
 
+from data_gen.passes import DEFAULT_MEMORY, film_within
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, choose
 from data_gen.scenes.facts import scene_facts
@@ -82,12 +83,13 @@ def candidates(scene: mi.Scene) -> list[str]:
     ]
 
 
-def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None) -> Choice:
+def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, memory: int = DEFAULT_MEMORY) -> Choice:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
     The description alone decides, at no cost, where one sampler alone can render the scene, and where the render is too
     short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has the bits
-    of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene.
+    of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene, and before anything is
+    tried where the image does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     sampler, reason = choose(scene_facts(scene))
@@ -97,6 +99,8 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None) -> 
     paths = math.inf if spp is None else spp * math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
     if paths < _LEAST_PATHS or (seconds is not None and seconds < _LEAST_SECONDS):
         return Choice(sampler, f"{reason}; the render is too short to try others")
+    entry = SAMPLERS[sampler]
+    film_within(memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch)
     with _at_most(scene, _PIXELS) as scale:
         first = try_out(scene, sampler)
         if first is None:

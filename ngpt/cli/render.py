@@ -97,7 +97,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     scene = load_scene(args.scene, args.size, dict(args.define))
     sampler, seconds = args.sampler, args.time
     if sampler == "auto":
-        choice = choose_by_pilot(scene, spp, seconds)
+        choice = choose_by_pilot(scene, spp, seconds, memory)
         sampler = choice.sampler
         console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
         seconds = seconds and max(seconds - choice.seconds, 1e-3)
