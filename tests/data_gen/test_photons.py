@@ -165,7 +165,7 @@ def test_a_wide_radius_is_biased(renderer):
         assert_alike(np.stack([light_of_gradients(s) for s in ours]), references, 6)
 
 
-@pytest.mark.parametrize("max_depth", [1, 2, 3])
+@pytest.mark.parametrize("max_depth", [1, 2, 4])
 def test_paths_are_no_longer_than_the_scene_says(renderer, max_depth):
     def short():
         return SCENES["glass"]() | {"integrator": {"type": "path", "max_depth": max_depth}}
