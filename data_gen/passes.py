@@ -34,6 +34,11 @@ _FIRST_LANES = 1 << 20
 _PASS_SECONDS = 2.0
 
 
+def _nothing(left: int) -> str:
+    """Of what would fit into so many bytes for a lane."""
+    return ""
+
+
 def render_passes(
     sample: SamplePass,
     sensor: mi.Sensor,
@@ -55,15 +60,17 @@ def render_passes(
     there are ``seconds``, with whole (seconds gone, seconds).
 
     How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
-    takes ``lane_bytes``. That changes no bit of the result, which depends on the seed, the size and the number of
-    samples alone. With a ``batch``, the samples of a pass depend on each other: each pass is one block of so many
-    samples per pixel, and the film's variances are over passes. Such a ``sample`` may keep a state from pass to pass;
-    ``CameraSamples.first`` tells it where it is.
+    takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
+    depends on the seed, the size and the number of samples alone. With a ``batch``, the samples of a pass depend on
+    each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
+    ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` tells it where it is.
 
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     total = spp if spp is not None else 1 << 31
-    film, block, most = film_within(memory, sensor, total, lane_bytes, batch)
+    lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
+    instead = getattr(sample, "instead", _nothing)
+    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead)
     start = now = time.perf_counter()
 
     def report(finished: bool = False) -> None:
@@ -96,16 +103,22 @@ def render_passes(
 
 
 def film_within(
-    memory: int, sensor: mi.Sensor, spp: int, lane_bytes: int = LANE_BYTES, batch: int = 0
+    memory: int,
+    sensor: mi.Sensor,
+    spp: int,
+    lane_bytes: int = LANE_BYTES,
+    batch: int = 0,
+    instead: Callable[[int], str] = _nothing,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
+    ``instead`` is that of ``blocks_within``.
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
     film = GradientFilm(width, height, batches=bool(batch))
     block = batch or block_of_samples(film.pixels)
-    most = blocks_within(memory, film, min(block, spp), lane_bytes)
+    most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
     return film, block, 1 if batch else most
 
 
@@ -138,20 +151,28 @@ def block_of_samples(pixels: int) -> int:
     return block
 
 
-def blocks_within(memory: int, film: GradientFilm, block: int, lane_bytes: int = LANE_BYTES) -> int:
+def blocks_within(
+    memory: int,
+    film: GradientFilm,
+    block: int,
+    lane_bytes: int = LANE_BYTES,
+    instead: Callable[[int], str] = _nothing,
+) -> int:
     """How many blocks of ``block`` samples a pass may have, so that it and the film stay within ``memory`` MiB.
 
-    Raises NgptError where not even one fits.
+    Raises NgptError where not even one fits. ``instead`` is asked what else would, with so many bytes left for a lane.
     """
     lanes = film.pixels * block
     # Dr.Jit gives each array the next power of two of bytes.
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
     blocks = (1 << (available.bit_length() - 1)) // lanes if available > 0 else 0
     if blocks < 1:
-        needed = -(-(film.bytes + lane_bytes * (1 << (lanes - 1).bit_length())) // 2**20)
+        width = 1 << (lanes - 1).bit_length()
+        needed = -(-(film.bytes + lane_bytes * width) // 2**20)
+        other = instead((memory * 2**20 - film.bytes) // width)
         raise NgptError(
             f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {memory} MiB are "
-            f"allowed; pass --memory {needed}, or render a smaller image"
+            f"allowed; pass --memory {needed}, or render a smaller image{other}"
         )
     # A block that ends amid a packet would push the next one to another place in its own.
     return blocks if lanes % _PACKET == 0 else 1

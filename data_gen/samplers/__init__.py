@@ -43,6 +43,7 @@ class Sampler:
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
+    ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
     ``module``      where its Mitsuba classes are, imported anew with each variant; "" if it has none
     """
 
@@ -57,6 +58,7 @@ class Sampler:
     tried: bool = True
     batch: int = 0
     lane_bytes: int = PATH_BYTES
+    biased: bool = False
     module: str = ""
 
 
@@ -154,6 +156,13 @@ def _notes_on_bdpt(facts: Facts) -> list[str]:
     return lines
 
 
+def _notes_on_ppm(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', found by photons; blurred, less with every sample"]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too")
+    return lines
+
+
 def _notes_on_gbdpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
     if facts.mirrors:
@@ -163,9 +172,17 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _PRIMAL = (
     f"data_gen.samplers.{name}"
-    for name in ("gpt.integrator", "gpt_basic", "gpt_simple", "bdpt.integrator", "gbdpt.integrator", "primal")
+    for name in (
+        "gpt.integrator",
+        "gpt_basic",
+        "gpt_simple",
+        "bdpt.integrator",
+        "gbdpt.integrator",
+        "photons.ppm",
+        "primal",
+    )
 )
 
 for _sampler in (
@@ -228,6 +245,23 @@ for _sampler in (
         batch=8,
         lane_bytes=_GBDPT_BYTES,
         module=_GBDPT,
+    ),
+    Sampler(
+        "ppm",
+        "photons gathered within a shrinking radius, without gradients (caustics seen in mirrors and through glass)",
+        _from_module(_PPM),
+        lambda facts: _refused_but_for_surfaces(facts, "ppm"),
+        _notes_on_ppm,
+        {
+            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (3)",
+            "photons": "light paths of a pass for each pixel (1)",
+            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+        },
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_PPM,
     ),
     Sampler(
         "primal",

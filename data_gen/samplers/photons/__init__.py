@@ -1,0 +1,1 @@
+"""Photons: light paths kept in a map, and the light gathered from those near a point."""

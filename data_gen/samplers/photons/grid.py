@@ -1,0 +1,96 @@
+"""The photons of a map by place: a dense uniform grid, whose cells are runs of one sorted list.
+
+A cell's edge is at least the diameter of what is gathered. So a ball touches two cells along each axis at most: four
+rows of two cells, which are neighbours in the list. All is made by counts and stable sorts, and whoever gathers meets
+the photons of a point in the order of the list: sums have the same bits every time.
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+# Cells beyond so many for each photon are empty: larger ones cost less.
+_CELLS_PER_PHOTON = 4
+_LEAST_CELLS = 1 << 12
+
+
+class Grid:
+    """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
+
+    ``points`` are all points, of which those that ``exist`` are entered; ``radius`` is the largest that is asked for.
+    """
+
+    def __init__(self, points: mi.Point3f, exist: mi.Bool, radius: float):
+        index = dr.compress(exist)
+        p = dr.gather(mi.Point3f, points, index)
+        self.size = dr.width(index)
+        if not self.size:
+            return
+        low, high = (np.array([f(axis)[0] for axis in p], np.float64) for f in (dr.min, dr.max))
+        self.edge, cells = self.cells(high - low, 2 * radius, max(_LEAST_CELLS, _CELLS_PER_PHOTON * self.size))
+        # Half a cell of room on all sides: the cells of a ball around any of the points are in the grid.
+        self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - self.edge))
+        self.rate = dr.opaque(mi.Float, 1 / self.edge)
+        self.n = mi.Vector3u(*(dr.opaque(mi.UInt32, int(n)) for n in cells))
+        key = self.linear(*(mi.UInt32((q - o) * self.rate) for q, o in zip(p, self.low, strict=True)))
+        counts = dr.zeros(mi.UInt32, int(np.prod(cells)) + 1)
+        dr.scatter_add(counts, mi.UInt32(1), key)
+        self.start = dr.prefix_sum(counts)
+        order = dr.argsort(key)
+        self.index, self.p = dr.gather(mi.UInt32, index, order), dr.gather(mi.Point3f, p, order)
+        dr.eval(self.start, self.index, self.p)
+
+    @staticmethod
+    def cells(extents: np.ndarray, edge: float, most: int) -> tuple[float, np.ndarray]:
+        """The edge of a cell, ``edge`` or as much longer as it takes to have at most ``most``, and their numbers."""
+        while True:
+            cells = np.floor(extents / edge).astype(np.int64) + 3
+            if np.prod(cells.astype(np.float64)) <= most:
+                return edge, cells
+            edge *= 1.25
+
+    def linear(self, x: mi.UInt32, y: mi.UInt32, z: mi.UInt32) -> mi.UInt32:
+        """The number of a cell."""
+        return x + self.n.x * (y + self.n.y * z)
+
+    def row(self, p: mi.Point3f, k: mi.UInt32, active) -> tuple[mi.UInt32, mi.UInt32]:
+        """From where to where in the list is row ``k`` of 4 of the cells near ``p``; nothing if ``p`` is far off."""
+        near = [(q - o) * self.rate - 0.5 for q, o in zip(p, self.low, strict=True)]
+        for f, n in zip(near, self.n, strict=True):
+            active = active & (f >= 0) & (f < n - 1)
+        x, y, z = (mi.UInt32(dr.select(active, f, 0)) for f in near)
+        cell = self.linear(x, y + (k & 1), z + (k >> 1))
+        return dr.gather(mi.UInt32, self.start, cell, active), dr.gather(mi.UInt32, self.start, cell + 2, active)
+
+    def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
+        """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.
+
+        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
+        """
+        if not self.size:
+            return total
+
+        def step(k, i, end, total):
+            at = i < end
+            near = at & (dr.squared_norm(dr.gather(mi.Point3f, self.p, i, at) - p) < radius2)
+            total = total + value(i, near)
+            i = i + 1
+            next_row = ~(i < end) & (k < 4)
+            first, last = self.row(p, k, next_row)
+            return (
+                dr.select(next_row, k + 1, k),
+                dr.select(next_row, first, i),
+                dr.select(next_row, last, end),
+                total,
+            )
+
+        # A first step without a point: i = end, and so row 0 is next.
+        none = dr.zeros(mi.UInt32, dr.width(p))
+        return dr.while_loop(
+            (mi.UInt32(none), mi.UInt32(none), mi.UInt32(none), total),
+            lambda k, i, end, total: active & ((k < 4) | (i < end)),
+            step,
+            label="gather",
+        )[3]

@@ -1,0 +1,224 @@
+r"""Progressive photon mapping: light is carried to where the camera looks, and gathered there from near by.
+
+Light that goes through glass and then onto a rough surface, seen in a mirror or through glass itself, is found by no
+connection: neither end can be joined to the other but by meeting it. Photons meet the surface, and are counted within
+a radius of the point that the camera path meets. That blurs the light over the radius, which shrinks from pass to pass.
+
+    x           a vertex of the camera path, at a material that scatters widely
+    b, d, Φ     a photon within radius r of it, the direction it came along, its power
+    L(x)        Σ f(x; -d) Φ / (π r² N),    N: light paths of the pass
+    β           throughput of the camera path
+
+A camera path goes on by mirrors, glass, sharp gloss and holes. It ends where light is scattered smoothly by a material
+that scatters widely. All light that is scattered there comes from photons, that of lamps seen from there included;
+emission that the camera path meets on its way counts as it is. So each path of light is found in one way alone.
+
+[Hachisuka et al. 2008, "Progressive Photon Mapping"; Knaus and Zwicker 2011, radius.py]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.film import GradientFilm
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.streams import sample_streams
+from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.bdpt.vertex import RADIANCE, context
+from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.photons.grid import Grid
+from data_gen.samplers.photons.radius import pixel_width, shrunk
+from data_gen.samplers.photons.trace import MAP_BYTES, trace
+from ngpt.errors import NgptError
+
+# Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
+NORMAL_COSINE = 0.7
+# Of a camera sample and its features, beside the maps
+CAMERA_BYTES = 256
+# The streams of light paths are made from random numbers of the camera's samples and this.
+_LIGHT_PATHS = 0x9807
+
+
+class Gathering:
+    """The photons of a map, where they are gathered within ``radius``; ``paths`` light paths have brought them."""
+
+    def __init__(self, photons, radius: float, paths: int, max_depth: int):
+        self.photons = photons
+        self.grid = Grid(photons.p, photons.depth > 0, radius)
+        # Not within the loops that call light().
+        self.radius2 = dr.opaque(mi.Float, radius**2)
+        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
+        self.max_depth = dr.opaque(mi.UInt32, max_depth)
+
+    def light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """L(x) at the vertex ``si``, behind ``depth`` edges, of paths that are not too long."""
+        photons, longest = self.photons, self.max_depth - depth
+
+        def one(i, near):
+            j = dr.gather(mi.UInt32, self.grid.index, i, near)
+            n, d = dr.gather(mi.Normal3f, photons.n, j, near), dr.gather(mi.Vector3f, photons.d, j, near)
+            near = near & (dr.dot(n, si.n) > NORMAL_COSINE) & (dr.gather(mi.UInt32, photons.depth, j, near) <= longest)
+            f = bsdf.eval(context(RADIANCE), si, si.to_local(-d), near)
+            # f has a cosine; the photons lie as densely as the geometric one is large.
+            C = f * dr.gather(mi.Spectrum, photons.β, j, near) / dr.abs(dr.dot(n, d))
+            return dr.select(near & dr.isfinite(dr.sum(C)), C, 0)
+
+        zero = dr.zeros(mi.Spectrum, dr.width(depth))
+        return self.K * self.grid.gather(si.p, self.radius2, active, one, zero)
+
+
+@dataclass
+class Passes:
+    """The passes of a render, and the memory that one takes."""
+
+    integrator: PPM
+    scene: mi.Scene
+    lights: LightEnds
+    materials: Materials
+    width: float  # of a pixel
+
+    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
+        self.integrator.sample_pass(self.scene, self.lights, self.materials, self.width, camera, film)
+
+    @property
+    def lane_bytes(self) -> int:
+        """Of a camera sample, with all that its light paths may leave in a map."""
+        return CAMERA_BYTES + self.integrator.photons * MAP_BYTES
+
+    def instead(self, lane_bytes: int) -> str:
+        """What else than a smaller image would fit into so many bytes for each camera sample."""
+        fits = (lane_bytes - CAMERA_BYTES) // MAP_BYTES
+        return f", or no more than --option photons={fits}" if fits > 0 else ""
+
+
+class PPM(GradientIntegrator):
+    """Progressive photon mapping on surfaces; no gradients.
+
+    Plugin ``ppm``. Parameters, the first three as for Mitsuba's ``path``:
+
+    ``max_depth``            default -1: no limit
+    ``rr_depth``             5
+    ``hide_emitters``        false
+    ``radius``               3, of the first pass, in pixels where the camera sees something (the median)
+    ``photons``              1, light paths of a pass for each pixel
+    ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
+
+    Biased, and consistent: the mean over passes converges to the image of ``path``, light that ``path`` cannot find
+    included. Passes differ: the first of one render is not one more of another.
+
+    Not handled: media, polarised and spectral variants, emitters other than areas, points, spots and those infinitely
+    far away. Rendering raises NgptError for them.
+    """
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        max_depth = props.get("max_depth", -1)
+        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
+        self.rr_depth = props.get("rr_depth", 5)
+        self.radius, self.photons = float(props.get("radius", 3.0)), int(props.get("photons", 1))
+        self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+        if not 0 < self.radius < float("inf"):
+            raise NgptError(f"ppm: a radius of {self.radius:g} pixels; use one above 0")
+        if not 1 <= self.photons <= 1 << 16:
+            raise NgptError(f"ppm: {self.photons} photons for each pixel are out of range; use 1 .. {1 << 16}")
+
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene)
+        lights, materials = LightEnds(scene, "ppm"), Materials(scene, self.threshold)
+        return Passes(self, scene, lights, materials, pixel_width(scene))
+
+    def sample_pass(self, scene, lights, materials, width: float, camera: CameraSamples, film: GradientFilm) -> None:
+        """One photon map, and one camera path for each camera sample, of which a pixel has one."""
+        ray, importance, _ = camera.rays()
+        random = camera.random.clone()
+        keys = random.next_key(), random.next_key()
+        radius = self.radius * width * shrunk(camera.first)
+        values = features(scene, camera.sensor, camera.random.clone(), ray)
+        L, Le = self.camera_path(scene, materials, random.clone(), ray, importance)
+        values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
+        dr.eval(values)
+        random.schedule_state()
+        if lights.emitters is not None and self.max_depth > 1:
+            for photons in self.photon_maps(scene, lights, materials, keys):
+                near = Gathering(photons, radius, self.photons * dr.width(random.random.state), self.max_depth)
+                L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, near.light)
+                values["primal"] += to_rgb(L, ray.wavelengths)
+                dr.eval(values["primal"])
+        film.put_all(values)
+
+    def photon_maps(self, scene, lights, materials, keys):
+        """The maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
+        n = dr.width(keys[0]) * self.photons
+        lane = dr.arange(mi.UInt32, n)
+        sample = lane // dr.opaque(mi.UInt32, self.photons)
+        key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
+        random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
+        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth)[1]
+
+    @dr.syntax
+    def camera_path(self, scene, materials, random, ray, importance, scattered=None):
+        """L of camera paths where light is ``scattered``, or that of emission met if it is None; and Le, seen directly.
+
+        ``scattered`` is called with (vertex, its material, depth, where).
+        """
+        ray = mi.Ray3f(ray)
+        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
+        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+        sky_seen = mi.Bool(not self.hide_emitters)
+        shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
+        Le = importance * si.emitter(scene).eval(si, shown)
+        L = dr.zeros(mi.Spectrum, dr.width(ray))
+        β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+        active = si.is_valid() & (depth < self.max_depth)
+        while dr.hint(active, label="camera path"):
+            bsdf = si.bsdf()
+            receives = active & materials.connectable(bsdf)
+            if dr.hint(scattered is not None, mode="scalar"):
+                L += β * scattered(si, bsdf, depth, receives)
+            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+            sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
+            kind = event_kind(sample.sampled_type)
+            found = active & (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
+            sky_seen |= found & (kind != NULL)
+            η = dr.select(found, η * sample.eta, η)
+            β *= f_p
+            # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
+            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
+            active = found & (dr.max(β) > 0) & (u_survival < survival)
+            β /= survival
+            depth += 1
+            si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
+            if dr.hint(scattered is None, mode="scalar"):
+                met = active & (si.is_valid() | sky_seen)
+                L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
+            active &= si.is_valid() & (depth < self.max_depth)
+        return L, Le
+
+
+def refuse(scene, sampler: str = "ppm") -> None:
+    """Raises NgptError, in the name of the ``sampler``, for variants in which photons cannot be shared."""
+    for refused, what in (
+        (mi.is_polarized, "polarised light"),
+        (mi.is_spectral, "spectra, since wavelengths of photons and camera paths differ"),
+    ):
+        if refused:
+            raise NgptError(
+                f"sampler '{sampler}' does not follow {what} (variant '{mi.variant()}'); "
+                f"use variant '{mi.variant().split('_')[0]}_ad_rgb', or sampler 'gpt-basic'"
+            )
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``ppm``, with the parameters of the scene's own ``path``."""
+    return like_path(scene, "ppm", **options).prepare(scene)
+
+
+mi.register_integrator("ppm", lambda props: PPM(props))

@@ -1,0 +1,42 @@
+"""How far photons are gathered from: in pixels at first, and less and less.
+
+Pass i gathers within r_i, with r_(i+1)² = r_i² (i + α) / (i + 1). So r² falls like i^(α - 1): slowly enough that the
+noise of the mean over passes goes to zero like i^-α, and its bias like i^(α - 1). Every pass is on its own, no point
+keeps statistics (Knaus and Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15).
+"""
+
+from __future__ import annotations
+
+import math
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+
+ALPHA = 2 / 3
+
+
+def shrunk(i: int) -> float:
+    """r_i / r_0, i from 0."""
+    # The product of (k + α) / (k + 1) over k = 1 .. i, by the Gamma function
+    log_ratio = math.lgamma(i + 1 + ALPHA) - math.lgamma(1 + ALPHA) - math.lgamma(i + 2)
+    return math.exp(log_ratio / 2)
+
+
+def pixel_width(scene: mi.Scene) -> float:
+    """How wide a pixel is where the camera sees something, in world units: the median over the image.
+
+    Where it sees nothing, a thousandth of the scene's diagonal.
+    """
+    camera = CameraSamples(scene.sensors()[0], 0, 1)
+    ray, _, _ = camera.rays()
+    depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
+    aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * depth)
+    dr.eval(depth, aside)
+    seen = np.array(depth) > 0
+    box = scene.bbox()
+    wide = np.median(np.array(aside)[seen]) if seen.any() else 1e-3 * np.linalg.norm(np.array(box.extents()))
+    return float(wide)
