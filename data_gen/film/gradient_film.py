@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film.moments import Moments, accumulate, no_moments, one_more
+from data_gen.film.moments import Moments, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
@@ -38,6 +38,9 @@ class GradientFilm:
     Samples that are not finite get zero weight: they are left out of the mean and counted. Which sample is added to
     which sum, and in what order, depends on its number alone: the same samples give the same bits, whatever the passes.
 
+    A pass may hold samples of ``some`` pixels alone. Then pixels have samples in different numbers, and so have the two
+    ends of a pair of pixels: each direction of a difference is a mean over the base paths of its own end.
+
     Variances are over samples, which are taken for independent. Where those of a pass are not, because they share
     photons, reservoirs or the state of a chain, or because lanes splat onto pixels of others, the film is made with
     ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over batches.
@@ -47,8 +50,11 @@ class GradientFilm:
         self.width, self.height, self.batches = width, height, batches
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
-        self.samples = 0  # per pixel
+        self.samples = 0  # per pixel; of those that were in all passes alone
         self.blocks = 0  # of samples, each of which goes to one strand
+        # The same of each pixel, where they differ
+        self.counts: np.ndarray | None = None
+        self._blocks_each: np.ndarray | None = None
         # Dr.Jit gives each array the next power of two of bytes.
         bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0)
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
@@ -89,11 +95,12 @@ class GradientFilm:
             self._splats[name] = Splats(self.pixels, channels)
         return self._splats[name]
 
-    def end_pass(self, block: int | None = None) -> None:
+    def end_pass(self, block: int | None = None, some: np.ndarray | None = None) -> None:
         """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
 
         ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side. Of a film with
-        ``batches`` it is all samples of the pass, and must be given where there are splats alone.
+        ``batches`` it is all samples of the pass, and must be given where there are splats alone. ``some`` are the
+        pixels of the pass, each once, where it is not all of them; a film with ``batches`` takes none.
         """
         if not self._pass and not self._splats:
             return
@@ -102,24 +109,47 @@ class GradientFilm:
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
         dr.eval(values)
         lanes = dr.width(values) if values else self.pixels * (block or 0)
-        spp = lanes // self.pixels
+        pixels = self.pixels if some is None else len(some)
+        spp = lanes // pixels
         block = block or spp
         if self.batches:
+            if some is not None:
+                raise ValueError("samples that depend on each other are of all pixels")
             self._add_batch(values, splats, spp)
         else:
             # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
-            pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
-            strand, pixel = pixel // self.pixels, pixel % self.pixels
-            behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
-            first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
+            pixel = dr.arange(mi.UInt32, pixels * self.strands)
+            strand, pixel = pixel // pixels, pixel % pixels
+            if some is None and self.counts is None:
+                behind, place = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands), None
+            else:
+                some = np.arange(self.pixels) if some is None else some
+                done = mi.UInt32(self._each()[1][some] % self.strands)
+                behind = self.strands - dr.gather(mi.UInt32, done, pixel)
+                place = strand * self.pixels + dr.gather(mi.UInt32, mi.UInt32(some), pixel)
+                dr.eval(place)
+            first = ((strand + behind) % self.strands * pixels + pixel) * dr.opaque(mi.UInt32, block)
             dr.eval(first)
-            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
+            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * pixels * block)))
             for name, (components, active) in values.items():
-                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, *where)
+                old = self._moments(name, len(components))
+                moments = accumulate(old if place is None else taken(old, place), components, active, *where)
                 # One by one: the old moments and the new ones are in memory together.
-                dr.eval(self.moments[name])
-        self.samples += spp
-        self.blocks += spp // block
+                dr.eval(moments)
+                self.moments[name] = moments if place is None else put_back(old, moments, place)
+        if some is None:
+            self.samples += spp
+            self.blocks += spp // block
+        else:
+            self.counts, self._blocks_each = self._each()
+            self.counts[some] += spp
+            self._blocks_each[some] += spp // block
+
+    def _each(self) -> tuple[np.ndarray, np.ndarray]:
+        """The samples and blocks of each pixel so far."""
+        if self.counts is None or self._blocks_each is None:
+            return np.full(self.pixels, self.samples, np.int64), np.full(self.pixels, self.blocks, np.int64)
+        return self.counts, self._blocks_each
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
@@ -142,6 +172,11 @@ class GradientFilm:
             dr.eval(moments)
             self.moments[name] = moments
 
+    @property
+    def samples_each(self) -> np.ndarray:
+        """Samples of each pixel, (pixels) int64, those that were not finite included."""
+        return self._each()[0].copy()
+
     def _moments(self, name: str, channels: int) -> Moments:
         """The statistics so far of what is put under a name."""
         width = self.pixels * self.strands
@@ -156,8 +191,8 @@ class GradientFilm:
     def develop(self) -> dict[str, np.ndarray]:
         """The layers, (H, W, C) float32: means of all that was put, dx, dy of the shifts, and their variances.
 
-        Variances are of the pixel mean and left out while a pixel has a single sample. A pixel that lost all its
-        samples is NaN.
+        Variances are of the pixel mean and left out while no pixel has more than one sample. A pixel that lost all its
+        samples is NaN. The layer ``samples`` is there where pixels differ in them.
         """
         self.end_pass()
         layers = {}
@@ -175,6 +210,8 @@ class GradientFilm:
                 layers[layer], variances[f"{layer}_var"] = self._gradient(layer)
         if np.max(count) > 1:
             layers |= variances
+        if self.counts is not None and np.ptp(self.counts):
+            layers["samples"] = self._image(self.counts)
         return {name: np.ascontiguousarray(layer, np.float32) for name, layer in layers.items()}
 
     def diagnose(self) -> dict[str, np.ndarray]:
@@ -220,7 +257,8 @@ class GradientFilm:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
-        from the successor by the backward shift.
+        from the successor by the backward shift. Either is a part of the difference, and not an estimate of all of it:
+        where one end has more samples, its part has less variance, and not more weight.
         """
         x, y = SHIFTS[f"{layer}+"]
         behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]
