@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import drjit as dr
 import mitsuba as mi
@@ -21,8 +22,8 @@ BLOCK = PACKET
 class UnevenRender:
     """A render that is told, step by step, how many more blocks of samples each pixel gets.
 
-    What it is told makes one sequence of blocks: the first block of all pixels that get one, row by row, then the
-    second of all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
+    What it is told makes one sequence of blocks: the first of all pixels that get one, row by row, then the second of
+    all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
     wherever it is: the same samples in all give the same bits, whatever the passes and whatever ended it.
 
     ``sample`` must take independent samples; see ``data_gen.passes.render_passes()`` for it, for ``memory`` (MiB) and
@@ -57,24 +58,21 @@ class UnevenRender:
         Unless the ``whole`` is asked for, these are as many of them as there may be; ``ended`` says whether some were
         left out.
         """
-        for some, each in _levels(blocks):
-            done, total = 0, len(some) * each
-            while done < total:
-                n = min(self._at_once(whole), total - done)
-                if not whole and (n := min(n, self.blocks_left)) < 1:
-                    self.ended = True
-                    return
-                begin = done % len(some)
-                if begin or n < len(some):
-                    part, rounds = some[begin : begin + n], 1
-                else:
-                    part, rounds = some, n // len(some)
-                self._render(part, rounds)
-                done += len(part) * rounds
-                self.report()
-                if self.stop() and not whole:
-                    self.ended = True
-                    return
+        waiting, level = np.zeros(0, np.uint32), 0
+        while True:
+            n = self._at_once(whole)
+            while len(waiting) < n and level < blocks.max():
+                waiting = np.append(waiting, np.flatnonzero(blocks > level).astype(np.uint32))
+                level += 1
+            if not len(waiting):
+                return
+            n = min(n, len(waiting)) if whole else min(n, len(waiting), self.blocks_left)
+            if n < 1 or (self.stop() and not whole):
+                self.ended = True
+                return
+            self._render(np.sort(waiting[:n]))
+            waiting = waiting[n:]
+            self.report()
 
     def _at_once(self, whole: bool) -> int:
         """Blocks of the next pass; 0 where there is no time for one."""
@@ -83,24 +81,19 @@ class UnevenRender:
         n = max(1, min(self.at_once, int(passes.PASS_SECONDS / self.expected)))
         if whole or self.end is None:
             return n
-        return min(n, int(max(self.end - time.perf_counter(), 0) / self.expected))
+        # No more than half of the time left, by the fastest pass so far: others may take longer.
+        return min(n, int(max(self.end - time.perf_counter(), 0) / 2 / self.expected))
 
-    def _render(self, some: np.ndarray, rounds: int) -> None:
+    def _render(self, some: np.ndarray) -> None:
+        """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
         start = time.perf_counter()
-        first = mi.UInt32(self.film.samples_each[some])
+        pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
+        within = np.arange(len(some)) - np.repeat(starts, blocks)
+        first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
         with recording():
-            camera = CameraSamples(self.sensor, self.seed, rounds * BLOCK, first, BLOCK, mi.UInt32(some))
-            self.sample(camera, self.film)
+            self.sample(CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some)), self.film)
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()
-        self.blocks_left -= len(some) * rounds
-        # Small passes take longer per block than large ones; more than the time left is worse than some of it unused.
-        self.expected = (time.perf_counter() - start) / (len(some) * rounds)
-
-
-def _levels(blocks: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
-    """(pixels, number of further blocks of each), in the order of the sequence."""
-    before = 0
-    for level in np.unique(blocks[blocks > 0]):
-        yield np.flatnonzero(blocks >= level), int(level) - before
-        before = int(level)
+        self.blocks_left -= len(some)
+        # Where a pass is small, or compiles a kernel, most of its time is not that of its blocks.
+        self.expected = min(self.expected or math.inf, (time.perf_counter() - start) / len(some))

@@ -37,6 +37,7 @@ data_gen.film data_gen.paths
 data_gen.passes
 data_gen.uneven
 data_gen.samplers
+data_gen.adaptive
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames

@@ -52,9 +52,9 @@ class GradientFilm:
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel; of those that were in all passes alone
         self.blocks = 0  # of samples, each of which goes to one strand
-        # The same of each pixel, where they differ
+        # The same of each pixel, where they may differ
         self.counts: np.ndarray | None = None
-        self._blocks_each: np.ndarray | None = None
+        self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
         bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0)
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
@@ -99,8 +99,8 @@ class GradientFilm:
         """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
 
         ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side. Of a film with
-        ``batches`` it is all samples of the pass, and must be given where there are splats alone. ``some`` are the
-        pixels of the pass, each once, where it is not all of them; a film with ``batches`` takes none.
+        ``batches`` it is all samples of the pass, and must be given where there are splats alone. ``some`` is the pixel
+        of each block, ascending, where the pass has not all pixels alike; all later passes then say theirs too.
         """
         if not self._pass and not self._splats:
             return
@@ -108,48 +108,58 @@ class GradientFilm:
         splats, self._splats = self._splats, {}
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
         dr.eval(values)
+        if some is not None:
+            self._add_some(values, block, some)
+            return
+        if self.counts is not None:
+            raise ValueError("pixels have samples in different numbers: say which pixels the blocks are of")
         lanes = dr.width(values) if values else self.pixels * (block or 0)
-        pixels = self.pixels if some is None else len(some)
-        spp = lanes // pixels
+        spp = lanes // self.pixels
         block = block or spp
         if self.batches:
-            if some is not None:
-                raise ValueError("samples that depend on each other are of all pixels")
             self._add_batch(values, splats, spp)
         else:
             # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
-            pixel = dr.arange(mi.UInt32, pixels * self.strands)
-            strand, pixel = pixel // pixels, pixel % pixels
-            if some is None and self.counts is None:
-                behind, place = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands), None
-            else:
-                some = np.arange(self.pixels) if some is None else some
-                done = mi.UInt32(self._each()[1][some] % self.strands)
-                behind = self.strands - dr.gather(mi.UInt32, done, pixel)
-                place = strand * self.pixels + dr.gather(mi.UInt32, mi.UInt32(some), pixel)
-                dr.eval(place)
-            first = ((strand + behind) % self.strands * pixels + pixel) * dr.opaque(mi.UInt32, block)
+            pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
+            strand, pixel = pixel // self.pixels, pixel % self.pixels
+            behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
+            first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
             dr.eval(first)
-            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * pixels * block)))
+            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
             for name, (components, active) in values.items():
-                old = self._moments(name, len(components))
-                moments = accumulate(old if place is None else taken(old, place), components, active, *where)
+                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, *where)
                 # One by one: the old moments and the new ones are in memory together.
-                dr.eval(moments)
-                self.moments[name] = moments if place is None else put_back(old, moments, place)
-        if some is None:
-            self.samples += spp
-            self.blocks += spp // block
-        else:
-            self.counts, self._blocks_each = self._each()
-            self.counts[some] += spp
-            self._blocks_each[some] += spp // block
+                dr.eval(self.moments[name])
+        self.samples += spp
+        self.blocks += spp // block
 
-    def _each(self) -> tuple[np.ndarray, np.ndarray]:
-        """The samples and blocks of each pixel so far."""
-        if self.counts is None or self._blocks_each is None:
-            return np.full(self.pixels, self.samples, np.int64), np.full(self.pixels, self.blocks, np.int64)
-        return self.counts, self._blocks_each
+    def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
+        """The samples of a pass whose blocks are those of ``some`` pixels."""
+        if self.batches or not block:
+            raise ValueError("passes of some pixels have blocks of independent samples")
+        if self.counts is None:
+            self.counts = np.full(self.pixels, self.samples, np.int64)
+            self._blocks_each = np.full(self.pixels, self.blocks, np.int64)
+        pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
+        job = dr.arange(mi.UInt32, len(pixels) * self.strands)
+        strand, i = job // len(pixels), job % len(pixels)
+
+        def of_job(numbers: np.ndarray) -> mi.UInt32:
+            return dr.gather(mi.UInt32, mi.UInt32(numbers), i)
+
+        # As in passes of all pixels, block b of a pixel goes to strand b mod strands.
+        behind = of_job(self.strands - self._blocks_each[pixels] % self.strands)
+        first = (of_job(starts) + (strand + behind) % self.strands) * dr.opaque(mi.UInt32, block)
+        end, place = of_job((starts + blocks) * block), strand * self.pixels + of_job(pixels)
+        dr.eval(first, end, place)
+        where = (first, end, *(dr.opaque(mi.UInt32, n) for n in (block, self.strands * block)))
+        for name, (components, active) in values.items():
+            old = self._moments(name, len(components))
+            new = accumulate(taken(old, place), components, active, *where)
+            dr.eval(new)
+            self.moments[name] = put_back(old, new, place)
+        self.counts[pixels] += blocks * block
+        self._blocks_each[pixels] += blocks
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
@@ -175,7 +185,7 @@ class GradientFilm:
     @property
     def samples_each(self) -> np.ndarray:
         """Samples of each pixel, (pixels) int64, those that were not finite included."""
-        return self._each()[0].copy()
+        return np.full(self.pixels, self.samples, np.int64) if self.counts is None else self.counts.copy()
 
     def _moments(self, name: str, channels: int) -> Moments:
         """The statistics so far of what is put under a name."""

@@ -19,7 +19,7 @@ class CameraSamples:
     random numbers of the paths to come. Cloning it replays them, which is what correlates a path with its shifted
     copies.
 
-    ``some`` are the numbers of the pixels to sample, UInt32; ``first`` is then a UInt32 with a number for each of them.
+    ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """
 
     def __init__(
