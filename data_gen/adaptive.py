@@ -30,8 +30,9 @@ from data_gen.samplers import SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
+from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
-from ngpt.uncertainty import reconstruct_with_error
+from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
 
 # Least number of samples per pixel in the mean: that of the first step, everywhere, and as many to be shared out
 LEAST = 2 * BLOCK
@@ -145,10 +146,13 @@ def assess(film: GradientFilm, method: str) -> Assessment:
     """The expected error of what a method would make of the film as it is."""
     spp = int(film.samples_each.mean())
     stack = GradientStack(film.develop(), {"ngpt:spp": spp, "ngpt:normalSpace": "camera"})
-    result = reconstruct_with_error(stack, method)
-    assert result.error is not None
+    result = reconstruct(stack, method)
+    again = reconstruct(noisier(stack), method)
     light = uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
-    squares = np.nan_to_num(np.square(result.error.astype(np.float64)) / (np.square(light) + EPSILON), posinf=0.0)
+    unit = np.sqrt(np.square(light) + EPSILON)
+    # Relative before it is averaged over neighbours: that of a lamp's edge is no error of the dark beside it.
+    changed = change(np.nan_to_num(result.image) / unit, np.nan_to_num(again.image) / unit)
+    squares = np.square(FACTORS.get(result.method, FACTOR) * changed)
     error = math.sqrt(trimmed_mean(squares, squares, _TRIM))
     return Assessment(np.sqrt(squares.mean(axis=-1)).ravel(), error, result.method)
 

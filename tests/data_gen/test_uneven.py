@@ -61,7 +61,7 @@ def test_passes_are_not_seen(renderer, rng, monkeypatch):
     scene, blocks = load(renderer, "glossy", SIZE), uneven(rng)
     whole = render(renderer, scene, blocks)
     monkeypatch.setattr(passes, "FIRST_LANES", 16 * 37)
-    monkeypatch.setattr(passes, "PASS_SECONDS", 0.02)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 0.2)
     same(whole, render(renderer, scene, blocks))
 
 
@@ -69,9 +69,10 @@ def test_what_ends_it_is_not_seen(renderer, rng, monkeypatch):
     from data_gen import passes
 
     scene, blocks = load(renderer, "diffuse", SIZE), uneven(rng)
-    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 40)
+    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 90)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)  # one block in each pass after the first
     calls = []
-    stopped = render(renderer, scene, blocks, stop=lambda: len(calls) > 3, report=lambda: calls.append(0))
+    stopped = render(renderer, scene, blocks, stop=lambda: len(calls) > 12, report=lambda: calls.append(0))
     done = stopped["samples"].sum()
     assert 16 * PIXELS < done < 16 * (PIXELS + blocks.sum())
     monkeypatch.undo()
