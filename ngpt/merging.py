@@ -51,7 +51,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     spp = [_samples(stack) for stack in stacks]
     _check(stacks, spp)
     counts = [_counts(stack, n) for stack, n in zip(stacks, spp, strict=True)]
-    total = sum(counts)
+    total = np.sum(counts, axis=0)
     layers = {}
     for name in stacks[0].names:
         if name not in (*VARIANCES.values(), "samples"):
