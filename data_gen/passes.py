@@ -24,14 +24,14 @@ DEFAULT_MEMORY = 6144
 # Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more.
 LANE_BYTES = 256
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
-_PACKET = 16
+PACKET = 16
 _BLOCK_LANES = 1 << 21
 # Lanes are numbered with 32 bits.
 _MOST_LANES = 1 << 30
 # Lanes of the first pass: enough to render small images at one go, and to judge how long the next may be.
-_FIRST_LANES = 1 << 20
+FIRST_LANES = 1 << 20
 # A pass this long makes little of the time that it takes to start one, and reacts soon enough.
-_PASS_SECONDS = 2.0
+PASS_SECONDS = 2.0
 
 
 def _nothing(left: int) -> str:
@@ -80,7 +80,7 @@ def render_passes(
             limit = math.ceil(seconds)
             progress(limit if finished else min(limit - 1, int(now - start)), limit)
 
-    blocks = _FIRST_LANES // (film.pixels * block) if seconds is None else 1
+    blocks = FIRST_LANES // (film.pixels * block) if seconds is None else 1
     report()
     while film.samples < total:
         left = total - film.samples
@@ -98,7 +98,7 @@ def render_passes(
         report(finished)
         if finished:
             break
-        blocks = int(min(time_left, _PASS_SECONDS) / each)
+        blocks = int(min(time_left, PASS_SECONDS) / each)
     return film
 
 
@@ -145,7 +145,7 @@ def block_of_samples(pixels: int) -> int:
     The results of a ray depend, in the last bits, on the rays traced with it. So which they are must not depend on how
     a render is split into passes, and passes consist of whole blocks.
     """
-    block = _PACKET
+    block = PACKET
     while block > 1 and pixels * block > _BLOCK_LANES:
         block //= 2
     return block
@@ -163,10 +163,23 @@ def blocks_within(
     Raises NgptError where not even one fits. ``instead`` is asked what else would, with so many bytes left for a lane.
     """
     lanes = film.pixels * block
+    blocks = lanes_within(memory, film, lanes, lane_bytes, instead) // lanes
+    # A block that ends amid a packet would push the next one to another place in its own.
+    return blocks if lanes % PACKET == 0 else 1
+
+
+def lanes_within(
+    memory: int,
+    film: GradientFilm,
+    lanes: int,
+    lane_bytes: int = LANE_BYTES,
+    instead: Callable[[int], str] = _nothing,
+) -> int:
+    """How many lanes a pass may have; raises NgptError where it is less than ``lanes``, see ``blocks_within``."""
     # Dr.Jit gives each array the next power of two of bytes.
     available = min((memory * 2**20 - film.bytes) // lane_bytes, _MOST_LANES)
-    blocks = (1 << (available.bit_length() - 1)) // lanes if available > 0 else 0
-    if blocks < 1:
+    most = 1 << (available.bit_length() - 1) if available > 0 else 0
+    if most < lanes:
         width = 1 << (lanes - 1).bit_length()
         needed = -(-(film.bytes + lane_bytes * width) // 2**20)
         other = instead((memory * 2**20 - film.bytes) // width)
@@ -174,5 +187,4 @@ def blocks_within(
             f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {memory} MiB are "
             f"allowed; pass --memory {needed}, or render a smaller image{other}"
         )
-    # A block that ends amid a packet would push the next one to another place in its own.
-    return blocks if lanes % _PACKET == 0 else 1
+    return most

@@ -8,6 +8,7 @@ from typing import Any
 
 import mitsuba as mi
 
+from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.scenes.facts import scene_facts
@@ -29,6 +30,7 @@ def render_stack(
     stop: Callable[[], bool] = lambda: False,
     diagnostics: bool = False,
     with_features: bool = True,
+    adaptive: Adaptive | None = None,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -41,10 +43,13 @@ def render_stack(
     alone can do without, it holds the primal alone. The scene's reconstruction filter is not used: the pixels of a
     stack, and so their differences, are box-filtered.
 
+    With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
+    ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
+
     The same seed and number of samples give the same bits, however they came about. Raises NgptError for options that
     do not exist or make no sense, and for a scene that the sampler cannot render.
     """
-    check_options(spp, seed, sampler, seconds, memory)
+    check_options(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(scene)
     if sampler == "auto":
         sampler, _ = choose(facts)
@@ -60,36 +65,35 @@ def render_stack(
         if option not in entry.options:
             have = ", ".join(entry.options) or "none"
             raise NgptError(f"sampler '{sampler}' has no option '{option}'; it has: {have}")
+    if adaptive is not None:
+        check_adaptive(adaptive, entry, options, spp)
     start = time.perf_counter()
-    film = render_passes(
-        entry.make(scene, **options),
-        scene.sensors()[0],
-        seed,
-        spp,
-        progress,
-        seconds,
-        memory,
-        stop,
-        entry.lane_bytes,
-        entry.batch,
-    )
+    sample, sensor, chosen = entry.make(scene, **options), scene.sensors()[0], {}
+    if adaptive is None:
+        film = render_passes(sample, sensor, seed, spp, progress, seconds, memory, stop, entry.lane_bytes, entry.batch)
+    else:
+        film, chosen = render_adaptive(
+            sample, sensor, seed, adaptive, spp, progress, seconds, memory, stop, entry.lane_bytes
+        )
     layers = film.develop()
     attributes = {
-        "ngpt:spp": film.samples,
+        "ngpt:spp": film.samples if adaptive is None else round(float(film.samples_each.mean())),
         "ngpt:seed": str(seed),
         "ngpt:sampler": sampler,
         "ngpt:seconds": time.perf_counter() - start,
         "ngpt:normalSpace": "camera",
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
-    }
+    } | chosen
     stack = GradientStack(layers, attributes=attributes)
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 
-def check_options(spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int) -> None:
-    """Raises NgptError for what no scene could be rendered with."""
-    if spp is None and seconds is None:
+def check_options(
+    spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int, ends: bool = False
+) -> None:
+    """Raises NgptError for what no scene could be rendered with; ``ends``: something else ends the render."""
+    if spp is None and seconds is None and not ends:
         raise NgptError("neither a number of samples per pixel nor a time to render for is given")
     if spp is not None and not 1 <= spp < 2**31:
         raise NgptError(f"{spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")

@@ -22,7 +22,7 @@ from ngpt.stack import GradientStack
 T = TypeVar("T")
 
 # What goes beside the image; alpha is a channel of it, and no method looks at other frames.
-_BESIDE = tuple(name for name in LAYERS if name not in ("primal", "alpha", "error", "motion"))
+_BESIDE = tuple(name for name in LAYERS if name not in ("primal", "alpha", "error", "motion", "samples"))
 # Of those, what Mitsuba's denoiser does not know.
 _FURTHER = tuple(name for name in _BESIDE if name not in ("albedo", "normal"))
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).

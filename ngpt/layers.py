@@ -38,6 +38,7 @@ LAYERS: dict[str, Layer] = {
         Layer("caustic_var", RGB, True, "sample variance of the pixel mean of caustic"),
         Layer("dx_var", RGB, True, "sample variance of the pixel mean of dx"),
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
+        Layer("samples", ("N",), True, "base paths of the pixel, where pixels differ in them"),
         Layer("motion", XY, True, "pixels from here to where this point was one frame before: x right, y down, or NaN"),
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),
         Layer("error", RGB, True, "in results: estimated standard error of the reconstruction"),

@@ -6,6 +6,9 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
     variance   Σ [n_i (n_i - 1) v_i + n_i (m_i - m)²] / (N (N - 1))
 
 [Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1]
+
+Its expectation is the variance of m for any weights n_i that no sample has a say in, whatever the v_i: so it holds for
+differences too, whose two directions may have samples in different numbers.
 """
 
 from collections.abc import Sequence
@@ -14,6 +17,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
+from ngpt.layers import DIFFERENCES
 from ngpt.stack import GradientStack
 
 # Layers with a variance, and the layers that hold it.
@@ -25,11 +29,14 @@ DIAGNOSTICS = "diagnostics."
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds.
 
-    Means are weighted by ``ngpt:spp``, and variances of the mean come from the pooled sums, so merged stacks of n1 and
-    n2 samples equal the stack of n1 + n2 up to the rounding of float32. There are two exceptions. Variances of dx and
-    dy are those of two independent directions, which a stack no longer tells apart: their merged value has the same
-    expectation, and differs by about 1 / N of itself. And samples that were not finite are missing in their pixel
-    alone, which then counts with the full weight of its stack; a pixel that lost all of them is NaN and counts nothing.
+    Means are weighted by ``ngpt:spp``, or by the layer ``samples`` where a stack has it: one of differences by the
+    harmonic mean of the samples of both its pixels, as their variances would be. The merged ``samples`` are sums, and
+    are left out where all pixels have the same number. Variances of the mean come from the pooled sums, so merged
+    stacks of n1 and n2 samples equal the stack of n1 + n2 up to the rounding of float32. There are two exceptions.
+    Variances of dx and dy are those of two independent directions, which a stack no longer tells apart: their merged
+    value has the same expectation, and differs by about 1 / N of itself. And samples that were not finite are missing
+    in their pixel alone, which then counts with the full weight of its stack; a pixel that lost all of them is NaN and
+    counts nothing.
 
     A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
     of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
@@ -41,19 +48,23 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
-    counts = [_samples(stack) for stack in stacks]
-    _check(stacks, counts)
-    total = sum(counts)
+    spp = [_samples(stack) for stack in stacks]
+    _check(stacks, spp)
+    counts = [_counts(stack, n) for stack, n in zip(stacks, spp, strict=True)]
+    total = np.sum(counts, axis=0)
     layers = {}
     for name in stacks[0].names:
-        if name not in VARIANCES.values():
-            layers[name] = _mean([stack[name] for stack in stacks], counts)
+        if name not in (*VARIANCES.values(), "samples"):
+            layers[name] = _mean([stack[name] for stack in stacks], _of_layer(counts, name))
     for name, variance in VARIANCES.items():
-        known = all(variance in stack or n == 1 for stack, n in zip(stacks, counts, strict=True))
+        known = all(variance in stack or n == 1 for stack, n in zip(stacks, spp, strict=True))
         if name in layers and known:
-            layers[variance] = _variance([_varies(stack, name) for stack in stacks], stacks, counts, variance)
+            means = [_varies(stack, name) for stack in stacks]
+            layers[variance] = _variance(means, stacks, _of_layer(counts, name), variance)
+    if np.ptp(total):
+        layers["samples"] = total
     attributes = dict(stacks[0].attributes) | {
-        "ngpt:spp": total,
+        "ngpt:spp": round(float(total.mean())),
         "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
     }
     for name in ("ngpt:seconds", "ngpt:discarded"):
@@ -66,9 +77,33 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     return with_channels(merged, {name: _mean([channels[name] for channels in further], counts) for name in further[0]})
 
 
-def _mean(layers: Sequence[np.ndarray], counts: Sequence[int]) -> np.ndarray:
+def _counts(stack: GradientStack, spp: int) -> np.ndarray:
+    """Samples of each pixel, (H, W, 1) double precision."""
+    if "samples" in stack:
+        return stack["samples"].astype(np.float64)
+    return np.full((stack.height, stack.width, 1), float(spp))
+
+
+def _of_layer(counts: Sequence[np.ndarray], name: str) -> Sequence[np.ndarray]:
+    """What the mean of a layer is weighted by: of a difference the harmonic mean of both its pixels' counts."""
+    if name not in DIFFERENCES:
+        return counts
+    x, y, _ = DIFFERENCES[name]
+    weights = [n.copy() for n in counts]
+    for weight, n in zip(weights, counts, strict=True):
+        here, there = n[: n.shape[0] - y, : n.shape[1] - x], n[y:, x:]
+        weight[: n.shape[0] - y, : n.shape[1] - x] = 2 * here * there / np.maximum(here + there, 1)
+    return weights
+
+
+def _like(counts: np.ndarray, layer: np.ndarray) -> np.ndarray:
+    """Counts (H, W, 1) for a layer (H, W, C), or a channel (H, W)."""
+    return counts if layer.ndim == 3 else counts[..., 0]
+
+
+def _mean(layers: Sequence[np.ndarray], counts: Sequence[np.ndarray]) -> np.ndarray:
     """Mean weighted by ``counts``, over the values that are not NaN; in double precision."""
-    weights = [n * ~np.isnan(layer) for layer, n in zip(layers, counts, strict=True)]
+    weights = [_like(n, layer) * ~np.isnan(layer) for layer, n in zip(layers, counts, strict=True)]
     # Products of infinite values and zero weights are left out, not added.
     total = sum(np.where(w > 0, w * layer.astype(np.float64), 0) for w, layer in zip(weights, layers, strict=True))
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -85,14 +120,14 @@ def _varies(stack: GradientStack, name: str) -> np.ndarray:
 
 
 def _variance(
-    means: Sequence[np.ndarray], stacks: Sequence[GradientStack], counts: Sequence[int], variance: str
+    means: Sequence[np.ndarray], stacks: Sequence[GradientStack], counts: Sequence[np.ndarray], variance: str
 ) -> np.ndarray:
     mean = _mean(means, counts)
     squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
         for values, stack, n in zip(means, stacks, counts, strict=True):
             there = ~np.isnan(values)
-            within = n * (n - 1) * stack[variance].astype(np.float64) if n > 1 else 0.0
+            within = np.where(n > 1, n * (n - 1) * stack[variance], 0) if variance in stack else 0.0
             squares += np.where(there, within + n * (values - mean) ** 2, 0)
             total += n * there
         return np.where(total > 1, squares / (total * (total - 1)), np.nan)
@@ -143,7 +178,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
 
 def _means(stack: GradientStack) -> set[str]:
     """What is averaged over samples: layers and diagnostics."""
-    return {*stack.names, *pass_through(stack)} - set(VARIANCES.values())
+    return {*stack.names, *pass_through(stack)} - {*VARIANCES.values(), "samples"}
 
 
 def _samples(stack: GradientStack) -> int:

@@ -169,3 +169,50 @@ def test_command(rng, tmp_path, capsys):
     assert "--force" in capsys.readouterr().err
     assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 2
     assert "seed 0" in capsys.readouterr().err
+
+
+def test_pixels_with_samples_in_different_numbers(rng):
+    """Each pixel as if it were merged alone; a film of all samples has the same primal."""
+    samples = 5 + rng.normal(size=(40, *SHAPE))
+    counts = rng.integers(2, 9, size=(3, *SHAPE[:2], 1))
+    stacks, begin = [], np.zeros((*SHAPE[:2], 1), int)
+    number = np.arange(40)[:, None, None, None]
+    for seed, n in enumerate(counts):
+        of_part = (number >= begin) & (number < begin + n)
+        mean = np.where(of_part, samples, 0).sum(axis=0) / n
+        variance = np.where(of_part, (samples - mean) ** 2, 0).sum(axis=0) / (n - 1) / n
+        known = {"ngpt:spp": 5, "ngpt:seed": str(seed), "ngpt:sampler": "gpt"}
+        layers = {"primal": mean, "primal_var": variance, "samples": n.astype(np.float32)}
+        stacks.append(GradientStack.from_arrays(attributes=known, **layers))
+        begin = begin + n
+    merged, total = merge(stacks), counts.sum(axis=0)
+    of_all = number < total
+    mean = np.where(of_all, samples, 0).sum(axis=0) / total
+    assert np.array_equal(merged["samples"], total)
+    assert merged.attributes["ngpt:spp"] == round(total.mean())
+    assert np.allclose(merged["primal"], mean, rtol=1e-5)
+    expected = np.where(of_all, (samples - mean) ** 2, 0).sum(axis=0) / (total - 1) / total
+    assert np.allclose(merged["primal_var"], expected, rtol=1e-4)
+
+
+def test_merged_differences_of_uneven_counts_have_the_right_variance(rng):
+    """Directions with other variances and counts in each stack: the merged variance is that of the merged mean."""
+    deviation, runs = np.array([1.0, 3.0]), 4000
+    counts = [np.array([4, 32]), np.array([16, 16]), np.array([32, 2])]
+    means, variances = [], []
+    for _ in range(runs // 200):
+        stacks = []
+        for seed, n in enumerate(counts):
+            # 200 rows, each an experiment of its own, of pairs of pixels.
+            each = [deviation[i] * rng.normal(size=(200, n[i])) for i in range(2)]
+            dx, var = np.zeros((2, 200, 2, 3))
+            dx[:, 0] = ((each[0].mean(axis=1) - each[1].mean(axis=1)) / 2)[:, None]
+            var[:, 0] = (sum(e.var(axis=1, ddof=1) / e.shape[1] for e in each) / 4)[:, None]
+            known = {"ngpt:spp": 16, "ngpt:seed": str(seed), "ngpt:sampler": "gpt"}
+            layers = {"dx": dx, "dx_var": var, "samples": np.broadcast_to(n[:, None], (200, 2, 1)).astype(np.float32)}
+            stacks.append(GradientStack.from_arrays(attributes=known, primal=np.ones((200, 2, 3)), **layers))
+            stacks[-1].layers["primal_var"] = np.zeros((200, 2, 3), np.float32)
+        merged = merge(stacks)
+        means.append(merged["dx"][:, 0, 0])
+        variances.append(merged["dx_var"][:, 0, 0])
+    assert np.mean(variances) == pytest.approx(np.var(means), rel=0.08)

@@ -35,7 +35,9 @@ data_gen data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths
 data_gen.passes
+data_gen.uneven
 data_gen.samplers
+data_gen.adaptive
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames

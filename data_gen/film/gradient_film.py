@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film.moments import Moments, accumulate, no_moments, one_more
+from data_gen.film.moments import Moments, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
@@ -38,6 +38,9 @@ class GradientFilm:
     Samples that are not finite get zero weight: they are left out of the mean and counted. Which sample is added to
     which sum, and in what order, depends on its number alone: the same samples give the same bits, whatever the passes.
 
+    A pass may hold samples of ``some`` pixels alone. Then pixels have samples in different numbers, and so have the two
+    ends of a pair of pixels: each direction of a difference is a mean over the base paths of its own end.
+
     Variances are over samples, which are taken for independent. Where those of a pass are not, because they share
     photons, reservoirs or the state of a chain, or because lanes splat onto pixels of others, the film is made with
     ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over batches.
@@ -47,8 +50,11 @@ class GradientFilm:
         self.width, self.height, self.batches = width, height, batches
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
-        self.samples = 0  # per pixel
+        self.samples = 0  # per pixel; of those that were in all passes alone
         self.blocks = 0  # of samples, each of which goes to one strand
+        # The same of each pixel, where they may differ
+        self.counts: np.ndarray | None = None
+        self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
         bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0)
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
@@ -89,11 +95,12 @@ class GradientFilm:
             self._splats[name] = Splats(self.pixels, channels)
         return self._splats[name]
 
-    def end_pass(self, block: int | None = None) -> None:
+    def end_pass(self, block: int | None = None, some: np.ndarray | None = None) -> None:
         """Adds what was put to the statistics: all of it, so that a pass broken off before leaves no trace.
 
         ``block`` is that of ``CameraSamples``: the number of samples of a pixel that are side by side. Of a film with
-        ``batches`` it is all samples of the pass, and must be given where there are splats alone.
+        ``batches`` it is all samples of the pass, and must be given where there are splats alone. ``some`` is the pixel
+        of each block, ascending, where the pass has not all pixels alike; all later passes then say theirs too.
         """
         if not self._pass and not self._splats:
             return
@@ -101,6 +108,11 @@ class GradientFilm:
         splats, self._splats = self._splats, {}
         # Reading single lanes evaluates an array: without this, each would trace the paths again.
         dr.eval(values)
+        if some is not None:
+            self._add_some(values, block, some)
+            return
+        if self.counts is not None:
+            raise ValueError("pixels have samples in different numbers: say which pixels the blocks are of")
         lanes = dr.width(values) if values else self.pixels * (block or 0)
         spp = lanes // self.pixels
         block = block or spp
@@ -120,6 +132,34 @@ class GradientFilm:
                 dr.eval(self.moments[name])
         self.samples += spp
         self.blocks += spp // block
+
+    def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
+        """The samples of a pass whose blocks are those of ``some`` pixels."""
+        if self.batches or not block:
+            raise ValueError("passes of some pixels have blocks of independent samples")
+        if self.counts is None:
+            self.counts = np.full(self.pixels, self.samples, np.int64)
+            self._blocks_each = np.full(self.pixels, self.blocks, np.int64)
+        pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
+        job = dr.arange(mi.UInt32, len(pixels) * self.strands)
+        strand, i = job // len(pixels), job % len(pixels)
+
+        def of_job(numbers: np.ndarray) -> mi.UInt32:
+            return dr.gather(mi.UInt32, mi.UInt32(numbers), i)
+
+        # As in passes of all pixels, block b of a pixel goes to strand b mod strands.
+        behind = of_job(self.strands - self._blocks_each[pixels] % self.strands)
+        first = (of_job(starts) + (strand + behind) % self.strands) * dr.opaque(mi.UInt32, block)
+        end, place = of_job((starts + blocks) * block), strand * self.pixels + of_job(pixels)
+        dr.eval(first, end, place)
+        where = (first, end, *(dr.opaque(mi.UInt32, n) for n in (block, self.strands * block)))
+        for name, (components, active) in values.items():
+            old = self._moments(name, len(components))
+            new = accumulate(taken(old, place), components, active, *where)
+            dr.eval(new)
+            self.moments[name] = put_back(old, new, place)
+        self.counts[pixels] += blocks * block
+        self._blocks_each[pixels] += blocks
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
@@ -142,6 +182,11 @@ class GradientFilm:
             dr.eval(moments)
             self.moments[name] = moments
 
+    @property
+    def samples_each(self) -> np.ndarray:
+        """Samples of each pixel, (pixels) int64, those that were not finite included."""
+        return np.full(self.pixels, self.samples, np.int64) if self.counts is None else self.counts.copy()
+
     def _moments(self, name: str, channels: int) -> Moments:
         """The statistics so far of what is put under a name."""
         width = self.pixels * self.strands
@@ -156,8 +201,8 @@ class GradientFilm:
     def develop(self) -> dict[str, np.ndarray]:
         """The layers, (H, W, C) float32: means of all that was put, dx, dy of the shifts, and their variances.
 
-        Variances are of the pixel mean and left out while a pixel has a single sample. A pixel that lost all its
-        samples is NaN.
+        Variances are of the pixel mean and left out while no pixel has more than one sample. A pixel that lost all its
+        samples is NaN. The layer ``samples`` is there where pixels differ in them.
         """
         self.end_pass()
         layers = {}
@@ -175,6 +220,8 @@ class GradientFilm:
                 layers[layer], variances[f"{layer}_var"] = self._gradient(layer)
         if np.max(count) > 1:
             layers |= variances
+        if self.counts is not None and np.ptp(self.counts):
+            layers["samples"] = self._image(self.counts)
         return {name: np.ascontiguousarray(layer, np.float32) for name, layer in layers.items()}
 
     def diagnose(self) -> dict[str, np.ndarray]:
@@ -220,7 +267,8 @@ class GradientFilm:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
-        from the successor by the backward shift.
+        from the successor by the backward shift. Either is a part of the difference, and not an estimate of all of it:
+        where one end has more samples, its part has less variance, and not more weight.
         """
         x, y = SHIFTS[f"{layer}+"]
         behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]

@@ -56,3 +56,25 @@ def accumulate(moments: Moments, components: list, active, first, end, block, st
         return i + dr.select(last, stride - block + 1, 1), dr.select(last, 0, n + 1), one_more(old, x, exists)
 
     return dr.while_loop((first, mi.UInt32(0), moments), lambda i, *_: i < end, add, label="film")[2]
+
+
+def taken(moments: Moments, place: mi.UInt32) -> Moments:
+    """The statistics of the strands at each ``place``."""
+
+    def gather(values: list) -> list:
+        return [dr.gather(type(value), value, place) for value in values]
+
+    return Moments(*gather([moments.count, moments.lost]), gather(moments.mean), gather(moments.m2))
+
+
+def put_back(moments: Moments, some: Moments, place: mi.UInt32) -> Moments:
+    """``moments`` with the statistics of ``some`` strands, each at its own ``place``."""
+
+    def scatter(values: list, new: list) -> list:
+        for value, part in zip(values, new, strict=True):
+            dr.scatter(value, part, place)
+        dr.eval(values)
+        return values
+
+    counts = scatter([moments.count, moments.lost], [some.count, some.lost])
+    return Moments(*counts, scatter(moments.mean, some.mean), scatter(moments.m2, some.m2))

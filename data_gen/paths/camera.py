@@ -11,25 +11,40 @@ from data_gen.paths.streams import sample_streams
 
 
 class CameraSamples:
-    """``spp`` camera samples for every pixel of a sensor, from number ``first`` on.
+    """``spp`` camera samples for every pixel of a sensor, from number ``first`` on; or for some pixels.
 
     Lanes are ordered by blocks of ``block`` samples (default: one block of them all), within a block pixel by pixel,
     within a pixel by sample; ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
     whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row. ``random`` holds the
     random numbers of the paths to come. Cloning it replays them, which is what correlates a path with its shifted
     copies.
+
+    ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """
 
-    def __init__(self, sensor: mi.Sensor, seed: int, spp: int, first: int = 0, block: int | None = None):
+    def __init__(
+        self,
+        sensor: mi.Sensor,
+        seed: int,
+        spp: int,
+        first: int | mi.UInt32 = 0,
+        block: int | None = None,
+        some: mi.UInt32 | None = None,
+    ):
         self.sensor, self.first = sensor, first
         self.size = mi.ScalarVector2u(sensor.film().crop_size())
-        pixels = int(dr.prod(self.size))
-        lane = dr.arange(mi.UInt32, pixels * spp)
+        self.pixels = int(dr.prod(self.size)) if some is None else dr.width(some)
+        lane = dr.arange(mi.UInt32, self.pixels * spp)
         # Opaque, here and below: a literal would be compiled into the kernel, a new one for every value.
         self.block = block or spp
-        in_pixel, in_block = (dr.opaque(mi.UInt32, n * self.block) for n in (1, pixels))
-        self.pixel = pixel = lane % in_block // in_pixel
-        sample = lane // in_block * in_pixel + lane % in_pixel + dr.opaque(mi.UInt32, first)
+        in_pixel, in_block = (dr.opaque(mi.UInt32, n * self.block) for n in (1, self.pixels))
+        pixel = lane % in_block // in_pixel
+        if some is None:
+            first = dr.opaque(mi.UInt32, first)
+        else:
+            pixel, first = dr.gather(mi.UInt32, some, pixel), dr.gather(mi.UInt32, first, pixel)
+        self.pixel = pixel
+        sample = lane // in_block * in_pixel + lane % in_pixel + first
         self.random = sample_streams(seed, pixel, sample)
         corner = mi.Point2f(pixel % self.size.x, pixel // self.size.x)
         self.position = corner + self.random.next_2d()

@@ -28,6 +28,24 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="render for this long, kernel compilation included, instead of a number of paths; with both: until the "
         "first of them is reached",
     )
+    parser.add_argument(
+        "--adaptive",
+        action="store_true",
+        help="more samples where the error of the result is large; --spp is then their mean",
+    )
+    parser.add_argument(
+        "--error",
+        type=float,
+        metavar="E",
+        help="--adaptive, until the result is expected to have this relative error (0.05: 5 %%); --spp and --time may "
+        "end it before",
+    )
+    parser.add_argument(
+        "--for",
+        dest="method",
+        metavar="METHOD",
+        help="with --adaptive or --error: the method that will reconstruct (default: what `auto` takes)",
+    )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     samplers = "; ".join(f"{name}: {summary}" for name, summary in summaries().items())
     parser.add_argument("--sampler", default="auto", metavar="NAME", help=f"default: auto. {samplers}")
@@ -90,13 +108,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.render import check_options, render_stack
     from data_gen.scenes.load import load_scene
 
-    spp = args.spp or (DEFAULT_SPP if args.time is None else None)
+    spp = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
     memory = args.memory or DEFAULT_MEMORY
+    adaptive = sharing(args)
     # Before the scene is loaded, which may take long.
-    check_options(spp, args.seed, args.sampler, args.time, memory)
+    check_options(spp, args.seed, args.sampler, args.time, memory, args.error is not None)
     scene = load_scene(args.scene, args.size, dict(args.define))
     sampler, seconds = args.sampler, args.time
-    if sampler == "auto":
+    # A pilot compares samplers at even samples, and may choose one that renders no others.
+    if sampler == "auto" and adaptive is None:
         choice = choose_by_pilot(scene, spp, seconds, memory)
         sampler = choice.sampler
         console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
@@ -112,12 +132,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
             memory=memory,
             stop=stop,
             diagnostics=args.diagnostics,
+            adaptive=adaptive,
         )
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
     done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
     interrupted = stop() and done != spp
+    if args.error is not None and "ngpt:error" in stack.attributes:
+        expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
+        short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
+        console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
     if interrupted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
@@ -127,8 +152,21 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 130 if interrupted else 0
 
 
+def sharing(args: argparse.Namespace):
+    """How samples are shared out; None: evenly."""
+    if args.error is None and not args.adaptive:
+        if args.method is not None:
+            raise NgptError("--for says what --adaptive and --error go by; give one of them too")
+        return None
+    from data_gen.adaptive import Adaptive
+
+    return Adaptive(args.error, args.method or "auto")
+
+
 def run_frames(args: argparse.Namespace, console: Console) -> int:
     """``--frames``: a stack for each."""
+    if args.adaptive or args.error is not None or args.method is not None:
+        raise NgptError("--adaptive, --error and --for are for single images; leave them out with --frames")
     places = targets(args.output, args.scene, args.frames)
     for target in places.values():
         check_output(target, args.force or args.skip_existing)

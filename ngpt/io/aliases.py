@@ -78,6 +78,7 @@ _SPELLINGS = {
     XYZ: ((("X", "x"), ("Y", "y"), ("Z", "z")), _COLOUR),
     XY: ((("X", "x"), ("Y", "y")),),
     ("Z",): ((("Z", "z", "V", "v", "T", "t", "Y", "y", "D", "d", "R", "r", ""),),),
+    ("N",): ((("N", "n", ""),),),
     ("A",): ((("A", "a", "alpha", ""),),),
 }
 # Parts of names, in small letters without blanks and underscores, that make a layer look like one of the contract.

@@ -25,7 +25,7 @@ def test_large_images_with_small_blocks(renderer, monkeypatch):
     monkeypatch.setattr(passes, "_BLOCK_LANES", 33 * 21 * 5)
     whole = render_stack(scene, 14, 7)
     assert passes.block_of_samples(33 * 21) == 4
-    monkeypatch.setattr(passes, "_PASS_SECONDS", 1e-9)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)
     same(whole, render_stack(scene, 14, 7))
 
 

@@ -207,8 +207,8 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeyp
     whole = render_stack(scene, spp, 7, name)
     same(whole, render_stack(scene, spp, 7, name))
     calls = []
-    monkeypatch.setattr(passes, "_FIRST_LANES", size[0] * size[1] * 40)
-    monkeypatch.setattr(passes, "_PASS_SECONDS", 1e-9)
+    monkeypatch.setattr(passes, "FIRST_LANES", size[0] * size[1] * 40)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 1e-9)
     parts = render_stack(scene, spp, 7, name, lambda done, total: calls.append((done, total)))
     if SAMPLERS[name].batch:
         assert len(calls) == 1 + -(-spp // SAMPLERS[name].batch)

@@ -117,7 +117,7 @@ def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np
 
     The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
     """
-    _, counts = np.unique(lanes // (int(dr.prod(camera.size)) * camera.block), return_counts=True)
+    _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
     padded = -(-counts // _PACKET) * _PACKET
     place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
     spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)

@@ -1,0 +1,171 @@
+"""Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
+
+The error is that of the image by the method that will run on the stack, not that of the stack: the standard errors of
+``ngpt.uncertainty``. A render goes on in steps, each of which may double the samples. Before each step the method runs
+twice on what there is. With error q of a pixel, relative to its light, and n samples of it, s = q sqrt(n) is what one
+sample would leave. The mean of s² / n for a given sum of n is least where n is proportional to s: the step brings the
+counts as near to that as it can. All pixels get at least a quarter of their even share, lest light that the first
+samples missed were never found.
+
+The samples that a choice was made by stay in the means. So a pixel whose first samples were too dark by chance might
+get fewer of those that would show it, and be too dark in the mean. Two things keep that small: errors are means over
+about 9x9 pixels, in which a pixel's own samples are few; and they are relative to the light there, so that noise which
+darkens lowers both. docs/adaptive.md has what was measured.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from data_gen.film import GradientFilm
+from data_gen.passes import DEFAULT_MEMORY, Progress, SamplePass
+from data_gen.samplers import SAMPLERS, Sampler
+from data_gen.uneven import BLOCK, UnevenRender
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import EPSILON, trimmed_mean
+from ngpt.methods import reconstruct
+from ngpt.stack import GradientStack
+from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
+
+# Least number of samples per pixel in the mean: that of the first step, everywhere, and as many to be shared out
+LEAST = 2 * BLOCK
+# Of an even share, what a pixel gets at least and at most
+_FLOOR, _CAP = 0.25, 16.0
+# A step to a given error goes a bit further than is thought to be needed, and is no smaller than this of what there is.
+_MARGIN, _SMALLEST = 1.05, 0.125
+# The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
+_TRIM = 0.001
+
+
+@dataclass(frozen=True)
+class Adaptive:
+    """How samples are shared out: for which ``method`` of reconstruction, and up to which ``error``.
+
+    The ``error`` is relative: the root of the mean of (x - r)² / (r² + 1e-3) over all but the worst 0.1 % of the
+    pixels, for the result x of the method and the converged image r, as far as standard errors foretell it. None: as
+    far as samples or time go.
+    """
+
+    error: float | None = None
+    method: str = "auto"
+
+
+def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int | None) -> None:
+    """Raises NgptError for what cannot be rendered with samples in different numbers."""
+    if adaptive.error is not None and not 0 < adaptive.error < math.inf:
+        raise NgptError(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
+    if spp is not None and spp < LEAST:
+        raise NgptError(f"{spp} samples per pixel are too few to be shared out; from {LEAST} on they can be")
+    if sampler.batch:
+        able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
+        raise NgptError(
+            f"the samples of '{sampler.name}' depend on each other, so all pixels have as many; for others use: {able}"
+        )
+    if options.get("reuse") or options.get("shift") == "manifold":
+        raise NgptError("options 'reuse' and 'shift=manifold' need samples of all pixels in each pass; leave them out")
+
+
+def render_adaptive(
+    sample: SamplePass,
+    sensor: mi.Sensor,
+    seed: int,
+    adaptive: Adaptive,
+    spp: int | None,
+    progress: Progress = lambda done, total: None,
+    seconds: float | None = None,
+    memory: int = DEFAULT_MEMORY,
+    stop: Callable[[], bool] = lambda: False,
+    lane_bytes: int = 256,
+) -> tuple[GradientFilm, dict]:
+    """The film, and attributes that say what its samples were chosen for.
+
+    For the parameters see ``data_gen.passes.render_passes()``; ``spp`` and what is reported of samples are means over
+    pixels. The first 16 samples of each pixel are always rendered. The seed, the size, the method and the number of all
+    samples decide the bits, whatever ended the render. Raises NgptError as the method does.
+    """
+    width, height = (int(n) for n in sensor.film().crop_size())
+    pixels = width * height
+    start, total = time.perf_counter(), spp or LEAST
+
+    def report() -> None:
+        if seconds is not None:
+            limit = math.ceil(seconds)
+            progress(min(limit, int(time.perf_counter() - start)), limit)
+        else:
+            done = int(work.film.samples_each.mean())
+            progress(min(done, total), total)
+
+    most = None if spp is None else spp * pixels
+    work = UnevenRender(sample, sensor, seed, most, seconds, memory, stop, lane_bytes, report)
+    report()
+    work.add(np.ones(pixels, int), whole=True)
+    attributes: dict = {}
+    took = 0.0
+    while not (work.ended or stop()):
+        begin = time.perf_counter()
+        if seconds is not None and begin - start + took > seconds:
+            break
+        n = work.film.samples_each
+        found = assess(work.film, adaptive.method)
+        took = time.perf_counter() - begin
+        attributes = {"ngpt:adaptive": found.method}
+        more = n.mean()
+        if adaptive.error is not None:
+            attributes["ngpt:error"] = found.error
+            if found.error <= adaptive.error:
+                break
+            needed = n.mean() * (found.error / adaptive.error) ** 2
+            if spp is None:
+                total = max(total, math.ceil(needed))
+            more = min(more, max(_MARGIN * needed - n.mean(), _SMALLEST * n.mean()))
+        work.add(share_out(found.relative * np.sqrt(n), n, more * pixels))
+    if seconds is not None:
+        progress(math.ceil(seconds), math.ceil(seconds))
+    elif not stop():
+        progress(total, total)
+    return work.film, attributes
+
+
+@dataclass(frozen=True)
+class Assessment:
+    """What a method makes of a stack: the standard error of each pixel relative to its light, (pixels), and in all."""
+
+    relative: np.ndarray
+    error: float
+    method: str
+
+
+def assess(film: GradientFilm, method: str) -> Assessment:
+    """The expected error of what a method would make of the film as it is."""
+    spp = int(film.samples_each.mean())
+    stack = GradientStack(film.develop(), {"ngpt:spp": spp, "ngpt:normalSpace": "camera"})
+    result = reconstruct(stack, method)
+    again = reconstruct(noisier(stack), method)
+    light = uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
+    unit = np.sqrt(np.square(light) + EPSILON)
+    # Relative before it is averaged over neighbours: that of a lamp's edge is no error of the dark beside it.
+    changed = change(np.nan_to_num(result.image) / unit, np.nan_to_num(again.image) / unit)
+    squares = np.square(FACTORS.get(result.method, FACTOR) * changed)
+    error = math.sqrt(trimmed_mean(squares, squares, _TRIM))
+    return Assessment(np.sqrt(squares.mean(axis=-1)).ravel(), error, result.method)
+
+
+def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
+    """How many more blocks each pixel gets of about so many ``samples``: counts in proportion to ``need``.
+
+    ``n`` are the samples it has. All (pixels).
+    """
+    shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
+    low, high = 0.0, (n.max() + samples) / _FLOOR
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if np.maximum(middle * shares - n, 0).sum() < samples else (low, middle)
+    blocks = np.floor(np.maximum(low * shares - n, 0) / BLOCK + 0.5).astype(int)
+    return blocks if blocks.any() else np.ones(len(n), int)

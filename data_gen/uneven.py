@@ -1,0 +1,99 @@
+"""Rendering of some pixels more than others: passes over lists of pixels, the same bits whatever the passes."""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen import passes
+from data_gen.film import GradientFilm
+from data_gen.passes import DEFAULT_MEMORY, LANE_BYTES, PACKET, SamplePass, lanes_within, recording
+from data_gen.paths.camera import CameraSamples
+
+# Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
+BLOCK = PACKET
+
+
+class UnevenRender:
+    """A render that is told, step by step, how many more blocks of samples each pixel gets.
+
+    What it is told makes one sequence of blocks: the first of all pixels that get one, row by row, then the second of
+    all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
+    wherever it is: the same samples in all give the same bits, whatever the passes and whatever ended it.
+
+    ``sample`` must take independent samples; see ``data_gen.passes.render_passes()`` for it, for ``memory`` (MiB) and
+    for ``stop``. ``report`` is called after each pass.
+    """
+
+    def __init__(
+        self,
+        sample: SamplePass,
+        sensor: mi.Sensor,
+        seed: int,
+        most: int | None = None,
+        seconds: float | None = None,
+        memory: int = DEFAULT_MEMORY,
+        stop: Callable[[], bool] = lambda: False,
+        lane_bytes: int = LANE_BYTES,
+        report: Callable[[], None] = lambda: None,
+    ):
+        width, height = (int(n) for n in sensor.film().crop_size())
+        self.film = GradientFilm(width, height)
+        self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
+        self.blocks_left = (most or 1 << 62) // BLOCK
+        # Raises NgptError where not even one row's worth fits.
+        self.at_once = lanes_within(memory, self.film, BLOCK * width, lane_bytes) // BLOCK
+        self.end = None if seconds is None else time.perf_counter() + seconds
+        self.expected: float | None = None  # seconds of a block
+        self.ended = False
+
+    def add(self, blocks: np.ndarray, whole: bool = False) -> None:
+        """Renders so many more ``blocks`` of each pixel, (pixels) integers.
+
+        Unless the ``whole`` is asked for, these are as many of them as there may be; ``ended`` says whether some were
+        left out.
+        """
+        waiting, level = np.zeros(0, np.uint32), 0
+        while True:
+            n = self._at_once(whole)
+            while len(waiting) < n and level < blocks.max():
+                waiting = np.append(waiting, np.flatnonzero(blocks > level).astype(np.uint32))
+                level += 1
+            if not len(waiting):
+                return
+            n = min(n, len(waiting)) if whole else min(n, len(waiting), self.blocks_left)
+            if n < 1 or (self.stop() and not whole):
+                self.ended = True
+                return
+            self._render(np.sort(waiting[:n]))
+            waiting = waiting[n:]
+            self.report()
+
+    def _at_once(self, whole: bool) -> int:
+        """Blocks of the next pass; 0 where there is no time for one."""
+        if self.expected is None:
+            return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
+        n = max(1, min(self.at_once, int(passes.PASS_SECONDS / self.expected)))
+        if whole or self.end is None:
+            return n
+        # No more than half of the time left, by the fastest pass so far: others may take longer.
+        return min(n, int(max(self.end - time.perf_counter(), 0) / 2 / self.expected))
+
+    def _render(self, some: np.ndarray) -> None:
+        """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
+        start = time.perf_counter()
+        pixels, starts, blocks = np.unique(some, return_index=True, return_counts=True)
+        within = np.arange(len(some)) - np.repeat(starts, blocks)
+        first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
+        with recording():
+            self.sample(CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some)), self.film)
+            self.film.end_pass(BLOCK, some)
+        dr.sync_thread()
+        self.blocks_left -= len(some)
+        # Where a pass is small, or compiles a kernel, most of its time is not that of its blocks.
+        self.expected = min(self.expected or math.inf, (time.perf_counter() - start) / len(some))

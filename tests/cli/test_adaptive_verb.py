@@ -1,0 +1,41 @@
+"""``ngpt render --adaptive`` and ``--error``."""
+
+import json
+
+import pytest
+
+import ngpt
+from ngpt.cli import main
+
+
+def test_an_error_is_reached_and_said(renderer, tmp_path, capsys):
+    target = str(tmp_path / "stack.exr")
+    options = ["--error", "0.5", "--spp", "48", "--size", "24x16", "--for", "wcv", "--sampler", "gpt", "--json"]
+    assert main(["render", "diffuse", "-o", target, *options]) == 0
+    printed = capsys.readouterr()
+    assert json.loads(printed.out)["adaptive"] == "wcv" and json.loads(printed.out)["error"] <= 0.5
+    assert "'wcv' is expected to have an error of" in printed.err
+
+
+def test_samples_differ_and_are_written(renderer, tmp_path, capsys):
+    target = str(tmp_path / "stack.exr")
+    options = ["--adaptive", "--spp", "48", "--size", "24x16", "--for", "wcv", "--sampler", "gpt"]
+    assert main(["render", "diffuse", "-o", target, *options]) == 0
+    stack = ngpt.read(target)
+    assert stack.attributes["ngpt:spp"] == 48 and stack["samples"].mean() == 48 and stack["samples"].max() > 48
+    assert main(["info", target]) == 0
+    assert "samples" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--for", "wcv"], "--for says what --adaptive and --error go by"),
+        (["--error", "0.1", "--frames", "0:2"], "--adaptive, --error and --for are for single images"),
+        (["--adaptive", "--spp", "64", "--sampler", "bdpt"], "depend on each other"),
+    ],
+)
+def test_refusals(renderer, tmp_path, capsys, options, message):
+    target = str(tmp_path / ("frame-{frame}.exr" if "--frames" in options else "stack.exr"))
+    assert main(["render", "diffuse", "-o", target, "--size", "8x8", *options]) != 0
+    assert message in capsys.readouterr().err
