@@ -32,6 +32,7 @@ from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connection, to_camera
@@ -187,7 +188,8 @@ class GBDPT(BDPT):
             L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
             if dr.hint(kept is not None, mode="scalar"):
                 joins = active & scatters_smoothly(si.bsdf()) & step.joins
-                L, Δ = self.shifted_connections(scene, plan, step, joins, kept, count, ray, L, offsets)
+                u = random.next_1d()
+                L, Δ = self.shifted_connection(scene, plan, step, joins, kept, count, ray, u, L, offsets)
                 offsets = with_differences(offsets, Δ)
             offsets = take_step(scene, plan, step, offsets)
             si, β, end = step.x1, step.β1, step.end1
@@ -196,18 +198,18 @@ class GBDPT(BDPT):
         return L, Le, [offset.Δ for offset in offsets]
 
     @dr.syntax
-    def shifted_connections(self, scene, plan, step, active, kept, count, ray, L, offsets):
-        """``L`` and Δ, and with them all paths that join the vertex of ``step`` to one of those ``kept``."""
+    def shifted_connection(self, scene, plan, step, active, kept, count, ray, u, L, offsets):
+        """``L`` and Δ, and with them the paths that join the vertex of ``step`` to one of those ``kept``, by ``u``.
+
+        It is chosen by the base path alone, so that it stands for all of them in differences as well.
+        """
         z, Δ = step.z, [offset.Δ for offset in offsets]
-        bsdf = z.si.bsdf()
-        i = mi.UInt32(0)
-        while dr.hint(active & (i < count), label="connections"):
-            y = recall(kept.read(i), ray.time, ray.wavelengths)
-            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= plan.longest)
-            found = connection(scene, z, bsdf, y, joins)
-            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, offsets, Δ)
-            L += weighted(C, others)
-            i += 1
+        chosen, times = choose(z, active, kept, count, plan.longest, u)
+        if active & (times > 0):
+            y = recall(kept.read(chosen), ray.time, ray.wavelengths)
+            found = connection(scene, z, z.si.bsdf(), y, mi.Bool(True))
+            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, times, offsets, Δ)
+            L += weighted(C, others) * times
         return L, Δ
 
 
