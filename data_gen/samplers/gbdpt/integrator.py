@@ -39,13 +39,12 @@ from data_gen.samplers.bdpt.strategies import connection, to_camera
 from data_gen.samplers.bdpt.vertex import (
     IMPORTANCE,
     Vertex,
-    adjoint,
     context,
     cosine,
+    light_leaves,
     recall,
     record,
     record_class,
-    reverse_density,
     scatters_smoothly,
 )
 from data_gen.samplers.common import like_path
@@ -147,10 +146,9 @@ class GBDPT(BDPT):
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
             left_smoothly = event_kind(sample.sampled_type) == SMOOTH
-            d, p_before = si.to_world(sample.wo), mi.Float(sample.pdf)
-            q = reverse_density(si, bsdf, sample.wo, active & left_smoothly)
-            end = mis.leave(end, cosine(si, d), sample.pdf, q, ~left_smoothly)
-            β *= f_p * adjoint(si, sample.wo)
+            d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
+            β *= dr.select(sample.pdf > 0, f_p, 0)
+            p_before = mi.Float(sample.pdf)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
