@@ -138,6 +138,20 @@ def see(scene, media: Media, trace, ray, medium, reach, channel, key, active) ->
     return dr.exp(-τ) * N, hit, ray
 
 
+def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
+    """exp(-τ) along ``ray`` up to the first surface that is no boundary, 0 where a grid is on the way.
+
+    Returns that, the surface, and the last piece of the ray.
+    """
+    reach = mi.Float(dr.inf)
+    if not media.grids:
+        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
+        return dr.exp(-τ), hit, ray
+    none, same = mi.UInt32(0), mi.Float(1)
+    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, channel, none, same, none, active)
+    return dr.select(M > 0, 0, dr.exp(-τ)), hit, ray
+
+
 def transmittance(
     scene, media: Media, x, place: Place, ray, target: mi.Point3f, channel, key, active: mi.Bool
 ) -> mi.Spectrum:

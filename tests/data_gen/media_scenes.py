@@ -89,6 +89,13 @@ def coloured_smoke():
     return cloudy(cloud, mist={"albedo": 0.8, "sigma_t": 0.1})
 
 
+def before_the_sky():
+    """The same in the open: before a sky, and before a lamp in plain view, half of it behind the cloud."""
+    scene = glowing(smoke()) | {"sky": {"type": "constant", "radiance": _rgb(0.4, 0.5, 0.6)}}
+    del scene["integrator"]["hide_emitters"], scene["back"], scene["wall"]
+    return scene
+
+
 def hiding():
     """A lamp in plain view, half behind a cloud, that hides from the camera; and mist around the camera."""
     return glowing(cloudy(grid(1), mist={"albedo": 0.8, "sigma_t": 0.2}))

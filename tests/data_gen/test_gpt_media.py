@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from data_gen_scenes import fog, within_fog
 from media_scenes import (
+    before_the_sky,
     by_mis,
     coloured_smoke,
     colours,
@@ -29,8 +30,9 @@ from ngpt.testing import z_test
 
 SIZE, PIXELS = (16, 16), 4
 # Not with large budgets: those tell `volpathmis` from `volpath`.
-FAST = [haze, colours, smoke, by_mis(colours), by_mis(coloured_smoke), hiding]
-SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, fog, within_fog, hiding, hiding_outside]
+FAST = [haze, colours, smoke, by_mis(colours), by_mis(coloured_smoke), before_the_sky, hiding]
+SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, before_the_sky, fog, within_fog]
+SLOW += [hiding, hiding_outside]
 
 
 @cache

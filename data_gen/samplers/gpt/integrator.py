@@ -170,32 +170,38 @@ class GPT(GradientIntegrator):
         seen = mi.Bool(not plan.hides)
         if plan.media:
             channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, plan.media)
-            light_key = random.next_key() if plan.media.grids else None
 
             def fly(ray, importance):
                 trace = partial(self.first_surface, scene)
                 segment = segments.fly(plan.media, trace, ray, within, channel, numbers, mi.Bool(True))
-                return segment.ray, segment.hit, importance * segment.weight, segment.place
+                return segment, importance * segment.weight
 
-            first_ray, hit, β, place = fly(ray, importance)
-            x = media.vertex(first_ray, hit, place)
-            Le = importance * self.lamps_in_fog(scene, plan, ray, within, channel, light_key)
+            first, β = fly(ray, importance)
+            hit, place = first.hit, first.place
+            x = media.vertex(first.ray, hit, place)
+            Le = importance * self.lamps_in_fog(scene, plan, ray, within, channel)
+            L_first = β * self.behind_grids(scene, plan, first)
             offsets = []
             for offset_ray, offset_importance, inside in shifted:
-                offset_ray, hit, offset_β, offset_place = fly(offset_ray, offset_importance)
-                offsets.append(start(plan, x, β, offset_ray, hit, offset_β, inside, offset_place))
+                there, offset_β = fly(offset_ray, offset_importance)
+                y = start(plan, x, β, there.ray, there.hit, offset_β, inside, there.place)
+                if plan.media.grids:
+                    # Both paths replay the numbers of this segment: r = 1, w = 1/2.
+                    y.Δ = offset_β * self.behind_grids(scene, plan, there) - L_first
+                    y.A = dr.select(inside, 1, 2) * L_first
+                offsets.append(y)
         else:
             x, β = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray)), importance
             # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
             Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
-            offsets, place, channel = [], None, None
+            offsets, place, channel, L_first = [], None, None, 0
             for offset_ray, offset_importance, inside in shifted:
                 hit = self.first_hit(scene, offset_ray)
                 offsets.append(start(plan, x, β, offset_ray, hit, offset_importance, inside))
         chain = no_chain(dr.width(hit.t)) if plan.manifold else None
         if plan.max_depth < 2:
             none = dr.zeros(mi.Spectrum, dr.width(hit.t))
-            return none, Le, none, offsets, chain
+            return none + L_first, Le, none, offsets, chain
 
         # --------------------- The first step ------------------------
         # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
@@ -205,7 +211,7 @@ class GPT(GradientIntegrator):
             scene, plan, random, x, place, channel, β, mi.Float(1), mi.UInt32(1), seen, false, false, chain, offsets
         )
         # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
-        L = β * step.L_light + step.β1 * step.L_bsdf
+        L = L_first + β * step.L_light + step.β1 * step.L_bsdf
         L_caustic = β * step.L_caustic if plan.caustic else step.L_caustic
         offsets = first_steps(scene, plan, step, offsets)
         L, L_caustic, offsets, chain = self.walk(scene, plan, random, step, η, L, L_caustic, offsets)
@@ -246,14 +252,28 @@ class GPT(GradientIntegrator):
             hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
         return hit
 
-    def lamps_in_fog(self, scene, plan: Plan, ray, within, channel, key) -> mi.Spectrum:
-        """What the camera sees of lamps and the environment through media; of homogeneous ones the expectation."""
+    def lamps_in_fog(self, scene, plan: Plan, ray, within, channel) -> mi.Spectrum:
+        """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
         if self.hide_emitters:
             return mi.Spectrum(0)
-        trace, reach = partial(self.first_surface, scene), mi.Float(dr.inf)
-        T, hit, ray = segments.see(scene, plan.media, trace, ray, within, reach, channel, key, mi.Bool(True))
+        trace = partial(self.first_surface, scene)
+        T, hit, ray = segments.clear_view(plan.media, trace, ray, within, channel, mi.Bool(True))
         si = hit.compute_surface_interaction(ray)
-        return T * si.emitter(scene).eval(si, mi.Bool(plan.max_depth > 0))
+        seen = hit.is_valid() if plan.media.grids else mi.Bool(True)
+        return T * si.emitter(scene).eval(si, seen & (plan.max_depth > 0))
+
+    def behind_grids(self, scene, plan: Plan, segment) -> mi.Spectrum:
+        """Le where the first ``segment`` of a path has come through grids, or to the environment of a scene with grids.
+
+        It is light like any other, not in ``direct``: it has noise, and less so together with the light that was
+        scattered on the way, since a path finds one or the other. The environment is here in all pixels. Else the box
+        around a cloud would stand out from the sky.
+        """
+        if self.hide_emitters or not plan.media.grids:
+            return mi.Spectrum(0)
+        si = segment.hit.compute_surface_interaction(segment.ray)
+        arrives = ~segment.place.scatters & ((segment.nulls.M > 0) | ~segment.hit.is_valid())
+        return si.emitter(scene).eval(si, arrives & (plan.max_depth > 0))
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
