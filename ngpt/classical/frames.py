@@ -7,9 +7,9 @@ in the frame after:
     I_t(p)  <-  what W I_{t-1}(p) + dt(p) says, with W the image before at p + motion
 
 W is bilinear on what is to be found, and a Catmull-Rom spline on a first guess G of it, which costs nothing in the
-iteration: W I = B I + (S - B) G. How far both are apart on G says how wrong W may be: ``INTERPOLATION`` ((S - B) G)² is
-added to the variance of dt. So other frames count little at edges that move by parts of a pixel. A pixel that comes
-into sight needs no test: dt holds the difference to what hid it.
+iteration: W I = B I + (S - B) G. How far both are apart on G says how wrong W may be: ``INTERPOLATION`` ((S - B) G)²,
+the largest of 3x3 pixels, is added to the variance of dt. So other frames count little at edges that move by parts of a
+pixel. A pixel that comes into sight needs no test: dt holds the difference to what hid it.
 
 As in ``controlvariates``, weights are relative: a = f var I / (f var I + var dt), with f the factor by which n
 iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.classical.variances``).
@@ -23,15 +23,16 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import maximum_filter
 from scipy.sparse import csr_matrix
 
 from ngpt.classical.controlvariates import SWEEPS, decay
 from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
-from ngpt.classical.variances import FLOOR, TYPICAL, smoothed
+from ngpt.classical.variances import FLOOR, smoothed
 from ngpt.warp import bilinear_taps, warped
 
-# Times the squared difference of two interpolations, what is added to the variance of dt. Of 1, 3, 10 and 30 the one
-# of least error and flicker on slow shots of the built-in scenes `diffuse` and `glossy`.
+# Times the squared difference of two interpolations, what is added to the variance of dt. Of 3, 10 and 30 the one of
+# least error on slow shots of the built-in scenes `diffuse` and `glossy`.
 INTERPOLATION = 10
 # Times the variance of dt. It is that of few pairs, most of which saw nothing of what is rare: gloss and caustics above
 # all. Of 1, 4 and 16 the one of least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a pixel.
@@ -155,7 +156,7 @@ class _Step:
         known = found & np.isfinite(link.dt).all(axis=-1) & np.isfinite(link.dt_var).all(axis=-1)
         apart: np.ndarray = np.where(known[..., None], spline - linear, 0).astype(dtype)
         noise = smoothed(np.where(known[..., None], link.dt_var, np.nan), True)
-        wrong = smoothed(np.square(apart, dtype=np.float64), True) / TYPICAL
+        wrong = maximum_filter(np.square(apart, dtype=np.float64).sum(axis=-1), 3)
         variance = np.where(known, _relative(DOUBT * noise + INTERPOLATION * wrong, level), np.inf)
         self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
         self.variance: np.ndarray = variance[..., None].astype(dtype)
