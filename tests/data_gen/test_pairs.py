@@ -54,7 +54,8 @@ def estimates(shot, count, pairs):
         ("glossy", 0.02, {"lamp": (-0.2, 0, 0)}),
     ],
 )
-def test_the_mean_is_the_difference_of_the_frames(renderer, scene, camera, moved):
+def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, camera, moved):
+    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
     paired, apart, _, _ = estimates(moving(scene, camera, **moved), 16, 16)
     known = np.isfinite(paired[0]).all(axis=-1)
     assert known.mean() > 0.85
@@ -65,7 +66,8 @@ def test_the_mean_is_the_difference_of_the_frames(renderer, scene, camera, moved
         assert not z_test(-paired, apart, block=4).passed
 
 
-def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer):
+def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
+    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
     from data_gen.render import render_stack
 
     shot = moving("diffuse", lamp=(0.3, 0, 0))
