@@ -1,12 +1,15 @@
 """Frames of a moving camera: error and flicker of results made frame by frame, and over time.
 
     python -m bench.sequences --folder SCENES --scenes diffuse glossy coffee --out OUT
+    python -m bench.sequences --folder SCENES --scenes diffuse glossy --shots slow fast object light --pairs 2 --out OUT
 
-Each shot moves a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
-sees in the median) and ``fast`` (8 pixels a frame, to and fro). Stacks and references are rendered once and kept in
+Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
+sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``, where
+the scene is one of those. Stacks and references are rendered once and kept in
 OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all
 frames but the first. What the references' own noise adds to both, by their variances, is taken off. ``+ temporal`` is
-`ngpt denoise --temporal`.
+`ngpt denoise --temporal`. With ``--pairs``, stacks have differences in time, and there is a row more, ``wcv + dt``, at
+``--spp``; all other rows are then of stacks without, at ``--spp-without``, for pairs take their time.
 """
 
 import argparse
@@ -19,8 +22,21 @@ from bench.common import metadata, save
 from ngpt.measure.flicker import flicker
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
+from ngpt.shots import reconstruct_shot
 from ngpt.temporal import Temporal
 
+# Scene and shot -> the parameter that moves, and by how much a frame. "lamp": the first shape that shines.
+MOVES = {
+    ("diffuse", "object"): ("ball", (0.03, 0, 0)),
+    ("glossy", "object"): ("gold", (-0.03, 0, 0)),
+    ("cornell-box", "object"): ("ShortBox", (-0.02, 0, 0.01)),
+    ("veach-mis", "object"): ("Glossy", (0, 0.05, 0)),
+    ("diffuse", "light"): ("lamp", (0.04, 0, 0)),
+    ("glossy", "light"): ("lamp", (-0.04, 0, 0)),
+    ("cornell-box", "light"): ("Light", (0.03, 0, 0)),
+    ("coffee", "light"): ("lamp", (0.03, 0, 0)),
+    ("veach-mis", "light"): ("Null_0002", (0, 0, 0.1)),
+}
 SPEEDS = {"static": 0.0, "slow": 0.5, "fast": 8.0}
 
 
@@ -28,11 +44,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, help="folder of scenes: NAME/scene.xml")
     parser.add_argument("--scenes", nargs="*", default=["diffuse", "glossy"])
-    parser.add_argument("--shots", nargs="*", default=list(SPEEDS), choices=SPEEDS)
+    parser.add_argument("--shots", nargs="*", default=list(SPEEDS), choices=[*SPEEDS, "object", "light"])
     parser.add_argument("--methods", nargs="*", default=["wcv", "ngpt-fast", "oidn"], choices=METHODS)
     parser.add_argument("--frames", type=int, default=10)
     parser.add_argument("--size", default="96x54")
     parser.add_argument("--spp", type=int, default=8)
+    parser.add_argument("--pairs", type=int, default=0, help="of differences in time (default: 0, none)")
+    parser.add_argument("--spp-without", type=int, default=12, help="of stacks without them (default: 12)")
     parser.add_argument("--reference-spp", type=int, default=512)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
@@ -40,38 +58,52 @@ def main() -> None:
     for scene in args.scenes:
         for shot in args.shots:
             folder = args.out / scene / shot
-            render_shot(args, scene, SPEEDS[shot], folder)
-            stacks, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in ("in", "ref"))
-            for method in args.methods:
-                for row in judge(stacks, references, method):
-                    rows.append({"scene": scene, "shot": shot} | row)
-                    print(line(rows[-1]), flush=True)
+            if shot not in SPEEDS and (scene, shot) not in MOVES:
+                continue
+            kinds = render_shot(args, scene, shot, folder)
+            stacks, paired, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in kinds)
+            found = [row for method in args.methods for row in judge(stacks, references, method)]
+            if args.pairs:
+                images = [result.image for _, _, result in reconstruct_shot(paired)]
+                found += measured(paired, references, {"wcv + dt": images})
+            for row in found:
+                rows.append({"scene": scene, "shot": shot} | row)
+                print(line(rows[-1]), flush=True)
     save(args.out / "sequences.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
 
 
 def judge(stacks: list, references: list, method: str) -> list[dict]:
-    """Rows of a method, frame by frame and over time; ``references`` are stacks, one alone for a shot at rest."""
+    """Rows of a method, frame by frame and over time."""
+    results = [ngpt.reconstruct(stack, method) for stack in stacks]
+    temporal = Temporal()
+    over_time = [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)]
+    return measured(
+        stacks, references, {method: [result.image for result in results], f"{method} + temporal": over_time}
+    )
+
+
+def measured(stacks: list, references: list, images: dict[str, list[np.ndarray]]) -> list[dict]:
+    """A row for each list of images; ``references`` are stacks, one alone for a shot at rest."""
     truth = [reference["primal"] for reference in references]
     rng = np.random.default_rng(0)
     noise = [np.sqrt(reference["primal_var"]) * rng.standard_normal(truth[0].shape) for reference in references]
     truth, noise = ([*images] * (len(stacks) // len(images)) for images in (truth, noise))
-    results = [ngpt.reconstruct(stack, method) for stack in stacks]
-    temporal = Temporal()
-    images = {
-        method: [result.image for result in results],
-        f"{method} + temporal": [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)],
-    }
     motions = [stack["motion"] for stack in stacks]
 
-    def measured(found: list[np.ndarray]) -> tuple[float, float]:
+    def errors_of(found: list[np.ndarray]) -> tuple[float, float]:
         errors = [relmse_trimmed(image, reference) for image, reference in zip(found[1:], truth[1:], strict=True)]
         return float(np.mean(errors)), flicker(found, truth, motions)
 
-    floor = measured([reference + own for reference, own in zip(truth, noise, strict=True)])
+    floor = errors_of([reference + own for reference, own in zip(truth, noise, strict=True)])
     rows = []
     for name, found in images.items():
-        error, change = measured(found)
-        rows.append({"method": name, "relMSE": error - floor[0], "flicker": change - floor[1], "floor": floor})
+        error, change = errors_of(found)
+        bias = float(
+            np.mean([image.mean() / reference.mean() - 1 for image, reference in zip(found, truth, strict=True)])
+        )
+        rows.append(
+            {"method": name, "relMSE": error - floor[0], "flicker": change - floor[1], "floor": floor, "bias": bias}
+        )
     return rows
 
 
@@ -79,8 +111,11 @@ def line(row: dict) -> str:
     return f"| {row['scene']} | {row['shot']} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |"
 
 
-def render_shot(args: argparse.Namespace, scene: str, speed: float, folder: Path) -> None:
-    """Stacks in ``folder/in``, references in ``folder/ref``; what is there already is kept."""
+def render_shot(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
+    """Renders stacks, those with pairs (the same without ``--pairs``) and references; returns the names of the folders.
+
+    What is there already is kept.
+    """
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
@@ -88,22 +123,51 @@ def render_shot(args: argparse.Namespace, scene: str, speed: float, folder: Path
 
     size = tuple(map(int, args.size.split("x")))
     name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
-    path = sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
-    for kind, options in (
-        ("in", {"spp": args.spp, "seed": 1, "sampler": "gpt"}),
-        (
-            "ref",
-            {"spp": args.reference_spp * (1 if speed else 4), "seed": 2, "sampler": "primal", "with_features": False},
-        ),
-    ):
+    speed = SPEEDS.get(shot)
+    path = None if speed is None else sideways(Shot(lambda frame: (name, {}), size).at(0), speed)
+    update = mover(*MOVES[scene, shot]) if speed is None else None
+    rests = speed == 0
+    stacks: dict = {"in": {"spp": args.spp, "seed": 1, "sampler": "gpt", "dt": args.pairs}}
+    if args.pairs:
+        stacks["without"] = {"spp": args.spp_without, "seed": 3, "sampler": "gpt"}
+    reference = {
+        "spp": args.reference_spp * (4 if rests else 1),
+        "seed": 2,
+        "sampler": "primal",
+        "with_features": False,
+    }
+    for kind, options in (stacks | {"ref": reference}).items():
         (folder / kind).mkdir(parents=True, exist_ok=True)
         # A shot at rest has one reference.
-        frames = range(args.frames if speed or kind == "in" else 1)
+        frames = range(1 if rests and kind == "ref" else args.frames)
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
-        shot = Shot(lambda frame: (name, {}), size, path)
         missing = [frame for frame, file in target.items() if not file.exists()]
-        for frame, stack in render_sequence(shot, frames, skip=lambda f, m=missing: f not in m, **options):
+        moving = Shot(lambda frame: (name, {}), size, path, update)
+        for frame, stack in render_sequence(moving, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
+    return ("without" if args.pairs else "in"), "in", "ref"
+
+
+def mover(shape: str, way: tuple[float, float, float]):
+    """What moves a shape so far a frame: see ``data_gen.frames.sequence.Shot``."""
+    import mitsuba as mi
+
+    start: dict = {}
+
+    def update(params, frame: int) -> None:
+        names = list(params.keys())
+        who = shape
+        if shape == "lamp" and "lamp.to_world" not in names:
+            who = next(name for name in names if name.endswith(".emitter.radiance.value")).split(".")[0]
+        far = [frame * step for step in way]
+        if f"{who}.to_world" in names:
+            before = start.setdefault(who, mi.Transform4f(params[f"{who}.to_world"]))
+            params[f"{who}.to_world"] = mi.Transform4f(mi.ScalarTransform4f().translate(far)) @ before
+        else:
+            before = start.setdefault(who, np.array(params[f"{who}.vertex_positions"]).reshape(-1, 3))
+            params[f"{who}.vertex_positions"] = mi.Float((before + far).astype(np.float32).ravel())
+
+    return update
 
 
 def sideways(scene, speed: float):

@@ -40,6 +40,8 @@ LAYERS: dict[str, Layer] = {
         Layer("dy_var", RGB, True, "sample variance of the pixel mean of dy"),
         Layer("samples", ("N",), True, "base paths of the pixel, where pixels differ in them"),
         Layer("motion", XY, True, "pixels from here to where this point was one frame before: x right, y down, or NaN"),
+        Layer("dt", RGB, True, "difference in time: estimates I[p] - I_before[p + motion], without direct; or NaN"),
+        Layer("dt_var", RGB, True, "sample variance of the pixel mean of dt"),
         Layer("alpha", ("A",), False, "coverage, untouched by reconstruction"),
         Layer("error", RGB, True, "in results: estimated standard error of the reconstruction"),
     )

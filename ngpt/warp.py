@@ -38,6 +38,25 @@ def warped(image: np.ndarray, motion: np.ndarray, sharp: bool = False) -> tuple[
     return np.where(found[..., None], value, 0).astype(image.dtype, copy=False), found
 
 
+def bilinear_taps(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The four pixels, (4, N) numbers row by row, and weights of each place x + motion, and where it is among pixels.
+
+    Weights are those of ``warped``; N is H * W, the last array (H, W). Beside the outermost pixels nothing is found.
+    """
+    height, width = motion.shape[:2]
+    y, x = np.mgrid[:height, :width].astype(np.float64)
+    x, y = x + motion[..., 0], y + motion[..., 1]
+    with np.errstate(invalid="ignore"):
+        found = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+    x, y = (np.where(found, v, 0) for v in (x, y))
+    left, top = np.floor(x).astype(int), np.floor(y).astype(int)
+    fx, fy = x - left, y - top
+    right, below = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    places = [row * width + column for row in (top, below) for column in (left, right)]
+    weights = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
+    return np.stack(places).reshape(4, -1), np.stack(weights).reshape(4, -1), found
+
+
 def _catmull_rom(f: np.ndarray) -> list[np.ndarray]:
     """The weights of the four pixels around a place, a fraction ``f`` from the second to the third."""
     return [

@@ -25,7 +25,7 @@ ngpt.classical
 ngpt.denoisers
 ngpt.network
 ngpt.methods
-ngpt.uncertainty ngpt.lightgroups ngpt.temporal
+ngpt.uncertainty ngpt.lightgroups ngpt.temporal ngpt.shots
 ngpt.denoiser
 ngpt.report
 ngpt.measure

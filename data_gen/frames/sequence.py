@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.motion import Geometry, Snapshot, motion_vectors, snapshot
+from data_gen.frames.pairs import difference, light
 from data_gen.render import render_stack
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
@@ -73,10 +75,11 @@ class Shot:
         params.update()
 
 
-def frame_seed(seed: int, frame: int) -> int:
-    """The seed of a frame: one of its own, whatever other frames are rendered."""
+def frame_seed(seed: int, frame: int, use: int = 0) -> int:
+    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
     # Entropy must not be negative, frames may be.
-    return int(np.random.SeedSequence([seed, frame % 2**64]).generate_state(1, np.uint64)[0])
+    entropy = [seed, frame % 2**64]
+    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
 
 
 def render_sequence(
@@ -84,6 +87,7 @@ def render_sequence(
     frames: Sequence[int],
     spp: int | None,
     seed: int = 0,
+    dt: int = 0,
     skip: Callable[[int], bool] = lambda frame: False,
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     **options: Any,
@@ -94,6 +98,10 @@ def render_sequence(
     same step would have before it, all NaN where there is none. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
     frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
     ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
+
+    With ``dt`` pairs of samples a pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of samples of their own
+    (``data_gen.frames.pairs``), by Mitsuba's integrator, without features. Each pair is two paths, one in the scene of
+    the frame before: where parameters change, scenes are loaded twice a frame. Their seconds are in ``ngpt:seconds``.
     """
     before: Snapshot | None = None
     last = None
@@ -110,8 +118,25 @@ def render_sequence(
         motion = np.full((height, width, 2), np.nan) if before is None else motion_vectors(scene, now, before)
         stack = render_stack(scene, spp, frame_seed(seed, frame), progress=progress(frame), **options)
         stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-        yield frame, stack.replace(motion=motion)
+        stack = stack.replace(motion=motion)
+        del scene  # two scenes in memory would make kernels larger
+        yield frame, _with_dt(stack, shot, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
         before, last = now, frame
+
+
+def _with_dt(stack: GradientStack, shot: Shot, frame: int, previous: int, pairs: int, seed: int) -> GradientStack:
+    """The stack with ``dt`` and ``dt_var``."""
+    motion = stack["motion"]
+    mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
+    if np.isfinite(motion).any():
+        scene, begun = shot.at(frame), time.perf_counter()
+        now, seconds = light(scene, seed, pairs), time.perf_counter() - begun
+        del scene
+        scene, begun = shot.at(previous), time.perf_counter()
+        mean, variance = difference(now, light(scene, seed, pairs, motion))
+        stack.attributes["ngpt:seconds"] += seconds + time.perf_counter() - begun
+    stack.attributes["ngpt:pairs"] = pairs
+    return stack.replace(dt=mean, dt_var=variance)
 
 
 def _before(shot: Shot, frame: int, first: bool) -> Snapshot | None:

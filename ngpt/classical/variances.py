@@ -78,7 +78,7 @@ def smooth_variances(
     not exist, have infinite variance.
     """
     xp = module(primal_var)
-    layers = [_smoothed(primal_var), *(_smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
+    layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
     p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
     differences = xp.stack([p, p])
@@ -113,7 +113,7 @@ def _over_colours(variance: Array) -> tuple[Array, Array]:
     return xp.where(good, total, 0), good
 
 
-def _smoothed(variance: Array, outliers: bool = False) -> Array:
+def smoothed(variance: Array, outliers: bool = False) -> Array:
     """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none.
 
     With ``outliers``, means of fourth roots, and a sum that is larger than what comes of them stays as it is.

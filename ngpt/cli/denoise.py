@@ -25,6 +25,7 @@ from ngpt.cli.arguments import (
     print_json,
     stack_files,
 )
+from ngpt.cli.shot import windowed
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
@@ -90,7 +91,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--temporal",
         action="store_true",
-        help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before",
+        help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before; "
+        "with -m wcv, and differences in time by `ngpt render --dt`, by those after too",
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
@@ -129,18 +131,24 @@ def run(args: argparse.Namespace, console: Console) -> int:
     options |= {name: number(text) if name in NUMBERS else text for name, text in args.option}
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    frames = overlapped(
-        pairs,
-        partial(read_frame, args=args, files=files, again=again),
-        partial(
-            compute_frame,
-            args=args,
-            options=options,
-            reference=reference,
-            temporal=Temporal() if args.temporal else None,
-        ),
-        partial(write_frame, overwrite=args.force),
-    )
+    overwrite = partial(write_frame, overwrite=args.force)
+    frames: Any
+    if args.temporal and args.method == "wcv" and not options and has_dt(pairs, args):
+        everything = {target for _, target in pairs}
+        frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)
+    else:
+        frames = overlapped(
+            pairs,
+            partial(read_frame, args=args, files=files, again=again),
+            partial(
+                compute_frame,
+                args=args,
+                options=options,
+                reference=reference,
+                temporal=Temporal() if args.temporal else None,
+            ),
+            overwrite,
+        )
     reports = []
     with shown as progress, closing(frames):
         progress(0, len(pairs))
@@ -161,6 +169,16 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.json:
         print_json({"ok": failed == 0, "files": reports})
     return 1 if failed else 0
+
+
+def has_dt(pairs: list[tuple[Path, Path]], args: argparse.Namespace) -> bool:
+    """Whether frames have differences in time, and one of them still has to be made."""
+    if all(args.skip_existing and target.exists() for _, target in pairs):
+        return False
+    try:
+        return "dt" in read(pairs[-1][0], dict(args.layer), args.untrusted)
+    except NgptError:
+        return False
 
 
 def _unseen(done: int, total: int) -> None:

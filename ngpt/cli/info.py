@@ -131,7 +131,9 @@ def stack(stack: GradientStack) -> dict:
             for name, rate in rates.items()
         },
         "other channels": [name for name in further if name not in rates],
-        "missing": [name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples")],
+        "missing": [
+            name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples", "dt", "dt_var")
+        ],
         "proposed": [
             f'--layer {name}="{layer}"'
             for name, layer in propose([(part.name, list(part.channels)) for part in parts], resolution).items()

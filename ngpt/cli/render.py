@@ -81,6 +81,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
     )
+    shot.add_argument(
+        "--dt",
+        type=positive,
+        default=0,
+        metavar="PAIRS",
+        help="write differences to the frame before too, of so many pairs of paths a pixel (2 or more), for "
+        "`ngpt denoise --temporal -m wcv`: a quarter of --spp is enough",
+    )
     shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
     shot.add_argument(
         "--shard", type=part, metavar="i/n", help="render only this part of the frames, for job arrays: 0/4 to 3/4"
@@ -100,7 +108,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if report is not None and args.json:
             print_json(report)
         return 0 if report is not None else 130
-    apart = {"--camera": args.camera, "--shard": args.shard, "--cluster": args.cluster}
+    apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
             raise NgptError(f"{option} belongs to a sequence; name its frames: --frames 0:120")
@@ -223,6 +231,8 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
     def describe(frame: int) -> tuple[str, dict[str, str]]:
         return filled(args.scene, frame), {name: filled(text, frame) for name, text in define.items()}
 
+    if args.dt == 1:
+        raise NgptError("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
     describe(args.frames[0])
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
@@ -259,6 +269,7 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
             args.frames,
             spp,
             args.seed,
+            args.dt,
             skip,
             sampler=args.sampler,
             seconds=args.time,

@@ -137,3 +137,13 @@ def test_a_wrong_path_is_refused_with_its_place(tmp_path, text, complaint):
     path.write_text(text)
     with pytest.raises(NgptError, match=complaint):
         read_camera_path(path)
+
+
+def test_differences_in_time_load_the_scene_before_again(renderer, tmp_path):
+    all_of_them = rendered(shot(tmp_path), range(1, 4), dt=2)
+    farm = rendered(shot(tmp_path), range(2, 4), skip=lambda frame: frame < 3, dt=2)
+    plain = rendered(shot(tmp_path), range(1, 4))
+    for name in ("dt", "dt_var", "primal", "motion"):
+        assert np.array_equal(farm[3][name], all_of_them[3][name], equal_nan=True), name
+    assert all(np.array_equal(plain[f]["primal"], stack["primal"]) for f, stack in all_of_them.items())
+    assert np.isfinite(farm[3]["dt"]).any() and np.nanmax(np.abs(farm[3]["dt"])) > 0

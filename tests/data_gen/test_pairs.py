@@ -1,0 +1,148 @@
+"""Differences in time from paired samples: their mean, how little they vary, and where they are not known."""
+
+import numpy as np
+import pytest
+
+from ngpt.testing import z_test
+
+SIZE = (24, 16)
+
+
+def moving(scene, camera=0.0, **moved):
+    """A shot of a built-in scene whose camera goes to the right, and whose shapes go somewhere, by so much a frame."""
+    import mitsuba as mi
+
+    from data_gen.frames.sequence import Shot
+
+    start = {}
+
+    def update(params, frame):
+        for name, way in ({"sensor": (camera, 0, 0)} | moved).items():
+            key = f"{name}.to_world"
+            start.setdefault(key, mi.Transform4f(params[key]))
+            there = mi.Transform4f(mi.ScalarTransform4f().translate([frame * step for step in way]))
+            params[key] = there @ start[key]
+
+    return Shot(lambda frame: (scene, {}), SIZE, update=update)
+
+
+def estimates(shot, count, pairs):
+    """dt of frame 1 with ``count`` seeds, the same of samples that are no pairs, its variances, the frame's light."""
+    from data_gen.frames.motion import motion_vectors
+    from data_gen.frames.pairs import difference, light
+
+    seeds = range(count)
+    before = shot.snapshot(0)
+    now = shot.snapshot(1)
+    motion = motion_vectors(shot.at(1), now, before)
+    here = [light(shot.at(1), seed, pairs) for seed in seeds]
+    shot.at(0)
+    there = [light(shot.at(0), seed, pairs, motion) for seed in seeds]
+    other = [light(shot.at(0), 1000 + seed, pairs, motion) for seed in seeds]
+    alone = [light(shot.at(1), 2000 + seed, pairs) for seed in seeds]
+    paired = [difference(a, b) for a, b in zip(here, there, strict=True)]
+    apart = [difference(a, b)[0] for a, b in zip(alone, other, strict=True)]
+    values = [np.average([m for _, m in one], axis=0, weights=[n for n, _ in one]) for one in here]
+    return np.stack([mean for mean, _ in paired]), np.stack(apart), np.stack([v for _, v in paired]), np.stack(values)
+
+
+@pytest.mark.parametrize(
+    ("scene", "camera", "moved"),
+    [
+        ("diffuse", 0.05, {}),
+        ("diffuse", 0.0, {"lamp": (0.3, 0, 0), "ball": (-0.1, 0, 0)}),
+        ("glossy", 0.02, {"lamp": (-0.2, 0, 0)}),
+    ],
+)
+def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, camera, moved):
+    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
+    paired, apart, _, _ = estimates(moving(scene, camera, **moved), 16, 16)
+    known = np.isfinite(paired[0]).all(axis=-1)
+    assert known.mean() > 0.85
+    paired, apart = (np.where(known[..., None], each, 0) for each in (paired, apart))
+    result = z_test(paired, apart, block=4)
+    assert result.passed, str(result)
+    if "lamp" in moved:  # It could have failed: the difference is large, and the other sign of it is found out.
+        assert not z_test(-paired, apart, block=4).passed
+
+
+def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
+    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
+    from data_gen.render import render_stack
+
+    shot = moving("diffuse", lamp=(0.3, 0, 0))
+    paired, _, _, _ = estimates(shot, 16, 16)
+
+    def frames(frame, seed):
+        layers = render_stack(shot.at(frame), 64, seed, "gpt-basic").layers
+        return layers["primal"] - layers["direct"]
+
+    later = [frames(1, seed) for seed in range(8)]
+    earlier = [frames(0, 100 + seed) for seed in range(8)]
+    truth = np.stack([a - b for a, b in zip(later, earlier, strict=True)])
+    assert z_test(paired, truth, block=4).passed
+
+
+@pytest.mark.parametrize(
+    ("scene", "camera", "moved", "most"),
+    [
+        ("diffuse", 0.02, {}, 0.05),
+        ("diffuse", 0.0, {"lamp": (0.04, 0, 0)}, 0.05),
+        ("glossy", 0.02, {}, 0.5),
+        ("glossy", 0.0, {"gold": (0.03, 0, 0)}, 0.5),
+    ],
+)
+def test_slow_changes_have_little_noise(renderer, scene, camera, moved, most):
+    paired, _, variances, values = estimates(moving(scene, camera, **moved), 12, 8)
+    noise, of_light = np.nanvar(paired, axis=0), np.nanvar(values, axis=0)
+    # Of typical pixels: the mean is that of a few.
+    ratio = np.nanmean(np.sqrt(noise)) ** 2 / np.nanmean(np.sqrt(of_light)) ** 2
+    assert ratio < most
+    assert np.nanmean(variances) == pytest.approx(np.nanmean(noise), rel=0.5)
+
+
+def test_where_nothing_changes_it_is_zero(renderer):
+    paired, _, variances, _ = estimates(moving("diffuse"), 1, 5)
+    assert not paired.any() and not variances.any()
+
+
+def test_it_is_not_known_where_motion_is_not_or_leads_off_the_film(renderer):
+    from data_gen.frames.pairs import difference, light
+
+    scene = moving("diffuse").at(0)
+    motion = np.zeros((*SIZE[::-1], 2))
+    motion[3, 4] = np.nan
+    motion[5, :2] = -3, 0
+    dt, variance = difference(light(scene, 1, 2), light(scene, 1, 2, motion))
+    unknown = np.zeros(SIZE[::-1], bool)
+    unknown[3, 4] = unknown[5, :2] = True
+    assert np.array_equal(np.isnan(dt).any(axis=-1), unknown) and np.array_equal(np.isnan(variance).all(-1), unknown)
+
+
+def test_batches_count_by_their_samples(rng):
+    from data_gen.frames.pairs import difference
+
+    samples = rng.normal(1, 2, (1000, 5, 1, 1, 3))
+    parts = [samples[:, :2].mean(axis=1), samples[:, 2:4].mean(axis=1), samples[:, 4:].mean(axis=1)]
+    zero = [(n, np.zeros((1, 1, 3))) for n in (2, 2, 1)]
+    found = [difference([(n, part[i]) for n, part in zip((2, 2, 1), parts, strict=True)], zero) for i in range(1000)]
+    means, variances = (np.stack(each) for each in zip(*found, strict=True))
+    assert np.allclose(means, samples.mean(axis=1), atol=1e-5)
+    assert variances.mean() == pytest.approx(4 / 5, rel=0.1) == pytest.approx(means.var(), rel=0.2)
+    assert np.isnan(difference(zero[:1], zero[:1])[1]).all()
+
+
+def test_sequences_have_it_and_nothing_else_changes(renderer):
+    from data_gen.frames.sequence import render_sequence
+
+    def stacks(frames, **options):
+        shot = moving("diffuse", 0.05, lamp=(0.1, 0, 0))
+        return dict(render_sequence(shot, frames, 2, 7, sampler="primal", **options))
+
+    plain, paired = stacks([0, 1, 2]), stacks([0, 1, 2], dt=3)
+    for frame, stack in plain.items():
+        assert all(np.array_equal(stack[name], paired[frame][name], equal_nan=True) for name in stack.names)
+        assert {"dt", "dt_var"} & set(stack.names) == set()
+    assert np.array_equal(stacks([2], dt=3)[2]["dt"], paired[2]["dt"], equal_nan=True)
+    assert paired[2].attributes["ngpt:pairs"] == 3
+    assert not np.array_equal(paired[1]["dt"], paired[2]["dt"]) and np.isfinite(paired[1]["dt"]).mean() > 0.8
