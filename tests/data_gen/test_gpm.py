@@ -172,9 +172,8 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     end.p, end.n = both(starts.end.p, start.end.p), both(starts.end.n, start.end.n)
     # Le cos / p with its own p
     β = both(starts.β, dr.select(ratio > 0, turned.β / ratio, 0))
-    more_starts = LightRay(
-        ray, β, both(starts.emitter, start.emitter), both(starts.index, start.index), end, both(starts.delta, start.delta)
-    )
+    kinds = (both(getattr(starts, name), getattr(start, name)) for name in ("emitter", "index"))
+    more_starts = LightRay(ray, β, *kinds, end, both(starts.delta, start.delta))
     copied = Photon(moved.p, moved.n, moved.d, moved.Φ)
     back, r_back, good_back = copy(scene, *ends, more_starts, more, lane + n, copied, y, x, r2, good)
     good, good_back = np.array(good), np.array(good_back)
@@ -224,12 +223,19 @@ def assert_no_bias(z):
     assert np.abs(z).max() < 4.5 and np.mean(z**2) < 1.5, (np.abs(z).max(), np.mean(z**2))
 
 
+def without_glass():
+    """The sky, whose sun no camera path meets by chance: that is rarer than any test has samples for."""
+    scene = SCENES["sky"]()
+    del scene["glass"]
+    return scene
+
+
 @pytest.mark.parametrize("pixels", [1, 4])
 @pytest.mark.parametrize("name", ["areas", "sky", "points", "glass"])
 def test_differences_are_those_of_the_image(renderer, name, pixels):
     """In one pass after another: with the same photons, so that the noise of both falls out in part."""
-    scene = load(renderer, SCENES[name], (16, 16))
-    stacks = passes(scene, 32, pixels, radius=0.7, photons=4)
+    scene = load(renderer, without_glass if name == "sky" else SCENES[name], (12, 12))
+    stacks = passes(scene, 32, pixels, radius=0.7, photons=2)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(paired(stacks, pixels, 4))
 

@@ -102,7 +102,7 @@ class GPM(PPM):
 
 
 class Gathering:
-    """The photons of a map, gathered within ``radius`` with all their copies; ``paths`` light paths have brought them."""
+    """The photons of a map, gathered within ``radius`` with all copies; ``paths`` light paths have brought them."""
 
     def __init__(self, scene, lights, materials, starts, photons, radius: float, paths: int):
         self.scene, self.lights, self.materials, self.starts, self.photons = scene, lights, materials, starts, photons

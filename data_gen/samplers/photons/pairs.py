@@ -37,9 +37,8 @@ class Pairs:
 
 
 def pieces(grid: Grid, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, most: int) -> Iterator[Pairs]:
-    """All pairs of the points ``p`` that are ``active`` and what the ``grid`` has nearer to them, ``most`` at a time."""
-    n = dr.width(p)
-    none = dr.zeros(mi.UInt32, n)
+    """All pairs of ``active`` points ``p`` and what the ``grid`` has nearer to them, at most so many at a time."""
+    none = dr.zeros(mi.UInt32, dr.width(p))
     (count,) = grid.each(
         p, radius2, active, lambda state, i, near: (state[0] + dr.select(near, mi.UInt32(1), 0),), (none,)
     )
@@ -47,23 +46,26 @@ def pieces(grid: Grid, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, most: 
     dr.eval(count, first, active)
     total = int(dr.sum(count)[0])
     for low in range(0, total, most):
-        size = min(most, total - low)
-        begin, length = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
-        inside = active & (first < begin + length) & (first + count > begin)
-        point, place = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
-        lane = dr.arange(mi.UInt32, n)
+        yield piece(grid, p, radius2, active, first, count, low, min(most, total - low))
 
-        def write(state, i, near):
-            # Below ``begin`` the difference is larger than any length.
-            at = state[0] - begin
-            known = near & (at < length)
-            dr.scatter(point, lane, at, known)
-            dr.scatter(place, i, at, known)
-            return (dr.select(near, state[0] + 1, state[0]),)
 
-        end = grid.each(p, radius2, inside, write, (mi.UInt32(first),))
-        dr.eval(end, point, place)
-        last = dr.minimum(first + count, begin + length)
-        here = mi.UInt32(dr.maximum(first, begin))
-        here, last = (dr.select(inside, x - begin, 0) for x in (here, last))
-        yield Pairs(point, place, here, last)
+def piece(grid: Grid, p, radius2, active, first: mi.UInt32, count: mi.UInt32, low: int, size: int) -> Pairs:
+    """The ``size`` pairs from number ``low`` on; those of a point begin at ``first`` and are ``count``."""
+    begin, length = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+    inside = active & (first < begin + length) & (first + count > begin)
+    point, place = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
+    lane = dr.arange(mi.UInt32, dr.width(p))
+
+    def write(state, i, near):
+        # Below ``begin`` the difference is larger than any length.
+        at = state[0] - begin
+        known = near & (at < length)
+        dr.scatter(point, lane, at, known)
+        dr.scatter(place, i, at, known)
+        return (dr.select(near, state[0] + 1, state[0]),)
+
+    end = grid.each(p, radius2, inside, write, (mi.UInt32(first),))
+    dr.eval(end, point, place)
+    last = dr.minimum(first + count, begin + length)
+    start = dr.maximum(first, begin)
+    return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))
