@@ -1,6 +1,6 @@
 """Photons with and without gradients, path tracing with and without: errors at equal time on scenes with caustics.
 
-    python -m bench.photons --scenes glossy SCENE.xml ... --picture docs/images/photons.jpg
+    python -m bench.photons --cache out/photons --scenes glossy SCENE.xml ... --picture docs/images/photons.jpg
 
 Time is processor time of all threads together, so that other work on the machine does not change the comparison. What a
 sample costs is measured between two renders of one sampler; each gets as many as --seconds buy. The time in which the
@@ -8,10 +8,11 @@ kernels of a pass are recorded counts. The reference is made by photons, in two 
 --reference-spp passes each with 4 photons for each pixel within 1 pixel at first: path tracing does not find all the
 light here. Its blur is that of the photon maps, a little, on the photons' side. Errors are the trimmed relMSE.
 
-The picture shows the first row of methods of each scene, with the reference beside them.
+The picture has a row for each scene. Scenes that are in the cache are not rendered again.
 """
 
 import argparse
+import json
 import time
 from pathlib import Path
 
@@ -44,6 +45,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
+    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("-o", "--output", default="bench/results/photons.json")
     args = parser.parse_args()
@@ -60,7 +62,13 @@ def main() -> None:
     result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
     rows = []
     for scene in args.scenes:
-        row, images = bench_scene(scene, args)
+        file = args.cache / f"{scene_name(scene)}.npz"
+        if not file.exists():
+            row, images = bench_scene(scene, args)
+            args.cache.mkdir(parents=True, exist_ok=True)
+            np.savez(file, json.dumps(row), *images)
+        row, *images = np.load(file).values()
+        row = json.loads(str(row))
         result["scenes"][scene_name(scene)] = row
         rows.append(images)
         save(args.output, result)

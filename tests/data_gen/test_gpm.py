@@ -218,9 +218,10 @@ def paired(stacks, pixels, block):
     return (blocks.mean(axis=0) / np.where(error > 0, error, np.inf)).ravel()
 
 
-def assert_no_bias(z):
-    """The largest z, and the sum of all squares: 32 stacks have z with a standard deviation of 1.03."""
-    assert np.abs(z).max() < 4.5 and np.mean(z**2) < 1.5, (np.abs(z).max(), np.mean(z**2))
+def assert_no_bias(stacks, pixels):
+    """The largest z of blocks of 4x4 pixels, and the mean of all squares of 2x2."""
+    largest, squares = np.abs(paired(stacks, pixels, 4)).max(), np.mean(paired(stacks, pixels, 2) ** 2)
+    assert largest < 4.5 and squares < 1.6, (largest, squares)
 
 
 def without_glass():
@@ -237,7 +238,17 @@ def test_differences_are_those_of_the_image(renderer, name, pixels):
     scene = load(renderer, without_glass if name == "sky" else SCENES[name], (12, 12))
     stacks = passes(scene, 32, pixels, radius=0.7, photons=2)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
-    assert_no_bias(paired(stacks, pixels, 4))
+    assert_no_bias(stacks, pixels)
+
+
+def test_a_wrong_jacobian_is_found(renderer, monkeypatch):
+    """By the same test: J = 1 has even less noise. Measured with 64 passes: a mean of z² of 13, with J one of 0.95."""
+    from data_gen.samplers.photons import shift
+
+    monkeypatch.setattr(shift, "jacobian", lambda d, n, length2, d1, m, length2_1: 0 * length2_1 + 1)
+    stacks = passes(load(renderer, "diffuse", (16, 16)), 32, 4, radius=0.7, photons=2)
+    with pytest.raises(AssertionError):
+        assert_no_bias(stacks, 4)
 
 
 @pytest.mark.parametrize("name", ["glass", "glossy"])
