@@ -251,7 +251,7 @@ def test_a_wrong_jacobian_is_found(renderer, monkeypatch):
         assert_no_bias(stacks, 4)
 
 
-@pytest.mark.parametrize("name", ["glass", "glossy"])
+@pytest.mark.parametrize("name", ["glass", "glossy", "hidden_sky"])
 def test_the_primal_is_that_of_ppm(renderer, name):
     """The same camera paths and photons; Russian roulette alone looks at five paths instead of one."""
 

@@ -65,29 +65,30 @@ class GPM(PPM):
     def sample_pass(self, scene, lights, materials, width: float, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path and its four shifts for each camera sample, of which a pixel has one."""
         rays = [camera.rays(), *(camera.rays(shift) for shift in SHIFTS.values())]
-        ray, importance, _ = rays[0]
+        ray, n = rays[0][0], dr.width(camera.pixel)
         random = camera.random.clone()
         keys = random.next_key(), random.next_key()
         radius = self.radius * width * shrunk(camera.first)
         values = features(scene, camera.sensor, camera.random.clone(), ray)
-        _, Le = self.camera_path(scene, materials, random.clone(), ray, importance)
-        dr.eval(values, Le)
+        dr.eval(values)
         random.schedule_state()
 
         def walk():
             paths = materials, random.clone(), rays, self.first_hit, self.hide_emitters
             return levels(scene, *paths, self.max_depth, self.rr_depth)
 
-        n = dr.width(ray.o)
         # The primal, the four Δ, and how many photons were gathered and had no copy
         sums = [dr.zeros(mi.Spectrum, n) for _ in range(1 + len(SHIFTS))] + [dr.zeros(mi.Point2f, n)]
+        Le = mi.Spectrum(0)
         for level in walk():
             if level.depth > 1:
                 add_to(sums, level.lanes, emitted(scene, level))
+            elif self.max_depth > 0:
+                Le = level.base.emission(scene)
         if lights.emitters is not None and self.max_depth > 1:
             starts, maps = self.photon_maps(scene, lights, materials, keys)
             for photons in maps:
-                gathering = Gathering(scene, lights, materials, starts, photons, radius, self.photons * n)
+                gathering = WithCopies(scene, lights, materials, starts, photons, radius, self.photons * n)
                 for level in walk():
                     if level.depth < self.max_depth:
                         for part in gathering.differences(level, self.max_depth - level.depth, PAIRS * n):
@@ -101,7 +102,7 @@ class GPM(PPM):
             film.put(name, to_rgb(difference, ray.wavelengths), inside)
 
 
-class Gathering:
+class WithCopies:
     """The photons of a map, gathered within ``radius`` with all copies; ``paths`` light paths have brought them."""
 
     def __init__(self, scene, lights, materials, starts, photons, radius: float, paths: int):
