@@ -221,7 +221,9 @@ class Denoiser:
         beside = {name: value for name, value in (given | layers).items() if value is not None}
         arrays = _layers("Denoiser", beside, size)
         if "normals" in arrays:
-            arrays["normal"] = (arrays.pop("normals") @ _rotation(to_sensor).T).astype(np.float32) * _TO_CAMERA
+            # Normals that are not finite stay so, and are repaired where all layers are.
+            with np.errstate(invalid="ignore", over="ignore"):
+                arrays["normal"] = (arrays.pop("normals") @ _rotation(to_sensor).T).astype(np.float32) * _TO_CAMERA
         result = _denoised("Denoiser", pixels, arrays, self.method, self.options)
         if self.denoise_alpha and pixels.shape[2] == 4:
             result = np.concatenate([result[..., :3], _alpha(pixels[..., 3:], arrays)], axis=-1)

@@ -2,6 +2,7 @@
 
 import ast
 import inspect
+import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import get_overloads
@@ -217,6 +218,16 @@ def test_transforms_may_scale_and_not_flatten(arrays):
     for flat in (np.diag([1, 1, 0]), np.full((3, 3), np.nan)):
         with pytest.raises(NgptError, match="to_sensor has determinant"):
             denoiser(*arguments, flat)
+
+
+@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 3.4e38])
+def test_normals_that_are_not_finite_are_repaired_in_silence(arrays, value):
+    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
+    arrays["normals"][3, 4] = value
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        result = denoiser(*(arrays[name] for name in ("noisy", "albedo", "normals")), 2 * np.eye(4))
+    assert np.isfinite(result).all()
 
 
 def test_bad_calls(arrays):

@@ -7,6 +7,7 @@ from glob import glob
 from pathlib import Path
 
 from data_gen.samplers import find
+from data_gen.scenes.procedural.variety import SHARES
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
 from ngpt.system.records import from_table, read_toml
@@ -38,17 +39,28 @@ class Config:
     reference_method: str = "wcv"
     scenes: int = 0
     varied: bool = False
+    sights: dict[str, float] = field(default_factory=dict)
     crops: int = 4
     files: tuple[Files, ...] = ()
 
     def __post_init__(self) -> None:
         low, high = self.spp
+        unknown = ", ".join(f"'{name}'" for name in self.sights if name not in SHARES)
         for bad, text in (
             (not 2 <= low <= high, f"spp = [{low}, {high}]: at least 2 (one sample has no variance), low to high"),
             (self.size < 8, f"size = {self.size}: at least 8 pixels"),
             (min(self.inputs, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
             (self.reference_spp < 4, f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves"),
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
+            (
+                bool(unknown),
+                f"sights: no sight is called {unknown}; there are {', '.join(SHARES)}",
+            ),
+            (
+                not all(0 <= share <= 1 for share in self.sights.values()),
+                f"sights = {self.sights}: each is the share of scenes that have it, 0 to 1",
+            ),
+            (bool(self.sights) and not self.varied, "sights are those of varied scenes; set varied = true"),
             (not self.scenes and not self.files, "no scenes: set scenes = N, or add a [[files]] table"),
         ):
             if bad:

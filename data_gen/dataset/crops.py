@@ -85,8 +85,9 @@ def scene_seed(config: Config, name: str) -> tuple[int, int]:
 
 def made_scene(config: Config, name: str, folder: Path) -> Path:
     from data_gen.scenes.procedural.scenes import make_scene
+    from data_gen.scenes.procedural.variety import SHARES
 
-    return make_scene(scene_seed(config, name), folder, config.varied)
+    return make_scene(scene_seed(config, name), folder, SHARES | config.sights if config.varied else None)
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:

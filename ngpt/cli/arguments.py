@@ -3,6 +3,7 @@
 import argparse
 import glob
 import json
+import re
 from pathlib import Path
 
 from ngpt.errors import NgptError
@@ -134,3 +135,11 @@ def _strict(value):
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
     return value
+
+
+def part(text: str) -> tuple[int, int]:
+    """``i/n``, the part i of n, counted from 0."""
+    match = re.fullmatch(r"(\d+)/(\d+)", text)
+    if not match or int(match[1]) >= int(match[2]):
+        raise argparse.ArgumentTypeError(f"'{text}' is not i/n with 0 <= i < n, such as 0/4")
+    return int(match[1]), int(match[2])

@@ -1,10 +1,9 @@
 """``ngpt dataset``: makes a training set, or continues one."""
 
 import argparse
-import re
 from pathlib import Path
 
-from ngpt.cli.arguments import add_config
+from ngpt.cli.arguments import add_config, part
 from ngpt.system import configs
 from ngpt.system.console import Console
 
@@ -34,10 +33,3 @@ def run(args: argparse.Namespace, console: Console) -> int:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
     write_card(args.out)
     return 0
-
-
-def part(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)/(\d+)", text)
-    if not match or int(match[1]) >= int(match[2]):
-        raise argparse.ArgumentTypeError(f"'{text}' is not i/n with 0 <= i < n, such as 0/4")
-    return int(match[1]), int(match[2])

@@ -3,11 +3,12 @@
 import argparse
 import signal
 from collections.abc import Callable, Iterator
+from concurrent.futures import as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
 from data_gen.samplers import summaries
-from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, positive, print_json, size
+from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.cli.frames import filled, frames, targets, varies
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
@@ -15,6 +16,8 @@ from ngpt.system.console import Console
 from ngpt.system.files import check_output
 
 DEFAULT_SPP = 32
+# Of a cluster: frames that a worker renders with one scene in memory, and kernels compiled once.
+FRAMES_OF_A_PART = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -79,6 +82,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
     )
     shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
+    shot.add_argument(
+        "--shard", type=part, metavar="i/n", help="render only this part of the frames, for job arrays: 0/4 to 3/4"
+    )
+    shot.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to render the frames on")
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
@@ -89,8 +96,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     if args.frames:
-        return run_frames(args, console)
-    for option, given in (("--camera", args.camera), ("--skip-existing", args.skip_existing)):
+        report = on_cluster(args, console) if args.cluster else render_frames(args, console)
+        if report is not None and args.json:
+            print_json(report)
+        return 0 if report is not None else 130
+    apart = {"--camera": args.camera, "--shard": args.shard, "--cluster": args.cluster}
+    for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
             raise NgptError(f"{option} belongs to a sequence; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):
@@ -163,13 +174,50 @@ def sharing(args: argparse.Namespace):
     return Adaptive(args.error, args.method or "auto")
 
 
-def run_frames(args: argparse.Namespace, console: Console) -> int:
-    """``--frames``: a stack for each."""
+def on_cluster(args: argparse.Namespace, console: Console) -> dict:
+    """``render_frames`` in parts, each on a worker of a Dask cluster; what is there already is not made again."""
+    if args.shard:
+        raise NgptError("--cluster shares the frames out by itself; leave --shard out")
+    for target in targets(args.output, args.scene, args.frames).values():
+        check_output(target, args.force or args.skip_existing)
+    from data_gen.dataset.jobs import cluster
+
+    parts = -(-len(args.frames) // FRAMES_OF_A_PART)
+    # A part that is tried again, since its worker died, goes on.
+    each = vars(args) | {"cluster": None, "skip_existing": args.skip_existing or not args.force}
+    reports: dict = {"frames": [], "skipped": 0}
+    with cluster(args.cluster) as workers, console.progress(f"render {args.scene}", "frames") as progress:
+        progress(0, len(args.frames))
+        futures = [workers.submit(_render_part, each | {"shard": (i, parts)}) for i in range(parts)]
+        for future in as_completed(futures):
+            report = future.result()
+            reports = {name: reports[name] + report[name] for name in reports}
+            progress(len(reports["frames"]) + reports["skipped"], len(args.frames))
+    reports["frames"].sort(key=lambda report: args.frames.index(report["frame"]))
+    return reports
+
+
+def _render_part(args: dict) -> dict:
+    report = render_frames(argparse.Namespace(**args), Console(quiet=True))
+    if report is None:
+        raise NgptError("a worker was interrupted; run the same command with --skip-existing to continue")
+    return report
+
+
+def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
+    """A stack for each frame of ``--frames``, or of the part of them in ``--shard``: what ``--json`` prints of them.
+
+    None where it was interrupted.
+    """
     if args.adaptive or args.error is not None or args.method is not None:
         raise NgptError("--adaptive, --error and --for are for single images; leave them out with --frames")
     places = targets(args.output, args.scene, args.frames)
-    for target in places.values():
-        check_output(target, args.force or args.skip_existing)
+    number, parts = args.shard or (0, 1)
+    # Of frames side by side, each needs the scene of the one before.
+    part_of = {frame: i * parts // len(places) for i, frame in enumerate(places)}
+    ours = [frame for frame in places if part_of[frame] == number]
+    for frame in ours:
+        check_output(places[frame], args.force or args.skip_existing)
     define = dict(args.define)
 
     def describe(frame: int) -> tuple[str, dict[str, str]]:
@@ -198,12 +246,14 @@ def run_frames(args: argparse.Namespace, console: Console) -> int:
     def skip(frame: int) -> bool:
         # Only when its turn has come, for several machines may be at work on one sequence.
         nonlocal skipped
+        if part_of[frame] != number:
+            return True
         there = args.skip_existing and places[frame].exists()
         skipped += there
         return there
 
     with console.progress(f"render {args.scene}", "frames") as progress, stop_on_ctrl_c() as stop:
-        progress(0, len(places))
+        progress(0, len(ours))
         for frame, stack in render_sequence(
             shot,
             args.frames,
@@ -219,7 +269,7 @@ def run_frames(args: argparse.Namespace, console: Console) -> int:
             done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
             if stop():
                 console.error(f"interrupted: frame {frame} is left out; --skip-existing goes on with it")
-                return 130
+                return None
             if stack.attributes["ngpt:discarded"]:
                 console.say(f"frame {frame}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
             target = places[frame]
@@ -228,14 +278,12 @@ def run_frames(args: argparse.Namespace, console: Console) -> int:
                 write(target, stack, overwrite=args.force)
             size = f"{stack.width}x{stack.height}"
             console.say(f"{describe(frame)[0]} frame {frame} -> {target}: {size}, {done} spp, {seconds:.2f} s")
-            ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
-            reports.append({"output": str(target), "width": stack.width, "height": stack.height} | ours)
-            progress(len(reports) + skipped, len(places))
+            made = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
+            reports.append({"output": str(target), "width": stack.width, "height": stack.height} | made)
+            progress(len(reports) + skipped, len(ours))
     if skipped:
-        console.say(f"{skipped} of {len(places)} frames were skipped: their stacks are there")
-    if args.json:
-        print_json({"frames": reports, "skipped": skipped})
-    return 0
+        console.say(f"{skipped} of {len(ours)} frames were skipped: their stacks are there")
+    return {"frames": reports, "skipped": skipped}
 
 
 @contextmanager

@@ -9,7 +9,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image
-from ngpt.measure.flicker import flicker, flicker_maps
+from ngpt.measure.flicker import change_maps, flicker, flicker_maps
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
@@ -24,12 +24,13 @@ FLICKER = (
     "mean of (d - d_r)^2 / (m + 0.001), d the change along motion from the frame before, d_r that of the reference r, "
     "m the mean of r^2 in both frames"
 )
+CHANGE = "map of the root of d^2 / (m + 0.001), with the mean m of the squared picture in both frames"
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Folders are sequences: each frame is a tab, and with a folder of references there is a table of errors and "
+        "Folders are sequences: the page plays them, and with a folder of references there is a table of errors and "
         "flicker."
     )
     parser.add_argument(
@@ -87,7 +88,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 
 def run_sequences(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
-    """Folders of frames of equal names: a tab for each frame, and what is measured over all of them."""
+    """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
     frames = frames_of(folders)
     first = read_image(Path(folders[0]) / frames[0])
@@ -104,35 +105,54 @@ def run_sequences(args: argparse.Namespace, names: list[str], target: Path, cons
                 check_size(path, image, str(Path(folders[0]) / frames[0]), first)
             reference = images.pop() if args.ref else None
             entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+            motions.append(motion_of(paths))
             if reference is not None:
-                motions.append(motion_of(paths))
                 for entry, path in zip(entries, paths, strict=False):
                     add_errors(entry, metrics, reference, path, paths[-1])
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             size = f"{first.shape[1]}x{first.shape[0]}"
             scenes.append(Scene(Path(frame).stem, f"{frame}, {size}", reference, entries, rising=rising))
     tables = {}
+    for place in range(len(names)):
+        add_maps(scenes, place, "change", change_maps([scene.entries[place].image for scene in scenes], motions))
     if args.ref and len(frames) > 1:
         references = [np.asarray(scene.reference) for scene in scenes]
         rows = [["", *metrics, "flicker"]]
         for place, name in enumerate(names):
             images = [scene.entries[place].image for scene in scenes]
-            for scene, changes in zip(scenes[1:], flicker_maps(images, references, motions), strict=True):
-                scene.entries[place].maps["flicker"] = np.clip(np.sqrt(np.nan_to_num(changes.mean(axis=-1))), 0, 1)
+            add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
             print(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
+    formulas |= {"change": CHANGE} if len(frames) > 1 else {}
     overview = Overview(tables=tables, formulas=formulas)
     title = f"{', '.join(names)}: {len(frames)} frames"
     facts = {"ngpt": __version__}
-    write_report(target, title, scenes, command=args.command, footer=facts, overview=overview, overwrite=args.force)
+    write_report(
+        target,
+        title,
+        scenes,
+        command=args.command,
+        footer=facts,
+        overview=overview,
+        overwrite=args.force,
+        sequence=True,
+    )
     if large := oversize(target):
         console.say(large)
     console.say(f"{target}: open it in a browser")
     return 0
+
+
+def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarray]) -> None:
+    """Maps of squared relative changes, one for each frame but the first, to the pictures at ``place``."""
+    for scene, change in zip(scenes, [np.zeros((1, 1, 3)), *changes], strict=True):
+        image = scene.entries[place].image
+        values = np.clip(np.sqrt(np.nan_to_num(change.mean(axis=-1))), 0, 1)
+        scene.entries[place].maps[name] = np.broadcast_to(values, image.shape[:2])
 
 
 def motion_of(paths: list[str]) -> np.ndarray | None:

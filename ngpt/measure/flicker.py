@@ -25,17 +25,35 @@ def flicker_maps(
             "frames or more, and as many of each"
         )
     errors = [np.asarray(image, np.float64) - reference for image, reference in zip(images, references, strict=True)]
+    return _changes(errors, references, motions)
+
+
+def change_maps(images: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]) -> list[np.ndarray]:
+    """(H, W, 3) for each frame but the first: d² / (m + 1e-3), NaN where d is not known.
+
+    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, m the mean of x² in both
+    frames: all that changes, flicker and light that moves. A frame without motion (None) is taken for one at rest.
+    """
+    still = np.zeros((*np.shape(images[0])[:2], 2)) if len(images) else None
+    images = [np.asarray(image, np.float64) for image in images]
+    return _changes(images, images, [still if motion is None else motion for motion in motions])
+
+
+def _changes(
+    values: Sequence[np.ndarray], levels: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
+) -> list[np.ndarray]:
+    """Squared differences in time along motion, over the mean of squared ``levels`` in both frames."""
     maps = []
-    squares = [np.square(reference, dtype=np.float64) for reference in references]
-    pairs = zip(errors, errors[1:], squares, squares[1:], motions[1:], strict=False)
-    for last, error, square_before, square, motion in pairs:
+    squares = [np.square(level, dtype=np.float64) for level in levels]
+    pairs = zip(values, values[1:], squares, squares[1:], motions[1:], strict=False)
+    for last, value, square_before, square, motion in pairs:
         if motion is None:
-            maps.append(np.full(error.shape, np.nan))
+            maps.append(np.full(value.shape, np.nan))
             continue
         before, found = warped(last, motion)
         # Of both frames: what goes from a lamp to what is dark beside it is not worth thousands of other pixels.
         level = (square + warped(square_before, motion)[0]) / 2
-        relative = np.square(error - before) / (level + EPSILON)
+        relative = np.square(value - before) / (level + EPSILON)
         maps.append(np.where(found[..., None], relative, np.nan))
     return maps
 

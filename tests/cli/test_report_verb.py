@@ -125,7 +125,11 @@ def test_folders_of_frames_are_sequences(tmp_path, rng, capsys):
     assert float(rows["steady"][1]) > 0.005  # relMSE, which sees no difference
     text = page.read_text()
     assert "Means over 3 frames" in text and "along motion" in text
+    played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
+    assert played["sequence"] and all(scene["maps"][-2:] == ["change", "flicker"] for scene in played["scenes"])
+    assert len({scene["stops"] for scene in played["scenes"]}) == 1
     assert main([*words, "-o", str(tmp_path / "plain.html"), "-q"]) == 0
+    assert facts(tmp_path / "plain.html")["maps"] == ["change"]
     (tmp_path / "flickers/1.exr").unlink()
     assert main([*words, "-o", str(tmp_path / "other.html"), "-q"]) == 2
     assert "has 1.exr and" in capsys.readouterr().err

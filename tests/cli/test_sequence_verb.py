@@ -3,6 +3,7 @@
 import argparse
 import json
 
+import numpy as np
 import pytest
 
 import ngpt
@@ -84,3 +85,50 @@ def test_a_sequence_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
     assert (tmp_path / "shot/diffuse.0001.exr").read_bytes() == first
     stack = ngpt.read(tmp_path / "shot/diffuse.0002.exr")
     assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05
+
+
+def parts(renderer, tmp_path, name, monkeypatch, *more):
+    monkeypatch.chdir(tmp_path)
+    words = ["--frames", "0:10:2", "--size", "16x12", "--spp", "1", "--sampler", "primal"]
+    assert main(["render", "diffuse", *words, "-o", name, *more]) == 0
+    return {file.name: ngpt.read(file) for file in sorted((tmp_path / name).iterdir())}
+
+
+def alike(stack, other):
+    same = {name: value for name, value in stack.attributes.items() if name != "ngpt:seconds"}
+    assert same.items() <= other.attributes.items() | {("ngpt:seconds", 0)}
+    assert all(np.array_equal(stack[name], other[name], equal_nan=True) for name in stack.names)
+
+
+def test_parts_of_a_sequence_are_its_frames(renderer, tmp_path, monkeypatch, capsys):
+    whole = parts(renderer, tmp_path, "whole", monkeypatch)
+    found = [list(parts(renderer, tmp_path, f"part{i}", monkeypatch, "--shard", f"{i}/2")) for i in range(2)]
+    assert [len(names) for names in found] == [3, 2] and sorted(found[0] + found[1]) == list(whole)
+    second = parts(renderer, tmp_path, "part1", monkeypatch, "--shard", "1/2", "--force")
+    for name, stack in second.items():
+        alike(stack, whole[name])
+    assert second["diffuse.0006.exr"].attributes["ngpt:previousFrame"] == 4
+    assert main(["render", "diffuse", "--shard", "0/2", "-o", str(tmp_path / "a.exr")]) == 2
+    assert "--shard belongs to a sequence" in capsys.readouterr().err
+
+
+def test_a_cluster_renders_the_parts_that_are_missing(renderer, tmp_path, monkeypatch, capsys):
+    from data_gen.dataset import jobs
+    from ngpt.cli import render
+
+    monkeypatch.setattr(jobs, "cluster", lambda address: jobs.Serial())
+    monkeypatch.setattr(render, "FRAMES_OF_A_PART", 2)
+    whole = parts(renderer, tmp_path, "whole", monkeypatch)
+    cluster = ["--cluster", "tcp://nowhere:1", "--json"]
+    assert list(parts(renderer, tmp_path, "farm", monkeypatch, *cluster)) == list(whole)
+    report = json.loads(capsys.readouterr().out)
+    assert [frame["frame"] for frame in report["frames"]] == [0, 2, 4, 6, 8] and report["skipped"] == 0
+    (tmp_path / "farm/diffuse.0004.exr").unlink()
+    again = parts(renderer, tmp_path, "farm", monkeypatch, *cluster, "--skip-existing")
+    report = json.loads(capsys.readouterr().out)
+    assert [frame["frame"] for frame in report["frames"]] == [4] and report["skipped"] == 4
+    for name, stack in again.items():
+        alike(stack, whole[name])
+    words = ["--frames", "0:2", "--cluster", "tcp://nowhere:1", "--shard", "0/2", "-o", str(tmp_path / "other")]
+    assert main(["render", "diffuse", *words]) == 2
+    assert "leave --shard out" in capsys.readouterr().err

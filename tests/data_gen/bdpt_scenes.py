@@ -77,6 +77,31 @@ def hidden_sky():
     return scene
 
 
+def bumps():
+    """Materials with normals of their own, which the shape does not know: a wall, a floor and a pane of glass."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _diffuse, _light, _sphere
+
+    def bitmap(values):
+        bitmap = mi.Bitmap(np.asarray(values, np.float32))
+        return {"type": "bitmap", "bitmap": bitmap, "raw": True, "filter_type": "nearest"}
+
+    def tilted(x, y, bsdf):
+        normal = np.array([x, y, np.sqrt(1 - x * x - y * y)]) / 2 + 0.5
+        return {"type": "normalmap", "normalmap": bitmap(np.tile(normal, (2, 2, 1))), "bsdf": bsdf}
+
+    heights = np.random.default_rng(2).random((8, 8, 1))
+    scene = _stage(
+        lamp=_light([0, 2, 0.6], [0, -1, 0], (0.6, 0.6), (15, 12, 10)),
+        glass=_sphere([0.6, 0.35, 0.6], 0.3, tilted(0.2, 0.1, {"type": "dielectric"})),
+    )
+    scene["wall"]["bsdf"] = {"type": "twosided", "nested": tilted(0.6, 0.2, _diffuse(0.7, 0.2, 0.2))}
+    rough = {"type": "bumpmap", "arbitrary": bitmap(heights), "scale": 2.0, "bsdf": _diffuse(0.6, 0.5, 0.4)}
+    scene["floor"]["bsdf"] = {"type": "twosided", "nested": rough}
+    return scene
+
+
 def without_the_point():
     """``plenty`` but for its point light: ``path`` never sees that through the holes and the pane, light paths do."""
     scene = plenty()
@@ -91,6 +116,7 @@ SCENES = {
     "glass": glass,
     "hidden_lamp": hidden_lamp,
     "hidden_sky": hidden_sky,
+    "bumps": bumps,
     "plenty": without_the_point,
     "furnace": furnace,
     "caustics": caustics,

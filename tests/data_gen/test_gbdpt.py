@@ -52,14 +52,14 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     assert np.array(r).ravel().tolist() == [1]
 
 
-@pytest.mark.parametrize("name", ["points", "sky"])
+@pytest.mark.parametrize("name", ["points", "sky", "bumps"])
 def test_unbiased_far_away(renderer, long_passes, name):
-    """All kinds of lights; ``diffuse`` has none but a rectangle."""
+    """All kinds of lights, where ``diffuse`` has none but a rectangle; and normals that shapes do not know."""
     check(renderer, SCENES[name])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENES if name not in ("points", "sky", "diffuse")])
+@pytest.mark.parametrize("name", [name for name in SCENES if name not in ("points", "sky", "bumps", "diffuse")])
 def test_unbiased_far_away_on_more_scenes(renderer, long_passes, name):
     check(renderer, SCENES[name])
 
@@ -140,7 +140,7 @@ class Paths:
         """(Vertex, whether it is there, whether it was left smoothly, density with which it was left)"""
         from data_gen.paths.vertex import SMOOTH, event_kind
         from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, adjoint, context, cosine, leave
+        from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves
 
         mi, dr, scene, lights = self.mi, self.dr, self.scene, self.plan.lights
         si, β = scene.ray_intersect(self.first.ray), self.first.β
@@ -152,8 +152,8 @@ class Paths:
             random = self.random
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, random.next_1d(), random.next_2d(), there)
             found.append((vertex, there, event_kind(sample.sampled_type) == SMOOTH, mi.Float(sample.pdf), d))
-            d, end = leave(vertex, bsdf, sample, there)
-            β = β * f_p * adjoint(si, sample.wo)
+            d, f_p, end = light_leaves(vertex, bsdf, sample, f_p, there)
+            β = β * f_p
             there = there & (sample.pdf > 0)
             si = scene.ray_intersect(si.spawn_ray(d), there)
             there &= si.is_valid()

@@ -12,8 +12,8 @@ import pytest
 
 pytest.importorskip("mitsuba")
 
-from data_gen.dataset import jobs
-from data_gen.dataset.config import Config, read_config
+from data_gen.dataset import crops, jobs
+from data_gen.dataset.config import Config, made_name, read_config
 from data_gen.scenes.procedural import media, variety
 from data_gen.scenes.procedural.scenes import make_scene
 from data_gen.scenes.procedural.stage import Stage
@@ -43,7 +43,7 @@ def files(folder: Path) -> dict[str, bytes]:
 
 def made(tmp_path: Path, name: str, seed, varied: bool = True) -> dict[str, bytes]:
     (tmp_path / name).mkdir()
-    make_scene(seed, tmp_path / name, varied)
+    make_scene(seed, tmp_path / name, variety.SHARES if varied else None)
     return files(tmp_path / name)
 
 
@@ -135,7 +135,7 @@ def test_each_kind_renders(tmp_path, monkeypatch):
         folder = tmp_path / f"{sight}{kind}"
         folder.mkdir()
         only(monkeypatch, sight, kind=kind)
-        paths.append(str(make_scene((4, number), folder, varied=True)))
+        paths.append(str(make_scene((4, number), folder, variety.SHARES)))
         text = (folder / "scene.xml").read_text()
         assert ('"volpath"' in text) == ("<medium" in text) == (sight == "media")
     command = [sys.executable, "-c", RENDERED, *paths]
@@ -207,3 +207,18 @@ def test_a_set_begun_before_there_was_an_entry_goes_on(tmp_path):
 def test_the_configuration_of_varied_scenes():
     config = read_config(ROOT / "configs" / "data-varied.toml")
     assert config.varied and config.sampler == "auto"
+
+
+def test_a_configuration_sets_shares(tmp_path):
+    config = Config(scenes=40, varied=True, sights={"media": 1.0, "hair": 0.0})
+    plain, more = tmp_path / "plain", tmp_path / "more"
+    for number in range(40):
+        seed = crops.scene_seed(config, made_name(number))
+        sights = variety.further_sights(seed, variety.SHARES | config.sights)[0]
+        assert "media" in sights and "hair" not in sights
+        # The other sights fall to the scenes that they fell to.
+        assert sights - {"media", "hair"} == variety.further_sights(seed)[0] - {"media", "hair"}
+    plain.mkdir()
+    more.mkdir()
+    assert "<medium" not in crops.made_scene(replace(config, sights={"media": 0.0}), made_name(0), plain).read_text()
+    assert "<medium" in crops.made_scene(config, made_name(0), more).read_text()

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.measure.flicker import flicker
+from ngpt.measure.flicker import change_maps, flicker
 from ngpt.measure.metrics import relmse_trimmed
 
 REST = np.zeros((30, 40, 2))
@@ -44,3 +44,11 @@ def test_what_is_not_known_does_not_count(rng):
 def test_lists_of_different_lengths_are_refused(rng):
     with pytest.raises(NgptError, match="it takes two"):
         flicker([REST], [REST], [REST])
+
+
+def test_the_map_of_change_is_along_motion(rng):
+    wide = rng.random((30, 46, 3))
+    images = [wide[:, i : i + 40] for i in range(2)]
+    along = change_maps(images, [None, REST + np.array([1, 0])])[0]
+    assert np.isnan(along[:, -1]).all() and np.abs(along[:, :-1]).max() < 1e-20
+    assert np.isclose(change_maps([REST, REST + 2], [None, None])[0], 4 / 2.001).all()

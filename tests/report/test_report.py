@@ -336,3 +336,45 @@ def test_panes_zoom_and_pan_together_and_keys_drive_them(tmp_path):
 
 def where(shot: np.ndarray, colour: np.ndarray) -> np.ndarray:
     return np.abs(shot - colour.astype(int)).max(axis=2) <= 1
+
+
+def test_the_frames_of_a_sequence_are_played_at_one_exposure(tmp_path):
+    frames = [
+        Scene(
+            f"{i:04}", "", None, [Entry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps={"change": np.zeros((6, 8))})]
+        )
+        for i in range(3)
+    ]
+    page = write_report(tmp_path / "p.html", "t", frames, command="", footer={}, sequence=True)
+    session = Session(tmp_path / "profile", page.as_uri())
+    try:
+        assert session.ask("$('tabs').hidden") is True and session.ask("$('player').hidden") is False
+        assert session.ask("$('frame-name').textContent") == "0000, 1 of 3"
+        middle = """(() => {
+            const copy = document.createElement("canvas").getContext("2d", {willReadFrequently: true});
+            copy.drawImage($("canvas-a"), 0, 0);
+            return copy.getImageData(4, 3, 1, 1).data[0];
+        })()"""
+        levels = [session.ask(middle)]
+        for number in ("1", "2"):
+            session.key("]")
+            assert session.view()["scene"] == number
+            levels.append(session.ask(middle))
+        assert levels[0] < levels[1] < levels[2]
+        assert session.ask("[...$('maps').children].find(b => b.value === 'change').disabled") is False
+        session.ask(
+            "$('fps').value = 24; window.seen = new Set(); "
+            "new MutationObserver(() => seen.add($('at-frame').value)).observe($('frame-name'), {childList: true});"
+        )
+        session.ask("$('play').click()")
+        end = time.monotonic() + 20
+        while session.ask("seen.size") < 3 and time.monotonic() < end:
+            time.sleep(0.05)
+        assert session.ask("seen.size") == 3 and session.ask("$('play').textContent") == "pause"
+        session.ask("$('play').click()")
+        stopped = session.view()["scene"]
+        assert session.ask("$('play').textContent") == "play"
+        time.sleep(0.3)
+        assert session.view()["scene"] == stopped and session.complaints == []
+    finally:
+        session.close()

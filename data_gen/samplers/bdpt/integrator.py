@@ -38,10 +38,10 @@ from data_gen.samplers.bdpt.vertex import (
     IMPORTANCE,
     RADIANCE,
     Vertex,
-    adjoint,
     context,
     cosine,
     leave,
+    light_leaves,
     recall,
     record,
     record_class,
@@ -136,8 +136,8 @@ class BDPT(GradientIntegrator):
             # -------------------- Next vertex ------------------------
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
-            d, end = leave(y, bsdf, sample, active)
-            β *= f_p * adjoint(si, sample.wo)
+            d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
+            β *= dr.select(sample.pdf > 0, f_p, 0)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)

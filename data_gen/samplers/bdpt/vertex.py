@@ -93,20 +93,49 @@ def scatters_smoothly(bsdf: mi.BSDFPtr) -> mi.Bool:
 
 def evaluate(mode, si, bsdf, wo: mi.Vector3f, active=True) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
     """f cos for a path that goes on along ``wo`` (local), the density of that, and with both directions swapped."""
+    if mode == IMPORTANCE:
+        f, q = light_scattered(si, bsdf, wo, active)
+        p = bsdf.pdf(context(RADIANCE), si, wo, active)
+        good = dr.isfinite(p)
+        return dr.select(good, f, 0), dr.select(good, p, 0), q
     f, p = bsdf.eval_pdf(context(mode), si, wo, active)
     good = dr.isfinite(p) & dr.isfinite(dr.sum(f))
-    f, p = dr.select(good, f, 0), dr.select(good, p, 0)
-    if mode == IMPORTANCE:
-        f = f * adjoint(si, wo)
-    return f, p, reverse_density(si, bsdf, wo, active)
+    return dr.select(good, f, 0), dr.select(good, p, 0), reverse_density(si, bsdf, wo, active)
 
 
 def reverse_density(si, bsdf, wo: mi.Vector3f, active) -> mi.Float:
     """Density of sampling the direction that the path comes from, had it come along ``wo``."""
-    swapped = mi.SurfaceInteraction3f(si)
-    swapped.wi = wo
-    q = bsdf.pdf(mi.BSDFContext(), swapped, si.wi, active)
+    q = bsdf.pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
     return dr.select(dr.isfinite(q), q, 0)
+
+
+def light_scattered(si, bsdf, wo: mi.Vector3f, active) -> tuple[mi.Spectrum, mi.Float]:
+    """f cos of light that leaves along ``wo``, and the density with both directions swapped.
+
+    It is f of radiance the other way, times cos_g(wo) / cos_g(wi): so both ends agree on f of a path, whatever normals
+    a material has. Those of bump and normal maps are in f alone, and f for light has the cosine to the wrong side.
+    [Veach 1997, "Robust Monte Carlo Methods for Light Transport Simulation", section 5.3.2]
+    """
+    f, q = bsdf.eval_pdf(context(RADIANCE), _come_along(si, wo), si.wi, active)
+    f *= _quotient(cosine(si, si.to_world(wo)), cosine(si, si.to_world(si.wi)))
+    good = dr.isfinite(q) & dr.isfinite(dr.sum(f))
+    return dr.select(good, f, 0), dr.select(good, q, 0)
+
+
+def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -> tuple[mi.Spectrum, mi.Float]:
+    """f cos / p of light that leaves by a sampled event, and the density with both directions swapped.
+
+    ``f_p`` is Mitsuba's for IMPORTANCE. Of mirrors and glass it has no cosines; those are to the half-vector, which is
+    their normal, whatever the shape's is.
+    """
+    smooth = event_kind(sample.sampled_type) == SMOOTH
+    f, q = light_scattered(si, bsdf, sample.wo, active & smooth)
+    h = si.wi + sample.eta * sample.wo
+    bends = dr.abs(dr.dot(si.wi, h) / dr.dot(sample.wo, h))
+    # Straight through there is no half-vector.
+    bends = dr.select(dr.squared_norm(h) > 1e-6, bends, 1)
+    turns = _quotient(cosine(si, si.to_world(sample.wo)), cosine(si, si.to_world(si.wi)))
+    return dr.select(smooth, f * dr.rcp(sample.pdf), f_p * (bends * turns)), q
 
 
 def leave(vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active) -> tuple[mi.Vector3f, Partial]:
@@ -117,12 +146,24 @@ def leave(vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active) -> tuple[mi.Vec
     return d, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, ~smooth)
 
 
-def adjoint(si, wo: mi.Vector3f) -> mi.Float:
-    """What shading normals do to light that is not to radiance: cos_s(wi) cos_g(wo) / cos_g(wi) cos_s(wo) (Veach 1997,
-    "Robust Monte Carlo Methods for Light Transport Simulation", eq. 5.19)."""
-    wi_cos, wo_cos = dr.dot(si.to_world(si.wi), si.n), dr.dot(si.to_world(wo), si.n)
-    factor = dr.abs((si.wi.z / wi_cos) * (wo_cos / wo.z))
-    return dr.select(dr.isfinite(factor), factor, 0)
+def light_leaves(
+    vertex: Vertex, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active
+) -> tuple[mi.Vector3f, mi.Spectrum, Partial]:
+    """The same of a light path, with f cos / p between; ``f_p`` is Mitsuba's."""
+    si, d = vertex.si, vertex.si.to_world(sample.wo)
+    f_p, q = light_sampled(si, bsdf, sample, f_p, active)
+    return d, f_p, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, event_kind(sample.sampled_type) != SMOOTH)
+
+
+def _come_along(si, wo: mi.Vector3f) -> mi.SurfaceInteraction3f:
+    """A vertex, had the path come there along ``wo``."""
+    swapped = mi.SurfaceInteraction3f(si)
+    swapped.wi = wo
+    return swapped
+
+
+def _quotient(a: mi.Float, b: mi.Float) -> mi.Float:
+    return dr.select(b > 0, a / b, 0)
 
 
 def cosine(si, d: mi.Vector3f) -> mi.Float:

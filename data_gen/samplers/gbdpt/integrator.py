@@ -32,19 +32,19 @@ from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connection, to_camera
 from data_gen.samplers.bdpt.vertex import (
     IMPORTANCE,
     Vertex,
-    adjoint,
     context,
     cosine,
+    light_leaves,
     recall,
     record,
     record_class,
-    reverse_density,
     scatters_smoothly,
 )
 from data_gen.samplers.common import like_path
@@ -146,10 +146,9 @@ class GBDPT(BDPT):
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
             left_smoothly = event_kind(sample.sampled_type) == SMOOTH
-            d, p_before = si.to_world(sample.wo), mi.Float(sample.pdf)
-            q = reverse_density(si, bsdf, sample.wo, active & left_smoothly)
-            end = mis.leave(end, cosine(si, d), sample.pdf, q, ~left_smoothly)
-            β *= f_p * adjoint(si, sample.wo)
+            d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
+            β *= dr.select(sample.pdf > 0, f_p, 0)
+            p_before = mi.Float(sample.pdf)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
@@ -187,7 +186,8 @@ class GBDPT(BDPT):
             L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
             if dr.hint(kept is not None, mode="scalar"):
                 joins = active & scatters_smoothly(si.bsdf()) & step.joins
-                L, Δ = self.shifted_connections(scene, plan, step, joins, kept, count, ray, L, offsets)
+                u = random.next_1d()
+                L, Δ = self.shifted_connection(scene, plan, step, joins, kept, count, ray, u, L, offsets)
                 offsets = with_differences(offsets, Δ)
             offsets = take_step(scene, plan, step, offsets)
             si, β, end = step.x1, step.β1, step.end1
@@ -196,18 +196,18 @@ class GBDPT(BDPT):
         return L, Le, [offset.Δ for offset in offsets]
 
     @dr.syntax
-    def shifted_connections(self, scene, plan, step, active, kept, count, ray, L, offsets):
-        """``L`` and Δ, and with them all paths that join the vertex of ``step`` to one of those ``kept``."""
+    def shifted_connection(self, scene, plan, step, active, kept, count, ray, u, L, offsets):
+        """``L`` and Δ, and with them the paths that join the vertex of ``step`` to one of those ``kept``, by ``u``.
+
+        It is chosen by the base path alone, so that it stands for all of them in differences as well.
+        """
         z, Δ = step.z, [offset.Δ for offset in offsets]
-        bsdf = z.si.bsdf()
-        i = mi.UInt32(0)
-        while dr.hint(active & (i < count), label="connections"):
-            y = recall(kept.read(i), ray.time, ray.wavelengths)
-            joins = active & (y.depth > 0) & (z.depth + y.depth + 1 <= plan.longest)
-            found = connection(scene, z, bsdf, y, joins)
-            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, offsets, Δ)
-            L += weighted(C, others)
-            i += 1
+        chosen, times = choose(z, active, kept, count, plan.longest, u)
+        if active & (times > 0):
+            y = recall(kept.read(chosen), ray.time, ray.wavelengths)
+            found = connection(scene, z, z.si.bsdf(), y, mi.Bool(True))
+            C, others, Δ = connect(scene, plan, z, step.connectable, y, found, times, offsets, Δ)
+            L += weighted(C, others) * times
         return L, Δ
 
 

@@ -74,10 +74,10 @@ def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offse
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
-def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, offsets, Δ) -> tuple:
+def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times, offsets, Δ) -> tuple:
     """C and ``others`` of the connection of ``z`` to ``y``, a vertex of the light path; and the sums Δ with it.
 
-    ``found`` is what ``strategies.connection`` has found for the base path.
+    ``found`` is what ``strategies.connection`` has found for the base path; it counts so many ``times`` in Δ.
     """
     g, known = found
     C, others = z.β * g, mis.others_connected(z.end, *known[:3], y.end, *known[3:])
@@ -87,7 +87,7 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, offse
         own = offset.apart | offset.joined
         busy |= own
         others1 = mis.others_connected(offset.end, *known[:3], y.end, *known[3:])
-        sums.append(Δ_before + dr.select(~own, difference(C, others, offset.β * g, offset.r, others1), 0))
+        sums.append(Δ_before + dr.select(~own, times * difference(C, others, offset.β * g, offset.r, others1), 0))
     # What a shift to y needs of the materials, but for the offset path's own
     both = z_connectable & plan.materials.connectable(y.si.bsdf())
 
@@ -100,7 +100,7 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, offse
             good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
             g1, known1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
             others1 = mis.others_connected(v.end, *known1[:3], y.end, *known1[3:])
-            return difference(C, others, v.β * g1, offset.r, others1)
+            return times * difference(C, others, v.β * g1, offset.r, others1)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
         return i + 1, *(dr.select(i == k, old + Δ1, old) for k, old in enumerate(Δ))

@@ -16,7 +16,7 @@ import mitsuba as mi
 
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
-from data_gen.samplers.bdpt.vertex import IMPORTANCE, adjoint, context
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 
 # Vertices of a map, for each light path of it. Paths that have more of them go on in another map.
 VERTICES_PER_PATH = 8
@@ -100,7 +100,7 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
         )
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists)
-        β = β * f_p * adjoint(si, sample.wo)
+        β = β * light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))[0]
         # By what is left of the light that the path began with
         survival = dr.ones(mi.Float, dr.width(lanes))
         if bounce >= rr_depth:

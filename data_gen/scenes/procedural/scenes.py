@@ -7,6 +7,7 @@ stands in free space, as a painter would place it; ``data_gen.dataset.cameras`` 
 from __future__ import annotations
 
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree as xml
@@ -29,7 +30,7 @@ from data_gen.scenes.procedural.meshes import (
 )
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour, sky, write_pfm
-from data_gen.scenes.procedural.variety import add_sights, further_sights
+from data_gen.scenes.procedural.variety import SHARES, add_sights, further_sights
 from ngpt.report.display import to_srgb8
 from ngpt.report.png import encode_png
 
@@ -176,16 +177,17 @@ def open_set(stage: Stage) -> tuple[np.ndarray, np.ndarray]:
 LAYOUTS = {"room": room, "open": open_set}
 
 
-def make_scene(seed: int | tuple[int, ...], folder: Path, varied: bool = False) -> Path:
+def make_scene(seed: int | tuple[int, ...], folder: Path, shares: Mapping[str, float] | None = None) -> Path:
     """Makes the scene of ``seed`` in the (existing, empty) ``folder``; the same seed gives the same files.
 
-    A ``varied`` scene has more to it in about two cases of three: see ``data_gen.scenes.procedural.variety``.
+    ``shares`` are the probabilities (0 to 1) of further sights, of all that are in
+    ``data_gen.scenes.procedural.variety.SHARES``. Without them there are none.
     """
     rng = np.random.default_rng(seed)
     layout = "room" if rng.random() < 0.7 else "open"
     stage = Stage(rng)
     origin, target = LAYOUTS[layout](stage)
-    sights, further = further_sights(seed) if varied else (frozenset(), rng)
+    sights, further = further_sights(seed, shares) if shares else (frozenset(), rng)
     # Nothing more comes to stand where the camera is.
     stage.standing.append((origin[0], origin[2], 0.6))
     bulbs = add_sights(stage, sights, further)
@@ -260,7 +262,7 @@ def main() -> int:
         print(f"{folder}: exists and is not an empty folder; give a new one", file=sys.stderr)
         return 2
     folder.mkdir(parents=True, exist_ok=True)
-    print(make_scene(int(words[0]), folder, varied="--varied" in sys.argv))
+    print(make_scene(int(words[0]), folder, SHARES if "--varied" in sys.argv else None))
     return 0
 
 

@@ -6,6 +6,7 @@ falls to is the same without this file.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,7 +16,7 @@ from data_gen.scenes.procedural.meshes import Mesh, box, cylinder, lathe, merge,
 from data_gen.scenes.procedural.stage import Stage
 from data_gen.scenes.procedural.textures import colour
 
-# The share of scenes that each falls to, independently.
+# The share of scenes that each falls to, independently, where a configuration says nothing else.
 SHARES = {"fine": 0.25, "hair": 0.25, "bulbs": 0.15, "caustic": 0.15, "media": 0.16}
 
 # Small lamps are this many emitters, whatever they are: kernels depend on the number.
@@ -33,10 +34,15 @@ class Lamp:
     radiance: np.ndarray
 
 
-def further_sights(seed: int | tuple[int, ...]) -> tuple[frozenset[str], np.random.Generator]:
-    """The names of what falls to the scene of ``seed``, of ``SHARES``, and the random numbers to make it of."""
+def further_sights(
+    seed: int | tuple[int, ...], shares: Mapping[str, float] = SHARES
+) -> tuple[frozenset[str], np.random.Generator]:
+    """The names of what falls to the scene of ``seed``, and the random numbers to make it of.
+
+    ``shares`` has all names of ``SHARES``, in the same order.
+    """
     rng = np.random.default_rng((*(seed if isinstance(seed, tuple) else (seed,)), 0x5EE))
-    return frozenset(name for name, share in SHARES.items() if rng.random() < share), rng
+    return frozenset(name for name, share in shares.items() if rng.random() < share), rng
 
 
 def add_sights(stage: Stage, sights: frozenset[str], rng: np.random.Generator) -> list[Lamp]:
