@@ -4,9 +4,10 @@
 
 Time is processor time of all threads together, so that other work on the machine does not change the comparison. What a
 sample costs is measured between two renders of one sampler; each gets as many as --seconds buy. The time in which the
-kernels of a pass are recorded counts. The reference is made by photons, in two halves with their own seeds, of
---reference-spp passes each with 4 photons for each pixel within 1 pixel at first: path tracing does not find all the
-light here. Its blur is that of the photon maps, a little, on the photons' side. Errors are the trimmed relMSE.
+kernels of a pass are recorded counts, which is most of it for small images with few photons. The reference is made by
+photons, in two halves with their own seeds, of --reference-spp passes each with 16 light paths for each pixel, gathered
+within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
+on the photons' side. Errors are the trimmed relMSE.
 
 The picture has a row for each scene. Scenes that are in the cache are not rendered again.
 """
@@ -34,7 +35,7 @@ METHODS = {
 }
 SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
-REFERENCE = {"radius": 1.0, "photons": 4}
+REFERENCE = {"radius": 1.0, "photons": 16}
 TILE = 192
 
 
@@ -45,6 +46,7 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
+    parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
     parser.add_argument("-o", "--output", default="bench/results/photons.json")
@@ -90,7 +92,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
     row: dict = {"error of half a reference": relmse_trimmed(halves[0], halves[1])}
     shown = {}
     for sampler, methods in METHODS.items():
-        options = {"radius": args.radius} if sampler in ("ppm", "gpm") else {}
+        options = {"radius": args.radius, "photons": args.photons} if sampler in ("ppm", "gpm") else {}
         spp = samples_within(scene, sampler, args.seconds, options)
         stack = render_stack(scene, spp, 0, sampler, **options)
         row[sampler] = {"spp": spp}
