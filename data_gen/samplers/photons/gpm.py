@@ -39,7 +39,7 @@ from data_gen.samplers.photons.radius import shrunk
 
 # Pairs of a point and a photon that are in memory together, for each camera sample; and the bytes of one.
 PAIRS = 16
-PAIR_BYTES = 128
+PAIR_BYTES = 192
 # Of a camera sample beside that: five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 1024
 
@@ -145,21 +145,26 @@ class WithCopies:
             apart.append(receives & ~shared & direct)
         counts = mi.Point2f(dr.select(lit, len(SHIFTS), 0), 0)
         dr.eval(C, Δ, apart, counts)
-        for k, offset in enumerate(level.offsets):
-            some = dr.compress(apart[k])
-            if dr.width(some):
-                dr.scatter(Δ[k], self.of_copies(pairs, some, level.base, offset, C), some)
-                dr.eval(Δ[k])
+        places = [dr.compress(one) for one in apart]
+        known = [k for k, some in enumerate(places) if dr.width(some)]
+        if known:
+            # All shifts in one kernel: to record one takes longer than to run it, where images are small.
+            some = dr.concat([places[k] for k in known])
+            which = dr.concat([dr.full(mi.UInt32, k, dr.width(places[k])) for k in known])
+            copied = self.of_copies(pairs, some, which, level, C)
+            for k, one in enumerate(Δ):
+                dr.scatter(one, copied, some, which == k)
+            dr.eval(Δ)
         for one in Δ:
             counts.y += dr.select(lit & dr.all(one == -2 * C), 1, 0)
         return [C, *Δ, counts]
 
-    def of_copies(self, pairs: Pairs, some: mi.UInt32, base, offset, C) -> mi.Spectrum:
-        """Δ of ``some`` pairs, whose photons are near to the base path's vertex alone."""
+    def of_copies(self, pairs: Pairs, some: mi.UInt32, which: mi.UInt32, level: Level, C) -> mi.Spectrum:
+        """Δ by the shift of number ``which`` of ``some`` pairs, whose photons are near to the base path alone."""
         point, place = (dr.gather(mi.UInt32, index, some) for index in (pairs.point, pairs.place))
         j, C = dr.gather(mi.UInt32, self.grid.index, place), dr.gather(mi.Spectrum, C, some)
-        x, _ = self.point(base, point)
-        y, β = self.point(offset, point)
+        x, _ = self.point(level.base, point)
+        y, β = self.point_of(level.offsets, which, point)
         photon, everywhere = photon_of(self.photons, j), dr.full(mi.Bool, True, dr.width(j))
         ends = self.scene, self.lights, self.materials.connectable, self.starts, self.photons
         moved, r, good = copy(*ends, j, photon, x, y, self.radius2, everywhere)
@@ -167,9 +172,22 @@ class WithCopies:
 
     def point(self, path, index: mi.UInt32) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
         """A vertex of camera paths, and their throughput."""
-        ray = mi.Ray3f(dr.gather(mi.Point3f, path.ray.o, index), dr.gather(mi.Vector3f, path.ray.d, index))
-        hit = dr.gather(mi.PreliminaryIntersection3f, path.hit, index)
-        return hit.compute_surface_interaction(ray), dr.gather(mi.Spectrum, path.β, index)
+        return self.point_of([path], dr.zeros(mi.UInt32, dr.width(index)), index)
+
+    def point_of(self, paths: list, which: mi.UInt32, index: mi.UInt32) -> tuple[mi.SurfaceInteraction3f, mi.Spectrum]:
+        """The same, of the path of number ``which``."""
+        o, d, hit, β = parts(paths[0], index)
+        for k, path in enumerate(paths[1:], 1):
+            here = which == k
+            both = zip(parts(path, index), (o, d, hit, β), strict=True)
+            o, d, hit, β = (dr.select(here, new, old) for new, old in both)
+        return hit.compute_surface_interaction(mi.Ray3f(o, d)), β
+
+
+def parts(path, index: mi.UInt32) -> tuple:
+    """Origin, direction and hit of a path's ray, and its throughput."""
+    o, d = dr.gather(mi.Point3f, path.ray.o, index), dr.gather(mi.Vector3f, path.ray.d, index)
+    return o, d, dr.gather(mi.PreliminaryIntersection3f, path.hit, index), dr.gather(mi.Spectrum, path.β, index)
 
 
 def difference(C: mi.Spectrum, C1: mi.Spectrum, r: mi.Float) -> mi.Spectrum:
