@@ -55,12 +55,7 @@ def main() -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    setup = {
-        "size": list(args.size),
-        "seconds": args.seconds,
-        "radius": args.radius,
-        "reference spp": args.reference_spp,
-    }
+    setup = {name: getattr(args, name) for name in ("size", "seconds", "radius", "photons", "reference_spp")}
     result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
     rows = []
     for scene in args.scenes:
