@@ -156,7 +156,7 @@ def _notes_on_bdpt(facts: Facts) -> list[str]:
     return lines
 
 
-def _notes_on_ppm(facts: Facts) -> list[str]:
+def _notes_on_photons(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found by photons; blurred, less with every sample"]
     if facts.mirrors:
         lines.append("mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too")
@@ -172,7 +172,7 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -181,9 +181,16 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _PRIMAL = (
         "bdpt.integrator",
         "gbdpt.integrator",
         "photons.ppm",
+        "photons.gpm",
         "primal",
     )
 )
+
+_PHOTON_OPTIONS = {
+    "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (3)",
+    "photons": "light paths of a pass for each pixel (1)",
+    "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+}
 
 for _sampler in (
     Sampler(
@@ -251,17 +258,25 @@ for _sampler in (
         "photons gathered within a shrinking radius, without gradients (caustics seen in mirrors and through glass)",
         _from_module(_PPM),
         lambda facts: _refused_but_for_surfaces(facts, "ppm"),
-        _notes_on_ppm,
-        {
-            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (3)",
-            "photons": "light paths of a pass for each pixel (1)",
-            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
-        },
+        _notes_on_photons,
+        _PHOTON_OPTIONS,
         gradients=False,
         tried=False,
         batch=1,
         biased=True,
         module=_PPM,
+    ),
+    Sampler(
+        "gpm",
+        "gradients of photons gathered within a shrinking radius (caustics seen in mirrors and through glass)",
+        _from_module(_GPM),
+        lambda facts: _refused_but_for_surfaces(facts, "gpm"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GPM,
     ),
     Sampler(
         "primal",

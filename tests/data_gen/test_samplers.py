@@ -140,7 +140,8 @@ def gains(renderer, name):
     from ngpt.evaluation.gradientmap import variances_of_differences
     from ngpt.stack import GradientStack
 
-    layers = render_ours(load(renderer, quick(renderer, name), (48, 48)), name, batches=1, spp=256)[0]
+    spp = 16 if SAMPLERS[name].batch == 1 else 256
+    layers = render_ours(load(renderer, quick(renderer, name), (48, 48)), name, batches=1, spp=spp)[0]
     found = []
     for layer, pixels in zip(("dx", "dy"), variances_of_differences(GradientStack.from_arrays(**layers)), strict=True):
         pixels, ours = pixels.sum(axis=-1), layers[f"{layer}_var"].sum(axis=-1)
@@ -183,7 +184,9 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
 @pytest.mark.parametrize("name", NAMES)
 def test_variances_are_those_over_seeds(renderer, name):
     """The law that every weight of a reconstruction rests on."""
-    stacks = render_ours(scene_for(renderer, name, (24, 16)), name, batches=64, spp=16)
+    # Where a sample is a pass, few of them: passes of one sample take long to start.
+    spp = 6 if SAMPLERS[name].batch == 1 else 16
+    stacks = render_ours(scene_for(renderer, name, (24, 16)), name, batches=64, spp=spp)
     for layer in ("primal", "dx", "dy"):
         if layer in stacks[0]:
             over_seeds = np.var([stack[layer] for stack in stacks], axis=0, ddof=1, dtype=np.float64)

@@ -64,18 +64,18 @@ class Grid:
         cell = self.linear(x, y + (k & 1), z + (k >> 1))
         return dr.gather(mi.UInt32, self.start, cell, active), dr.gather(mi.UInt32, self.start, cell + 2, active)
 
-    def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
-        """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.
+    def each(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
+        """``state`` after ``visit`` (state, place in the list, near) for all points that may be nearer to ``p``.
 
-        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
+        ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops.
         """
         if not self.size:
-            return total
+            return state
 
-        def step(k, i, end, total):
+        def step(k, i, end, state):
             at = i < end
             near = at & (dr.squared_norm(dr.gather(mi.Point3f, self.p, i, at) - p) < radius2)
-            total = total + value(i, near)
+            state = visit(state, i, near)
             i = i + 1
             next_row = ~(i < end) & (k < 4)
             first, last = self.row(p, k, next_row)
@@ -83,14 +83,21 @@ class Grid:
                 dr.select(next_row, k + 1, k),
                 dr.select(next_row, first, i),
                 dr.select(next_row, last, end),
-                total,
+                state,
             )
 
         # A first step without a point: i = end, and so row 0 is next.
         none = dr.zeros(mi.UInt32, dr.width(p))
         return dr.while_loop(
-            (mi.UInt32(none), mi.UInt32(none), mi.UInt32(none), total),
-            lambda k, i, end, total: active & ((k < 4) | (i < end)),
+            (mi.UInt32(none), mi.UInt32(none), mi.UInt32(none), state),
+            lambda k, i, end, state: active & ((k < 4) | (i < end)),
             step,
             label="gather",
         )[3]
+
+    def gather(self, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, value, total):
+        """``total`` plus the sum of ``value`` (place in the list, near) over all points nearer to ``p`` than that.
+
+        ``value`` gives the type of ``total``, and 0 where not ``near``. May be called within symbolic loops.
+        """
+        return self.each(p, radius2, active, lambda sums, i, near: (sums[0] + value(i, near),), (total,))[0]

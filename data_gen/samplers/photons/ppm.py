@@ -34,13 +34,12 @@ from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, 
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.photons.copies import faces, light, photon_of
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, trace
 from ngpt.errors import NgptError
 
-# Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
-NORMAL_COSINE = 0.7
 # Of a camera sample and its features, beside the maps
 CAMERA_BYTES = 256
 # The streams of light paths are made from random numbers of the camera's samples and this.
@@ -64,12 +63,9 @@ class Gathering:
 
         def one(i, near):
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
-            n, d = dr.gather(mi.Normal3f, photons.n, j, near), dr.gather(mi.Vector3f, photons.d, j, near)
-            near = near & (dr.dot(n, si.n) > NORMAL_COSINE) & (dr.gather(mi.UInt32, photons.depth, j, near) <= longest)
-            f = bsdf.eval(context(RADIANCE), si, si.to_local(-d), near)
-            # f has a cosine; the photons lie as densely as the geometric one is large.
-            C = f * dr.gather(mi.Spectrum, photons.β, j, near) / dr.abs(dr.dot(n, d))
-            return dr.select(near & dr.isfinite(dr.sum(C)), C, 0)
+            photon = photon_of(photons, j, near)
+            near = near & faces(photon, si) & (dr.gather(mi.UInt32, photons.depth, j, near) <= longest)
+            return light(photon, si, bsdf, near)
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         return self.K * self.grid.gather(si.p, self.radius2, active, one, zero)
@@ -91,11 +87,11 @@ class Passes:
     @property
     def lane_bytes(self) -> int:
         """Of a camera sample, with all that its light paths may leave in a map."""
-        return CAMERA_BYTES + self.integrator.photons * MAP_BYTES
+        return self.integrator.camera_bytes + self.integrator.photons * MAP_BYTES
 
     def instead(self, lane_bytes: int) -> str:
         """What else than a smaller image would fit into so many bytes for each camera sample."""
-        fits = (lane_bytes - CAMERA_BYTES) // MAP_BYTES
+        fits = (lane_bytes - self.integrator.camera_bytes) // MAP_BYTES
         return f", or no more than --option photons={fits}" if fits > 0 else ""
 
 
@@ -118,6 +114,9 @@ class PPM(GradientIntegrator):
     far away. Rendering raises NgptError for them.
     """
 
+    name = "ppm"
+    camera_bytes = CAMERA_BYTES
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         max_depth = props.get("max_depth", -1)
@@ -126,13 +125,13 @@ class PPM(GradientIntegrator):
         self.radius, self.photons = float(props.get("radius", 3.0)), int(props.get("photons", 1))
         self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
         if not 0 < self.radius < float("inf"):
-            raise NgptError(f"ppm: a radius of {self.radius:g} pixels; use one above 0")
+            raise NgptError(f"{self.name}: a radius of {self.radius:g} pixels; use one above 0")
         if not 1 <= self.photons <= 1 << 16:
-            raise NgptError(f"ppm: {self.photons} photons for each pixel are out of range; use 1 .. {1 << 16}")
+            raise NgptError(f"{self.name}: {self.photons} photons for each pixel are out of range; use 1 .. {1 << 16}")
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene)
-        lights, materials = LightEnds(scene, "ppm"), Materials(scene, self.threshold)
+        refuse(scene, self.name)
+        lights, materials = LightEnds(scene, self.name), Materials(scene, self.threshold)
         return Passes(self, scene, lights, materials, pixel_width(scene))
 
     def sample_pass(self, scene, lights, materials, width: float, camera: CameraSamples, film: GradientFilm) -> None:
@@ -147,7 +146,8 @@ class PPM(GradientIntegrator):
         dr.eval(values)
         random.schedule_state()
         if lights.emitters is not None and self.max_depth > 1:
-            for photons in self.photon_maps(scene, lights, materials, keys):
+            _, maps = self.photon_maps(scene, lights, materials, keys)
+            for photons in maps:
                 near = Gathering(photons, radius, self.photons * dr.width(random.random.state), self.max_depth)
                 L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, near.light)
                 values["primal"] += to_rgb(L, ray.wavelengths)
@@ -155,13 +155,13 @@ class PPM(GradientIntegrator):
         film.put_all(values)
 
     def photon_maps(self, scene, lights, materials, keys):
-        """The maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
+        """The light's ends and the maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
         n = dr.width(keys[0]) * self.photons
         lane = dr.arange(mi.UInt32, n)
         sample = lane // dr.opaque(mi.UInt32, self.photons)
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth)[1]
+        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth)
 
     @dr.syntax
     def camera_path(self, scene, materials, random, ray, importance, scattered=None):
@@ -203,7 +203,7 @@ class PPM(GradientIntegrator):
         return L, Le
 
 
-def refuse(scene, sampler: str = "ppm") -> None:
+def refuse(scene, sampler: str) -> None:
     """Raises NgptError, in the name of the ``sampler``, for variants in which photons cannot be shared."""
     for refused, what in (
         (mi.is_polarized, "polarised light"),

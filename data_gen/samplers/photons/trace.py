@@ -14,13 +14,14 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 
 # Vertices of a map, for each light path of it. Paths that have more of them go on in another map.
 VERTICES_PER_PATH = 8
-# Bytes of a vertex: 21 words of a record, as much again while levels are joined, and 9 words of a grid that is made.
-VERTEX_BYTES = (21 + 21 + 9) * 4
+# Bytes of a vertex: 22 words of a record, as much again while levels are joined, and 9 words of a grid that is made.
+VERTEX_BYTES = (22 + 22 + 9) * 4
 # Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
 # Bytes that a map takes for each light path.
@@ -33,13 +34,14 @@ def vertices_class(variant: str) -> type:
 
     @dataclass
     class Vertices:
-        """Vertices of light paths, an array of each field: 21 words a vertex."""
+        """Vertices of light paths, an array of each field: 22 words a vertex."""
 
         p: mi.Point3f
         n: mi.Normal3f  # geometric
         d: mi.Vector3f  # of the light that arrives
         β: mi.Spectrum  # its power, times the number of light paths
-        density: mi.Float  # with which d was sampled at the parent, survival included; 0 at a first vertex
+        density: mi.Float  # with which d was sampled at the parent: infinite by a mirror or alike; 0 at a first vertex
+        survival: mi.Float  # the probability to survive Russian roulette at the parent
         depth: mi.UInt32  # edges from the light; 0 where nothing is gathered: the vertex is a parent alone
         parent: mi.UInt32  # its place in the map; of a first vertex, the number of its light path
         t: mi.Float  # the length of the edge from there
@@ -77,13 +79,15 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
     paths = dr.width(start.ray.d)
     room = paths * VERTICES_PER_PATH
     ray, β, brightest = start.ray, start.β, dr.rcp(dr.max(start.β))
-    density, parent = dr.zeros(mi.Float, paths), dr.arange(mi.UInt32, paths)
+    density, survival, parent = dr.zeros(mi.Float, paths), dr.ones(mi.Float, paths), dr.arange(mi.UInt32, paths)
     lanes = dr.compress(dr.max(β) > 0)
     levels: list = []
     size, bounce = 0, 1
     while dr.width(lanes) and bounce <= max_depth:
         ray = mi.Ray3f(dr.gather(mi.Point3f, ray.o, lanes), dr.gather(mi.Vector3f, ray.d, lanes))
-        β, brightest, density, parent = (dr.gather(type(x), x, lanes) for x in (β, brightest, density, parent))
+        β, brightest, density, survival, parent = (
+            dr.gather(type(x), x, lanes) for x in (β, brightest, density, survival, parent)
+        )
         random = random.at(lanes)
         hit = scene.ray_intersect_preliminary(ray)
         si = hit.compute_surface_interaction(ray)
@@ -91,19 +95,21 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
         depth = dr.select(receives(bsdf), dr.opaque(mi.UInt32, bounce), 0)
         place = dr.prefix_sum(dr.select(exists, mi.UInt32(1), 0))
         level = vertices_class(mi.variant())(
-            *(si.p, si.n, ray.d, β, density, depth, parent, hit.t, hit.prim_uv, hit.prim_index),
+            *(si.p, si.n, ray.d, β, density, survival, depth, parent, hit.t, hit.prim_uv, hit.prim_index),
             *(hit.shape, hit.instance),
         )
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists)
         β = β * light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))[0]
         # By what is left of the light that the path began with
-        survival = mi.Float(1) if bounce < rr_depth else dr.fmin(dr.max(β) * brightest, 0.95)
+        survival = dr.ones(mi.Float, dr.width(lanes))
+        if bounce >= rr_depth:
+            survival = dr.fmin(dr.max(β) * brightest, 0.95)
         goes_on = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
-        β, density = β / survival, sample.pdf * survival
+        β, density = β / survival, dr.select(event_kind(sample.sampled_type) == SMOOTH, sample.pdf, dr.inf)
         ray = si.spawn_ray(si.to_world(sample.wo))
         random.schedule_state()
-        dr.eval(level, exists, goes_on, place, β, density, ray)
+        dr.eval(level, exists, goes_on, place, β, density, survival, ray)
         level = _at(level, dr.compress(exists))
         if not len(level):
             break  # all that was left has escaped
@@ -121,6 +127,19 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
         bounce += 1
     if levels:
         yield _joined(levels)
+
+
+def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f:
+    """A vertex of a map, as the light path has come to it."""
+    fields_of_hit = ("t", "prim_uv", "prim_index", "shape", "instance")
+    hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(index))
+    for name in fields_of_hit:
+        value = getattr(photons, name)
+        setattr(hit, name, dr.gather(type(value), value, index, active))
+    # Not told by any other field: without it the vertex would be void.
+    hit.valid = mi.Bool(active)
+    p, d = dr.gather(mi.Point3f, photons.p, index, active), dr.gather(mi.Vector3f, photons.d, index, active)
+    return hit.compute_surface_interaction(mi.Ray3f(p - d * hit.t, d), active=active)
 
 
 def _at(vertices, index: mi.UInt32):

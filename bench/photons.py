@@ -1,0 +1,132 @@
+"""Photons with and without gradients, path tracing with and without: errors at equal time on scenes with caustics.
+
+    python -m bench.photons --cache out/photons --scenes glossy SCENE.xml ... --picture docs/images/photons.jpg
+
+Time is processor time of all threads together, so that other work on the machine does not change the comparison. What a
+sample costs is measured between two renders of one sampler; each gets as many as --seconds buy. The time in which the
+kernels of a pass are recorded counts, which is most of it for small images with few photons. The reference is made by
+photons, in two halves with their own seeds, of --reference-spp passes each with 16 light paths for each pixel, gathered
+within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
+on the photons' side. Errors are the trimmed relMSE.
+
+The picture has a row for each scene. Scenes that are in the cache are not rendered again.
+"""
+
+import argparse
+import json
+import time
+from pathlib import Path
+
+import numpy as np
+
+from bench import panels
+from bench.common import metadata, save
+from ngpt.evaluation.config import scene_name
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.methods import denoise
+from ngpt.report.display import auto_exposure, to_srgb8
+
+# Sampler -> its reconstructions
+METHODS = {
+    "ppm": ("primal", "oidn"),
+    "gpm": ("primal", "l1", "wcv"),
+    "gpt": ("l1", "wcv"),
+    "primal": ("oidn",),
+}
+SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
+TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
+REFERENCE = {"radius": 1.0, "photons": 16}
+TILE = 192
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", required=True)
+    parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
+    parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
+    parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
+    parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
+    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
+    parser.add_argument("--picture", type=Path)
+    parser.add_argument("-o", "--output", default="bench/results/photons.json")
+    args = parser.parse_args()
+
+    from data_gen.backend import use_variant
+
+    use_variant()
+    setup = {name: getattr(args, name) for name in ("size", "seconds", "radius", "photons", "reference_spp")}
+    result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
+    rows = []
+    for scene in args.scenes:
+        file = args.cache / f"{scene_name(scene)}.npz"
+        if not file.exists():
+            row, images = bench_scene(scene, args)
+            args.cache.mkdir(parents=True, exist_ok=True)
+            np.savez(file, json.dumps(row), *images)
+        row, *images = np.load(file).values()
+        row = json.loads(str(row))
+        result["scenes"][scene_name(scene)] = row
+        rows.append(images)
+        save(args.output, result)
+        print(scene_name(scene), row, flush=True)
+        if args.picture:
+            panels.save(args.picture, picture(rows, result["scenes"]))
+
+
+def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndarray]]:
+    """Sampler -> samples and errors by method; and what the picture shows."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(path, tuple(args.size))
+    halves = [
+        render_stack(scene, args.reference_spp, 1 << 20 | i, "ppm", **REFERENCE)["primal"].astype(np.float64)
+        for i in range(2)
+    ]
+    row: dict = {"error of half a reference": relmse_trimmed(halves[0], halves[1])}
+    shown = {}
+    for sampler, methods in METHODS.items():
+        options = {"radius": args.radius, "photons": args.photons} if sampler in ("ppm", "gpm") else {}
+        spp = samples_within(scene, sampler, args.seconds, options)
+        stack = render_stack(scene, spp, 0, sampler, **options)
+        row[sampler] = {"spp": spp}
+        for method in methods:
+            image = shown[sampler, method] = denoise(stack, method)
+            row[sampler][method] = float(f"{relmse_trimmed(image, *halves):.4g}")
+    return row, [shown[which] for which in SHOWN] + [(halves[0] + halves[1]) / 2]
+
+
+def samples_within(scene, sampler: str, seconds: float, options: dict) -> int:
+    """How many samples per pixel so much processor time buys, at least 2."""
+    from data_gen.render import render_stack
+
+    def cost(spp: int) -> float:
+        start = time.process_time()
+        render_stack(scene, spp, 1, sampler, **options)
+        return time.process_time() - start
+
+    few, many = (2, 8) if sampler in ("ppm", "gpm") else (16, 64)
+    cost(few)  # compiles the kernels
+    fixed = cost(few)
+    each = max(cost(many) - fixed, 1e-3) / (many - few)
+    return max(2, round(1 + (seconds - fixed) / each))
+
+
+def picture(rows: list[list[np.ndarray]], scenes: dict) -> np.ndarray:
+    headings = []
+    for sampler, method in SHOWN:
+        name = TITLES[sampler] if sampler == "primal" else sampler
+        what = name if method == "primal" else f"{name} and {TITLES[method]}"
+        headings.append([what, ", ".join(f"{scene[sampler][method]:.3g}" for scene in scenes.values())])
+    headings.append(["reference", "error (relMSE), by rows"])
+    stops = [auto_exposure(row[-1]) for row in rows]
+    tiles = []
+    for column in range(len(headings)):
+        size = TILE, TILE * rows[0][0].shape[0] // rows[0][0].shape[1]
+        tiles.append([panels.scaled(to_srgb8(row[column], stop), size) for row, stop in zip(rows, stops, strict=True)])
+    return panels.columns(headings, tiles)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,144 @@
+"""Photons and their copies near the vertex of a neighbouring pixel's path: by ``shift``, what light they bring there.
+
+    a           the predecessor of photon b: a vertex of its light path, or the point of the lamp where it begins
+    Φ, Φ'       power of photon and copy, both with the density of the photon's path
+    p, p'       densities of the directions d and d' at a, without Russian roulette: it is on top of a pair of paths
+    r           p' J / p
+
+A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. Nor is there
+one where anything is in the way, or where the copy lies outside the radius or on a surface that faces another way. What
+a photon must fulfil the copy must, too, so that both directions of a difference reject alike.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.samplers.bdpt.lights import LightEnds, LightRay
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, context, evaluate
+from data_gen.samplers.photons import shift
+from data_gen.samplers.photons.trace import vertex_of
+
+# Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
+NORMAL_COSINE = 0.7
+
+
+@dataclass
+class Photon:
+    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings."""
+
+    p: mi.Point3f
+    n: mi.Normal3f
+    d: mi.Vector3f
+    Φ: mi.Spectrum
+
+
+@dataclass
+class Way:
+    """How light comes from a to the point ``target``, or in its direction."""
+
+    ray: mi.Ray3f
+    Φ: mi.Spectrum  # without J
+    ratio: mi.Float  # p' / p
+    length2: mi.Float  # squared, from a to the target; 1 from infinity
+    base_length2: mi.Float  # from a to b̂
+
+
+def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi.Bool:
+    """Whether a photon is gathered at ``x``."""
+    return (dr.squared_norm(photon.p - x.p) < radius2) & faces(photon, x)
+
+
+def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
+    """Whether a photon lies on a surface that faces the same way as that of ``x``."""
+    return dr.dot(photon.n, x.n) > NORMAL_COSINE
+
+
+def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) -> mi.Spectrum:
+    """f Φ, what a photon adds to radiance at ``x``, of material ``bsdf``; the kernel is not in it."""
+    f = bsdf.eval(context(RADIANCE), x, x.to_local(-photon.d), active)
+    # f has a cosine; the photons lie as densely as the geometric one is large.
+    L = f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
+    return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
+
+
+def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
+    """The photon of that place in the map."""
+    n, d = dr.gather(mi.Normal3f, photons.n, j, active), dr.gather(mi.Vector3f, photons.d, j, active)
+    return Photon(dr.gather(mi.Point3f, photons.p, j, active), n, d, dr.gather(mi.Spectrum, photons.β, j, active))
+
+
+def copy(scene, lights: LightEnds, connectable, starts: LightRay, photons, j, photon: Photon, x, y, radius2, active):
+    """(copy, r, whether it exists) of the ``photon`` of place ``j`` that is gathered at ``x`` and not at ``y``, for y.
+
+    ``starts`` are the light's ends of all light paths, ``connectable`` (material) says where photons are gathered.
+    """
+    foot = shift.on_plane(photon.p, photon.d, x.p, x.n)
+    target = shift.moved(foot, x.p, x.n, y.p, y.n)
+    way = redirected(scene, lights, starts, photons, j, photon, foot, target, active)
+    J = shift.jacobian(photon.d, x.n, way.base_length2, way.ray.d, y.n, way.length2)
+    r = way.ratio * J
+    # In front of a
+    good = active & (dr.dot(target - way.ray.o, way.ray.d) > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
+    hit = scene.ray_intersect(way.ray, good)
+    moved = Photon(hit.p, hit.n, way.ray.d, way.Φ * J)
+    good &= hit.is_valid() & connectable(hit.bsdf())
+    # At x it would be gathered as it is, not as a copy: the shift back would be another.
+    return moved, r, good & is_near(moved, y, radius2) & ~is_near(moved, x, radius2)
+
+
+def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, foot, target, active) -> Way:
+    """From the photon's predecessor to ``target`` instead of ``foot``. Φ is 0 where that is not possible."""
+    parent = dr.gather(mi.UInt32, photons.parent, j, active)
+    density = dr.gather(mi.Float, photons.density, j, active)
+    t = dr.gather(mi.Float, photons.t, j, active)
+    # Along the photon's line, b̂ may lie behind a.
+    base_length = t + dr.dot(foot - photon.p, photon.d)
+    first, known = density == 0, dr.isfinite(density) & (base_length > 0)
+
+    # ------------------------ From a lamp ------------------------
+    start = start_of(starts, parent, active & first)
+    beyond = lights.far(start.index)
+    # The origin of light from infinity moves, on a plane that the light is normal to.
+    aside = target + start.ray.d * dr.dot(start.ray.o - target, start.ray.d)
+    there = dr.zeros(mi.Interaction3f, dr.width(j))
+    # Rays begin a little above their surface, here and below.
+    there.p = target + (start.end.p - start.ray.o)
+    there.time, there.wavelengths = start.ray.time, start.ray.wavelengths
+    moved, lamp_ratio, per_length2 = lights.redirected(scene, start, there)
+    beyond &= first
+
+    # ------------------------ From a vertex ----------------------
+    a = vertex_of(photons, parent, active & ~first)
+    origin = a.spawn_ray(target - a.p).o
+    to = mi.Vector3f(target - origin)
+    length2 = dr.squared_norm(to)
+    d = to * dr.rsqrt(length2)
+    f, p, _ = evaluate(IMPORTANCE, a, a.bsdf(), a.to_local(d), active & ~first & known)
+    survival = dr.gather(mi.Float, photons.survival, j, active)
+    Φ = dr.gather(mi.Spectrum, photons.β, parent, active) * f / (density * survival)
+
+    Φ = dr.select(first, moved.β, Φ)
+    origin = dr.select(first, dr.select(beyond, aside, moved.ray.o), origin)
+    return Way(
+        ray=mi.Ray3f(origin, dr.select(first, moved.ray.d, d), start.ray.time, start.ray.wavelengths),
+        Φ=dr.select(known & dr.isfinite(dr.sum(Φ)), Φ, 0),
+        ratio=dr.select(first, lamp_ratio, p / density),
+        length2=dr.select(first, dr.rcp(per_length2), length2),
+        base_length2=dr.select(beyond, 1, dr.square(base_length)),
+    )
+
+
+def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:
+    """The light's end of a light path."""
+
+    def taken(value):
+        return dr.gather(type(value), value, path, active)
+
+    end = dr.zeros(mi.DirectionSample3f, dr.width(path))
+    end.p, end.n = taken(starts.end.p), taken(starts.end.n)
+    ray = mi.Ray3f(taken(starts.ray.o), taken(starts.ray.d), starts.ray.time, starts.ray.wavelengths)
+    return LightRay(ray, taken(starts.β), taken(starts.emitter), taken(starts.index), end, taken(starts.delta))

@@ -1,0 +1,71 @@
+"""Pairs of a point and a photon near it, in the order of the points: one lane each, however many a point has.
+
+Shifts are done for pairs, all lanes at work; within the walk through the grid one lane in five would have a photon. The
+list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their order: the same
+pairs give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.samplers.photons.grid import Grid
+
+
+@dataclass
+class Pairs:
+    """A piece of the list of all pairs: ``point`` and ``place``, that of the photon in the list of the grid."""
+
+    point: mi.UInt32
+    place: mi.UInt32
+    first: mi.UInt32  # of each point, where its pairs begin in this piece
+    end: mi.UInt32
+
+    def sums(self, values: list) -> list:
+        """For each of ``values``, an array of colours, one for each pair: the sum over the pairs of each point."""
+        zeros = [dr.zeros(type(value), dr.width(self.first)) for value in values]
+
+        def add(i, sums):
+            return i + 1, [total + dr.gather(type(v), v, i) for total, v in zip(sums, values, strict=True)]
+
+        state = (mi.UInt32(self.first), zeros)
+        return dr.while_loop(state, lambda i, sums: i < self.end, add, label="sums of pairs")[1]
+
+
+def pieces(grid: Grid, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, most: int) -> Iterator[Pairs]:
+    """All pairs of ``active`` points ``p`` and what the ``grid`` has nearer to them, at most so many at a time."""
+    none = dr.zeros(mi.UInt32, dr.width(p))
+    (count,) = grid.each(
+        p, radius2, active, lambda state, i, near: (state[0] + dr.select(near, mi.UInt32(1), 0),), (none,)
+    )
+    first = dr.prefix_sum(count)
+    dr.eval(count, first, active)
+    total = int(dr.sum(count)[0])
+    for low in range(0, total, most):
+        yield piece(grid, p, radius2, active, first, count, low, min(most, total - low))
+
+
+def piece(grid: Grid, p, radius2, active, first: mi.UInt32, count: mi.UInt32, low: int, size: int) -> Pairs:
+    """The ``size`` pairs from number ``low`` on; those of a point begin at ``first`` and are ``count``."""
+    begin, length = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+    inside = active & (first < begin + length) & (first + count > begin)
+    point, place = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
+    lane = dr.arange(mi.UInt32, dr.width(p))
+
+    def write(state, i, near):
+        # Below ``begin`` the difference is larger than any length.
+        at = state[0] - begin
+        known = near & (at < length)
+        dr.scatter(point, lane, at, known)
+        dr.scatter(place, i, at, known)
+        return (dr.select(near, state[0] + 1, state[0]),)
+
+    end = grid.each(p, radius2, inside, write, (mi.UInt32(first),))
+    dr.eval(end, point, place)
+    last = dr.minimum(first + count, begin + length)
+    start = dr.maximum(first, begin)
+    return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))

@@ -1,0 +1,57 @@
+r"""How a photon moves with the point that gathers it: pure functions.
+
+A photon b is gathered at x, and its copy b' at y, the vertex of the neighbouring pixel's path. The copy's place round y
+is the mirror image of that of b round x: whatever is nearer to x than the radius, and not to y, goes to what is nearer
+to y and not to x. Surfaces are curved, and photons lie on them, not on a plane; so it is the photon's line that moves.
+
+    a, d        the predecessor of the photon on its light path, and the direction from there
+    b̂           where that line meets the tangent plane at x
+    ĉ           the mirror image of b̂ in the plane between x and y, turned by the smallest rotation into the tangent
+                plane at y
+    d'          from a to ĉ; what the line meets is b'
+    J           dω'/dω, the ratio of the solid angles of a piece of either plane
+
+The map from b̂ to ĉ is a rigid one, and its inverse is the same with x and y in each other's place. So shifting the
+copy back gives b, on curved surfaces too. [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 4.3; the
+mirror image: Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 4]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+
+
+def on_plane(b, d, x, n):
+    """b̂: where the line through ``b`` along ``d`` meets the plane through ``x`` with normal ``n``."""
+    return b + d * (dr.dot(x - b, n) / dr.dot(d, n))
+
+
+def moved(b̂, x, n, y, m):
+    """ĉ: the image, in the plane through ``y`` with normal ``m``, of a point in that through ``x`` with normal ``n``.
+
+    Either normal may point either way; x and y differ.
+    """
+    across = dr.normalize(y - x)
+    n = mirror(n, across)
+    m = dr.select(dr.dot(n, m) < 0, -m, m)
+    return y + rotate(mirror(b̂ - x, across), n, m)
+
+
+def mirror(v, across):
+    """``v`` mirrored in the plane whose normal is ``across``."""
+    return v - across * (2 * dr.dot(v, across))
+
+
+def rotate(v, n, m):
+    """``v`` turned by the smallest rotation from the unit vector ``n`` to ``m``, which is not opposite."""
+    axis, cos = dr.cross(n, m), dr.dot(n, m)
+    return v * cos + dr.cross(axis, v) + axis * (dr.dot(axis, v) / (1 + cos))
+
+
+def jacobian(d, n, length2, d1, m, length2_1):
+    """J of the way from a, along ``d``, to b̂ (normal ``n``), which becomes that along ``d1`` to ĉ (normal ``m``).
+
+    ``length2``, ``length2_1``: squared distances of b̂ and ĉ from a. Of light from infinitely far away, whose origins
+    move and not the directions, they are 1.
+    """
+    return dr.abs(dr.dot(m, d1) / dr.dot(n, d)) * (length2 / length2_1)
