@@ -78,7 +78,8 @@ class UnevenRender:
         if not self.passes:
             return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
         begin, each = foretold(self.passes)
-        n = max(1, min(self.at_once, int((passes.PASS_SECONDS - begin) / each)))
+        # Where a pass takes long to begin, it goes on for longer.
+        n = max(1, min(self.at_once, int(max(passes.PASS_SECONDS - begin, 3 * begin) / each)))
         if whole or self.end is None:
             return n
         left = self.end - time.perf_counter()
