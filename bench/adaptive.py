@@ -2,7 +2,7 @@
 
     python -m bench.adaptive --scenes diffuse glossy SCENE.xml ... [--spp 128] [-o bench/results/adaptive.json]
     python -m bench.adaptive --timed diffuse SCENE.xml ... [--timed-size 320 180]
-    python -m bench.adaptive --table                                  # of what is in the file
+    python -m bench.adaptive --table                                   # of what is in the file
 
     even      all pixels have the same samples: --spp, half and twice as many
     adaptive  --spp in the mean, shared out by the error that the method is expected to have (data_gen/adaptive.py)
@@ -179,31 +179,42 @@ def slope(row: dict) -> float:
 
 def price(costs: dict, method: str) -> float:
     """Seconds of adaptive samples over those of as many even ones, the median of scenes; nan if not measured."""
-    each = [row[f"adaptive {method}"]["median"] / row[SAMPLER[method]]["median"] for row in costs.values()]
+    name = f"adaptive {method}"
+    each = [row[name]["median"] / row[SAMPLER[method]]["median"] for row in costs.values() if name in row]
     return statistics.median(each) if each else math.nan
 
 
 def table(result: dict) -> list[str]:
-    """Lines of a table in Markdown: errors over those of even samples, scene by scene, and their geometric means."""
+    """Lines of tables in Markdown: errors over those of even samples, scene by scene, and their geometric means; and
+    errors that were expected over the true ones."""
     methods = list(dict.fromkeys(m for entry in result["scenes"].values() for m in entry["methods"]))
-    found: dict[str, dict[str, list[float]]] = {m: {"adaptive": [], "oracle": [], "time": []} for m in methods}
-    lines = ["| scene | " + " | ".join(f"`{m}`" for m in methods) + " |", "|---|" + "--:|" * len(methods)]
+    head = ["| scene | " + " | ".join(f"`{m}`" for m in methods) + " |", "|---|" + "--:|" * len(methods)]
+    found: dict[str, list[tuple[float, ...]]] = {m: [] for m in methods}
+    lines, foretold = list(head), ["", *head]
     for scene, entry in result["scenes"].items():
-        cells, rows = [], entry["methods"]
+        cells, told = [], []
         for m in methods:
-            even = mean_log(rows[m]["even"][str(result["spp"])])
-            for name in ("adaptive", "oracle"):
-                found[m][name].append(mean_log(rows[m][name]) / even)
-            found[m]["time"].append(found[m]["adaptive"][-1] / price(result["costs"], m) ** slope(rows[m]))
-            cells.append(f"{found[m]['adaptive'][-1]:.2f}, {found[m]['oracle'][-1]:.2f}, {found[m]['time'][-1]:.2f}")
+            if (row := entry["methods"].get(m)) is None:
+                cells.append("")
+                told.append("")
+                continue
+            even = mean_log(row["even"][str(result["spp"])])
+            adaptive, oracle = (mean_log(row[name]) / even for name in ("adaptive", "oracle"))
+            found[m].append((adaptive, oracle, adaptive / price(result["costs"], m) ** slope(row)))
+            cells.append(f"{adaptive:.2f}, {oracle:.2f}")
+            start = math.sqrt(row["pilot"]["expected"] / row["pilot"]["true"])
+            end = math.sqrt(mean_log(row["expected"]) / mean_log(row["adaptive"])) if "expected" in row else math.nan
+            told.append(f"{start:.2f}, {end:.2f}".replace(", nan", ""))
         lines.append(f"| {scene} | " + " | ".join(cells) + " |")
+        foretold.append(f"| {scene} | " + " | ".join(told) + " |")
     for title, cell in {
-        "mean": lambda f: ", ".join(f"{mean_log(each):.2f}" for each in f.values()),
-        "worse than even": lambda f: ", ".join(str(sum(x > 1 for x in each)) for each in f.values()),
+        "mean": lambda rows: ", ".join(f"{mean_log([row[i] for row in rows]):.2f}" for i in (0, 1)),
+        "worse than even": lambda rows: ", ".join(str(sum(row[i] > 1 for row in rows)) for i in (0, 1)),
+        "mean, equal time": lambda rows: f"{mean_log([row[2] for row in rows]):.2f}",
     }.items():
         lines.append(f"| {title} | " + " | ".join(cell(found[m]) for m in methods) + " |")
     lines.append("| seconds over even | " + " | ".join(f"{price(result['costs'], m):.2f}" for m in methods) + " |")
-    return lines
+    return lines + foretold
 
 
 if __name__ == "__main__":
