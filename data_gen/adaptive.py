@@ -42,6 +42,8 @@ _FLOOR, _CAP = 0.25, 16.0
 _MARGIN, _SMALLEST = 1.05, 0.125
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
+# This share of the changes is cut to the next smaller one: else all pixels around a firefly get its samples.
+_CUT = 0.03
 # Standard errors are right for two values in three. The few that are far off make the mean square larger than so; that
 # of l1, whose standard errors count the light that it leaves out, is smaller. By python -m bench.adaptive, six scenes.
 _TAILS = {"l1": 0.75}
@@ -170,10 +172,14 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     light = uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
     # Relative before it is averaged over neighbours: that of a lamp's edge is no error of the dark beside it.
-    changed = change(np.nan_to_num(result.image) / unit, np.nan_to_num(again.image) / unit)
-    squares = np.square(FACTORS.get(result.method, FACTOR) * changed)
+    once, twice = (np.nan_to_num(r.image) / unit for r in (result, again))
+    factor = FACTORS.get(result.method, FACTOR)
+    squares = np.square(factor * (twice - once))
     error = _TAILS.get(result.method, _TAIL) * math.sqrt(trimmed_mean(squares, squares, _TRIM))
-    return Assessment(np.sqrt(squares.mean(axis=-1)).ravel(), error, result.method)
+    # Nor is that of a firefly an error of all pixels around it.
+    most = np.quantile(np.abs(twice - once), 1 - _CUT)
+    around = factor * change(once, once + np.clip(twice - once, -most, most))
+    return Assessment(np.sqrt(np.square(around).mean(axis=-1)).ravel(), error, result.method)
 
 
 def seconds_to_assess(stack: GradientStack, method: str) -> float:

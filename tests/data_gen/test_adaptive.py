@@ -80,6 +80,19 @@ def test_time_is_kept(renderer):
     assert stack.attributes["ngpt:spp"] >= 16
 
 
+def test_a_firefly_gets_no_samples_for_all_around_it(renderer, rng):
+    """A pixel whose noise is a thousand times that of others is one pixel, and left out of the error of all."""
+    from data_gen.adaptive import assess
+
+    primal = rng.uniform(0.5, 1.0, (48, 48, 3)).astype(np.float32)
+    variance = np.full_like(primal, 1e-4)
+    calm = assess(GradientStack({"primal": primal, "primal_var": variance}), "primal")
+    variance[20, 20] = 100.0
+    wild = assess(GradientStack({"primal": primal, "primal_var": variance}), "primal")
+    assert wild.error == pytest.approx(calm.error, rel=0.1)
+    assert np.all(wild.relative < 1.5 * calm.relative)
+
+
 def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     """A method that takes long for its pixels is not begun where it would end too late."""
     import time
