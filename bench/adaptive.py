@@ -153,7 +153,7 @@ def bench_costs(path: str, args: argparse.Namespace) -> dict:
     from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.timed_size))
-    calls = {s: {"sampler": s} for s in sorted({SAMPLER[method] for method in args.methods})}
+    calls: dict[str, dict] = {s: {"sampler": s} for s in sorted({SAMPLER[method] for method in args.methods})}
     calls |= {f"adaptive {m}": {"sampler": SAMPLER[m], "adaptive": Adaptive(None, m)} for m in args.methods}
     seconds: dict[str, list[float]] = {name: [] for name in calls}
     for repeat in range(args.repeats + 1):
