@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Callable
 
@@ -49,7 +48,7 @@ class UnevenRender:
         # Raises NgptError where not even one row's worth fits.
         self.at_once = lanes_within(memory, self.film, BLOCK * width, lane_bytes) // BLOCK
         self.end = None if seconds is None else time.perf_counter() + seconds
-        self.expected: float | None = None  # seconds of a block
+        self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False
 
     def add(self, blocks: np.ndarray, whole: bool = False) -> None:
@@ -76,13 +75,17 @@ class UnevenRender:
 
     def _at_once(self, whole: bool) -> int:
         """Blocks of the next pass; 0 where there is no time for one."""
-        if self.expected is None:
+        if not self.passes:
             return max(1, min(self.at_once, passes.FIRST_LANES // BLOCK))
-        n = max(1, min(self.at_once, int(passes.PASS_SECONDS / self.expected)))
+        begin, each = foretold(self.passes)
+        # Where a pass takes long to begin, it goes on for longer.
+        n = max(1, min(self.at_once, int(max(passes.PASS_SECONDS - begin, 3 * begin) / each)))
         if whole or self.end is None:
             return n
-        # No more than half of the time left, by the fastest pass so far: others may take longer.
-        return min(n, int(max(self.end - time.perf_counter(), 0) / 2 / self.expected))
+        left = self.end - time.perf_counter()
+        # Two thirds of the time left, since a pass may take longer than others did; all of it where that is too little.
+        most = int((2 / 3 * left - begin) / each)
+        return min(n, most if most > 0 else int(left > begin + each))
 
     def _render(self, some: np.ndarray) -> None:
         """One block of each of ``some`` pixels, ascending; of a pixel that is there more than once, so many."""
@@ -95,5 +98,17 @@ class UnevenRender:
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()
         self.blocks_left -= len(some)
-        # Where a pass is small, or compiles a kernel, most of its time is not that of its blocks.
-        self.expected = min(self.expected or math.inf, (time.perf_counter() - start) / len(some))
+        self.passes.append((len(some), time.perf_counter() - start))
+
+
+def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
+    """Seconds to begin a pass and seconds of a block of it, from those of passes: a line, by least squares.
+
+    Of the last eight, without the first of all, which compiles kernels.
+    """
+    blocks, seconds = np.array(done[1:][-8:] or done).T
+    fastest = float((seconds / blocks).min())
+    if np.ptp(blocks) == 0:
+        return 0.0, fastest
+    each = float(np.clip(np.polyfit(blocks, seconds, 1)[0], 0.1 * fastest, fastest))
+    return max(float(np.median(seconds - each * blocks)), 0.0), each

@@ -47,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--for",
         dest="method",
         metavar="METHOD",
-        help="with --adaptive or --error: the method that will reconstruct (default: what `auto` takes)",
+        help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv)",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     samplers = "; ".join(f"{name}: {summary}" for name, summary in summaries().items())

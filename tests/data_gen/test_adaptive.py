@@ -7,6 +7,7 @@ from unbiased import load
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import reconstruct
+from ngpt.stack import GradientStack
 
 SIZE = (24, 16)
 
@@ -79,6 +80,42 @@ def test_time_is_kept(renderer):
     assert stack.attributes["ngpt:spp"] >= 16
 
 
+def test_a_firefly_gets_no_samples_for_all_around_it(renderer, rng):
+    """A pixel whose noise is a thousand times that of others is one pixel, and left out of the error of all."""
+    from data_gen.adaptive import assess
+
+    primal = rng.uniform(0.5, 1.0, (48, 48, 3)).astype(np.float32)
+    variance = np.full_like(primal, 1e-4)
+    calm = assess(GradientStack({"primal": primal, "primal_var": variance}), "primal")
+    variance[20, 20] = 100.0
+    wild = assess(GradientStack({"primal": primal, "primal_var": variance}), "primal")
+    assert wild.error == pytest.approx(calm.error, rel=0.1)
+    assert np.all(wild.relative < 1.5 * calm.relative)
+
+
+def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
+    """A method that takes long for its pixels is not begun where it would end too late."""
+    import time
+
+    from data_gen import adaptive
+
+    calls = []
+
+    def slow(stack, method):
+        calls.append(stack.width * stack.height)
+        time.sleep(2e-5 * calls[-1])
+        return adaptive.Assessment(np.ones(calls[-1]), 1.0, method)
+
+    monkeypatch.setattr(adaptive, "assess", slow)
+    monkeypatch.setattr(adaptive, "_PART", 40)
+    scene = load(renderer, "diffuse", (100, 80))
+    stack = render(renderer, None, 0, scene, "primal", method="primal", seconds=0.1)
+    assert not calls and stack.attributes["ngpt:spp"] == 16  # nothing is begun when time is over
+    stack = GradientStack({"primal": np.ones((80, 100, 3), np.float32)})
+    assert adaptive.seconds_to_assess(stack, "primal") == pytest.approx(0.16, rel=0.5) and calls == [100, 1600]
+    assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
+
+
 def test_samples_go_where_the_error_is(renderer):
     """The same number makes a better image, by the method they were meant for."""
     from data_gen.render import render_stack
@@ -91,6 +128,39 @@ def test_samples_go_where_the_error_is(renderer):
         errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *halves) for stack in stacks])
     even, adaptive = np.mean(errors, axis=0)
     assert adaptive < 0.95 * even
+
+
+def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
+    """They stay in the means: were each pixel judged by its own noise alone, the image would be too dark."""
+    from data_gen import adaptive
+    from data_gen.render import render_stack
+
+    def by_pixel(stack, method):
+        return adaptive.Assessment(np.sqrt(stack["primal_var"].sum(axis=-1)).ravel(), 1.0, method)
+
+    scene = load(renderer, "glossy", SIZE)
+    light = render_stack(scene, 8192, 99, "primal", with_features=False)["primal"].mean()
+
+    def bias():
+        """In the mean over renders, and its standard error."""
+        stacks = [
+            render(renderer, 32, seed, scene, "primal", method="primal", with_features=False) for seed in range(10)
+        ]
+        each = np.array([stack["primal"].mean() for stack in stacks]) / light - 1
+        return each.mean(), each.std(ddof=1) / np.sqrt(len(each))
+
+    mean, error = bias()
+    assert abs(mean) < 0.02 and abs(mean) < 3.5 * error
+    monkeypatch.setattr(adaptive, "assess", by_pixel)
+    mean, error = bias()
+    assert mean < -0.03 and mean < -5 * error
+
+
+def test_gradients_are_shared_out_by_what_is_quick(renderer):
+    """Where no method is named: those of a network would cost more than they gain."""
+    stack = render(renderer, 32, method="auto")
+    assert stack.attributes["ngpt:adaptive"] == "wcv"
+    same(stack, render(renderer, 32, method="wcv"))
 
 
 @pytest.mark.parametrize("sampler", ["primal", "gpt"])

@@ -122,3 +122,15 @@ def test_directions_are_means_over_their_own_ends(renderer, rng):
         assert np.allclose(layers["dx_var"][0, pixel], (forward[1] + backward[1]) / 4, rtol=1e-5)
     assert layers["samples"].ravel().tolist() == [16, 64, 32]
     assert GradientStack(layers)["samples"].shape == (1, 3, 1)
+
+
+def test_the_time_of_a_pass_is_foretold(renderer):
+    from data_gen.uneven import foretold
+
+    assert foretold([(100, 3.0)]) == (0.0, 0.03)
+    # The first compiles.
+    assert foretold([(100, 30.0), (100, 0.4), (300, 0.8), (50, 0.3)]) == pytest.approx((0.2, 0.002))
+    assert foretold([(100, 30.0), (100, 0.4), (100, 0.5)]) == pytest.approx((0.0, 0.004))
+    # Never nothing at all, however the times of busy machines fall.
+    begin, each = foretold([(1, 9.0), (100, 0.4), (300, 0.2), (200, 0.3)])
+    assert begin >= 0 and each > 0
