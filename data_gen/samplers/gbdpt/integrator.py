@@ -30,7 +30,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
@@ -49,7 +49,7 @@ from data_gen.samplers.bdpt.vertex import (
 )
 from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan, base_step
-from data_gen.samplers.gbdpt.light_shift import Splatted, differences
+from data_gen.samplers.gbdpt.light_shift import Link, Splatted, differences, next_link
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -109,8 +109,8 @@ class GBDPT(BDPT):
         e, p_light = lights.densities(scene, start, si)
         end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
         depth, count = mi.UInt32(1), mi.UInt32(0)
-        # How the vertex before was left
-        p_before, survival_before, left_smoothly = mi.Float(1), mi.Float(1), mi.Bool(True)
+        # The vertex that light has left smoothly last
+        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
         Record = record_class(mi.variant())
         kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
         while dr.hint(active, label="light path"):
@@ -133,10 +133,13 @@ class GBDPT(BDPT):
             splats["primal"].add(pixel, list(light), dr.max(C) > 0)
 
             # ----------------- Its four shifts -----------------------
-            first = depth == 1
-            before = recall(kept.read(dr.maximum(depth, 2) - 2), camera_ray.time, camera_ray.wavelengths)
-            allowed = materials.connectable(bsdf) & (first | (left_smoothly & materials.connectable(before.si.bsdf())))
-            path = Splatted(y, ray.d, uv, on_lens, C, others, first, start, before, p_before, survival_before, allowed)
+            first = link.depth == 0
+            before = recall(kept.read(dr.maximum(link.depth, 1) - 1), camera_ray.time, camera_ray.wavelengths)
+            allowed = link.whole & materials.connectable(bsdf) & (first | materials.connectable(before.si.bsdf()))
+            path = Splatted(
+                *(y, ray.d, uv, on_lens, C, others, first, start, before),
+                *(link.p, link.survival, link.events, allowed),
+            )
             Δ = differences(scene, plan, camera, path, self.first_hit)
             for name in SHIFTS:
                 one, on_film = Δ[name]
@@ -145,15 +148,13 @@ class GBDPT(BDPT):
             # -------------------- Next vertex ------------------------
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
-            left_smoothly = event_kind(sample.sampled_type) == SMOOTH
             d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
             β *= dr.select(sample.pdf > 0, f_p, 0)
-            p_before = mi.Float(sample.pdf)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
-            survival_before = dr.rcp(survival)
-            β *= survival_before
+            β /= survival
+            link = next_link(link, depth, sample, dr.rcp(survival))
             depth += 1
             ray = si.spawn_ray(d)
             hit = scene.ray_intersect_preliminary(ray, active=active)
