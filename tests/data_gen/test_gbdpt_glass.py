@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from bdpt_scenes import SCENES
 from data_gen_scenes import caustics
 from unbiased import load
 
@@ -99,7 +98,7 @@ class Caustics:
         """(C', r, others') at that place on the film."""
         from data_gen.samplers.gbdpt.light_shift import shifted
 
-        return shifted(self.scene, self.plan, self.camera, path, uv, active, self.first_hit)
+        return shifted(self.scene, self.plan, self.camera, path, uv, active, self.first_hit, True)
 
     def copy(self, path, pixels):
         """Its copy so many pixels to the right and half as many down: where it is, and C', r, others'."""
@@ -190,7 +189,12 @@ def moved_path(paths, uv, good):
         dr.eval(si, d, β, end)
     y = Vertex(si, β, end, path.y.depth)
     C, others, uv_back = to_camera(
-        camera.sensor, path.lens, y, si.bsdf(), good, lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)
+        camera.sensor,
+        path.lens,
+        y,
+        si.bsdf(),
+        good,
+        lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active),
     )
     p_new = dr.select(path.first, path.p, p)
     moved = replace(path, y=y, d=d, uv=uv_back, C=C, others=others, start=start, p=p_new)
@@ -218,7 +222,7 @@ def test_copies_are_paths_that_light_could_have_found(paths):
     assert np.array(lit).sum() > 0.9 * np.array(good).sum()
     close(C / r, moved.C, lit, most=0.1)
     close(others, moved.others, np.array(lit) & (np.array(others) > 0), most=0.1)
-    C_back, r_back, others_back = paths.shift(moved, paths.path.uv, lit)
+    C_back, r_back, _ = paths.shift(moved, paths.path.uv, lit)
     back = lit & (paths.dr.max(C_back) > 0)
     assert np.array(back).sum() > 0.97 * np.array(lit).sum()
     close(r * r_back, 1, back, median=1e-2, most=0.1)

@@ -68,11 +68,13 @@ def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: m
 
 
 def differences(
-    scene, plan: Plan, camera, path: Splatted, first_hit: Callable
+    scene, plan: Plan, camera, path: Splatted, first_hit: Callable, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
-    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film."""
+    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film.
+
+    Paths are those that are ``lit``: with ``bent`` the ones with events in between, else the others.
+    """
     shifts = list(SHIFTS.values())
-    lit = dr.max(path.C) > 0
     state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))
 
     def one(i, *Δ):
@@ -81,12 +83,9 @@ def differences(
         active = lit & inside(camera, uv)
 
         def pair(_):
-            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit)
-            Δ = difference(path.C, path.others, C, r, others)
-            if not plan.materials.all_connectable:
-                alone = difference_of_one(path.C, path.others, C, r, others)
-                Δ = dr.select(path.events != 0, alone, Δ)
-            return Δ
+            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit, bent)
+            weights = difference_of_one if bent else difference
+            return weights(path.C, path.others, C, r, others)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), active, pair, lambda none: none)
         return i + 1, *(dr.select(i == k, Δ1, old) for k, old in enumerate(Δ))
@@ -96,7 +95,7 @@ def differences(
     return dict(zip(SHIFTS, zip(Δ, on_film, strict=True), strict=True))
 
 
-def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
+def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bool = False):
     """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
     sensor, y = camera.sensor, path.y
@@ -135,16 +134,11 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
         β = before.β * f * (G * path.survival / path.p)
         return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p)
 
-    def straight(*_):
-        return dr.if_stmt(edge, path.first, from_start, from_before)
-
-    if plan.materials.all_connectable:
-        d, β, r, vcm, vc, shadow = straight()
+    if bent:
+        d, β, r, vc = through_glass(scene, plan, path, x, active)
+        vcm = mi.Float(0)
     else:
-        bent = active & (path.events != 0)
-        d, β, r, vcm, vc, shadow = dr.if_stmt(
-            edge, bent, lambda *_: through_glass(scene, plan, path, x, active), straight
-        )
+        d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
 
     # ----------------------- To the camera -----------------------
     x.wi = x.to_local(-d)
@@ -152,14 +146,15 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
     C = β * f * importance * J
     seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
     # Nothing is in the way of what has been followed.
-    C = dr.select(seen & ~scene.ray_test(shadow, seen & (path.events == 0)), C, 0)
+    C = dr.select(seen if bent else seen & ~scene.ray_test(shadow, seen), C, 0)
     return C, r * J, mis.others_to_camera(Partial(vcm, vc), importance[0], cosine(x, toward.d), q)
 
 
 def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
     """The edge from ``x`` to the vertex before, through the same ``events`` as the path from its own last vertex.
 
-    With Jacobian and densities by [Hua et al. 2019, section 3.4], for ω at either last vertex, at c what is before:
+    Returned are the direction in which light arrives, its β there (0 if it does not), r, and ``vc`` of ``mis``. With
+    Jacobian and densities by [Hua et al. 2019, section 3.4], for ω at either last vertex, at c what is before:
 
         b' / b    f'_c F' / (f_c F) G              F of radiance that goes the other way
         r         p'_c P' / (p_c P) G η² / η'²     P of the events
@@ -198,7 +193,7 @@ def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
     r = ratio * shot.P / base.P * G * dr.square(base.η / shot.η)
     vc *= dr.rcp(shot.turns * cosine(x, ω1))
     found &= (ratio > 0) & dr.isfinite(dr.sum(β)) & dr.isfinite(r) & dr.isfinite(vc)
-    return -ω1, dr.select(found, β, 0), dr.select(found, r, 0), mi.Float(0), dr.select(found, vc, 0), x.spawn_ray(ω1)
+    return -ω1, dr.select(found, β, 0), dr.select(found, r, 0), dr.select(found, vc, 0)
 
 
 def inside(camera, uv: mi.Point2f) -> mi.Bool:
