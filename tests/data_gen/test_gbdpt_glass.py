@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from data_gen_scenes import caustics
-from unbiased import load
+from unbiased import DISTANCES, gradient_tests, load, render_ours
 
 
 def by_a_point():
@@ -114,6 +114,7 @@ def paths(renderer, request):
     return Caustics(renderer, LIT[request.param])
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def close(ours, theirs, good, median=1e-3, most=0.03):
     error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
     error = error[..., np.array(good)]
@@ -227,3 +228,91 @@ def test_copies_are_paths_that_light_could_have_found(paths):
     assert np.array(back).sum() > 0.97 * np.array(lit).sum()
     close(r * r_back, 1, back, median=1e-2, most=0.1)
     close(C_back * r, paths.path.C, back, median=1e-2, most=0.1)
+
+
+@pytest.fixture
+def long_passes(monkeypatch):
+    """A pass of 64 samples per pixel: much less of the time goes by with recording kernels."""
+    from dataclasses import replace
+
+    from data_gen.samplers import SAMPLERS
+
+    for name in ("bdpt", "gbdpt"):
+        monkeypatch.setitem(SAMPLERS, name, replace(SAMPLERS[name], batch=64))
+
+
+def z_tests(mi, description, pixels):
+    """Against differences of ``bdpt``: ``path`` finds hardly any of this light, and none of a point's."""
+    scene = load(mi, description, (32, 32))
+    references = np.stack([stack["primal"] for stack in render_ours(scene, "bdpt", 16, 64)])
+    return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
+
+
+def test_unbiased(renderer, long_passes):
+    for name, result in z_tests(renderer, caustics, 1):
+        assert result.passed, f"{name}: {result}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixels", DISTANCES)
+@pytest.mark.parametrize("lit", LIT)
+def test_unbiased_by_more_lights(renderer, long_passes, lit, pixels):
+    for name, result in z_tests(renderer, LIT[lit], pixels):
+        assert result.passed, f"{name}: {result}"
+
+
+def without_jacobian(follow):
+    def mutant(*args):
+        ω, shot, J, found = follow(*args)
+        return ω, shot, J * 0 + 1, found
+
+    return mutant
+
+
+def halved(weights):
+    """As if a rejected path had a copy that says the rest."""
+    return lambda C, others, shifted, r, others_shifted: weights(C, others, shifted, r, others_shifted) / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "mutate"), [("follow", without_jacobian), ("difference_of_one", halved)], ids=["J is 1", "half"]
+)
+def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, function, mutate):
+    from data_gen.samplers.gbdpt import light_shift
+
+    monkeypatch.setattr(light_shift, function, mutate(getattr(light_shift, function)))
+    passed = {name: result.passed for name, result in z_tests(renderer, caustics, 1)}
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+def test_less_noise_than_without(renderer, long_passes, monkeypatch):
+    """Light of a point through a ball and by a mirror: nothing else falls on the floor but what it sees itself."""
+    from data_gen.samplers.gbdpt import light_shift
+
+    scene = load(renderer, by_a_point, (64, 64))
+
+    def noise():
+        layers = render_ours(scene, "gbdpt", 1, 256)[0]
+        return layers["dx_var"].mean() + layers["dy_var"].mean()
+
+    followed = noise()
+
+    def lost(scene, plan, path, x, active):
+        return renderer.Vector3f(path.d), renderer.Spectrum(0), renderer.Float(0), renderer.Float(0)
+
+    monkeypatch.setattr(light_shift, "through_glass", lost)
+    assert followed < 0.8 * noise()
+
+
+def test_the_same_bits_whatever_the_passes(renderer, monkeypatch):
+    from data_gen import passes
+    from data_gen.render import render_stack
+
+    scene = load(renderer, caustics, (24, 16))
+    whole = render_stack(scene, 32, 5, "gbdpt")
+    monkeypatch.setattr(passes, "FIRST_LANES", 1)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 0.0)
+    split = render_stack(scene, 32, 5, "gbdpt")
+    for name in whole.names:
+        assert np.array_equal(whole[name], split[name]), name
