@@ -16,6 +16,9 @@ rejected, alike by all strategies, where one of these three vertices is not conn
 them, or where the copy is occluded or black. What is completed by connecting the camera path's first vertices is
 shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
 
+What reaches the first vertex through mirrors or glass is rejected, but for light paths that end there: of those the
+copies go through the same events to the vertex before them, in a kernel of their own.
+
 [Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain
 Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 14-15]
 """
