@@ -6,8 +6,12 @@ from copy import copy
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from data_gen.paths.streams import sample_streams
+
+# As in ``data_gen.passes``: rays of lanes side by side are traced together.
+_PACKET = 16
 
 
 class CameraSamples:
@@ -80,3 +84,16 @@ class CameraSamples:
         uv = p / mi.Vector2f(self.size)
         ray, importance = self.sensor.sample_ray_differential(self.time, self.wavelength, uv, self.lens)
         return ray, importance, inside
+
+
+def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
+    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.
+
+    The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
+    """
+    _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
+    padded = -(-counts // _PACKET) * _PACKET
+    place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
+    spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)
+    spread[place], exists[place] = lanes, True
+    return spread, exists

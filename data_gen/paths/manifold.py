@@ -52,6 +52,8 @@ class Shot:
     ``B0``, ``B1``   columns of B, for two orthogonal turns of ω
     ``first``   point of the first event
     ``weight``  product of the events' f / P, and ``P`` of the probabilities with which sampling takes such events
+    ``η``       product of the events' relative indices of refraction
+    ``turns``   product of the quotients of cosines, behind over before an event, to the geometric normals
     ``ray``     from the last event on
     """
 
@@ -63,6 +65,8 @@ class Shot:
     first: mi.Point3f
     weight: mi.Spectrum
     P: mi.Float
+    η: mi.Float
+    turns: mi.Float
     ray: mi.Ray3f
 
     @property
@@ -77,9 +81,18 @@ def event(sampled_type: mi.UInt32) -> mi.UInt32:
     return dr.select(mi.has_flag(sampled_type, mi.BSDFFlags.Null), PASS, code)
 
 
+def prepend_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
+    """The chain with one more event in front of all others, and whether it has room for it."""
+    return (events << 2) | code, has_room(events)
+
+
+def has_room(events: mi.UInt32) -> mi.Bool:
+    return events < (1 << (2 * MAX_EVENTS - 2))
+
+
 def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
     """The chain with one more event, and whether it has room for it."""
-    fits = events < (1 << (2 * MAX_EVENTS - 2))
+    fits = has_room(events)
     # The place behind the highest event
     place = (34 - dr.lzcnt(events) - 1) & ~mi.UInt32(1)
     return events | (code << place), fits
@@ -90,10 +103,11 @@ def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32,
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
-    turns = mi.Frame3f(ω)
+    frame = mi.Frame3f(ω)
     dp0, dp1 = mi.Vector3f(0), mi.Vector3f(0)
-    dd0, dd1 = mi.Vector3f(turns.s), mi.Vector3f(turns.t)
+    dd0, dd1 = mi.Vector3f(frame.s), mi.Vector3f(frame.t)
     weight, P, length = mi.Spectrum(1), mi.Float(1), mi.Float(0)
+    η, turns = mi.Float(1), mi.Float(1)
     good, left, first = mi.Bool(active), mi.UInt32(events), mi.Point3f(z.p)
     while dr.hint(good & (left != 0), label="chain"):
         # ------------------------ Event --------------------------
@@ -113,13 +127,15 @@ def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32,
         first = dr.select(left == events, si.p, first)
         weight *= f_P
         P *= sample.pdf
+        η *= sample.eta
+        turns *= dr.abs(dr.dot(wo, si.n) / dr.dot(ray.d, si.n))
         length += si.t
         ray = si.spawn_ray(wo)
         left >>= 2
-    return arrive(target, ray, length, (dp0, dp1), (dd0, dd1), first, weight, P, good)
+    return arrive(target, ray, length, (dp0, dp1), (dd0, dd1), first, (weight, P, η, turns), good)
 
 
-def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, weight, P, good) -> Shot:
+def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, products: tuple, good) -> Shot:
     """The end of a shot: from the last event to the plane of the target."""
     plane = mi.Frame3f(target.n)
     cos = dr.dot(ray.d, target.n)
@@ -133,7 +149,7 @@ def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, weight, P, good
         columns.append(dr.select(target.far, d, move - ray.d * (dr.dot(move, target.n) / cos)))
     B0, B1, miss = (mi.Vector2f(dr.dot(v, plane.s), dr.dot(v, plane.t)) for v in (*columns, miss))
     reach = dr.select(target.far, 1, length + t)
-    return Shot(good & dr.isfinite(dr.squared_norm(miss)), miss, reach, B0, B1, first, weight, P, ray)
+    return Shot(good & dr.isfinite(dr.squared_norm(miss)), miss, reach, B0, B1, first, *products, ray)
 
 
 def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:

@@ -167,7 +167,7 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
     if facts.mirrors:
         lines.append(
-            "mirrors or clear glass: shifted in front of the camera, not behind other surfaces: noisy gradients"
+            "mirrors or clear glass: shifted in front of the camera, and where light comes through them to what it sees"
         )
     return lines
 

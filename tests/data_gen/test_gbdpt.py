@@ -330,7 +330,8 @@ def splatted(paths, s):
     nothing_between = lambda si, to, active: paths.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
     C, others, uv = to_camera(paths.sensor, paths.lens, y, y.si.bsdf(), good, nothing_between)
     return Splatted(
-        y, d, uv, paths.lens, C, others, mi.Bool(s == 1), paths.first, before, p, mi.Float(1), mi.Bool(good)
+        *(y, d, uv, paths.lens, C, others, mi.Bool(s == 1), paths.first, before),
+        *(p, mi.Float(1), mi.UInt32(0), mi.Bool(good)),
     )
 
 

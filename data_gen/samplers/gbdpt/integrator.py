@@ -16,6 +16,9 @@ rejected, alike by all strategies, where one of these three vertices is not conn
 them, or where the copy is occluded or black. What is completed by connecting the camera path's first vertices is
 shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
 
+What reaches the first vertex through mirrors or glass is rejected, but for light paths that end there: of those the
+copies go through the same events to the vertex before them, in a kernel of their own.
+
 [Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain
 Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 14-15]
 """
@@ -24,13 +27,14 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
@@ -49,7 +53,7 @@ from data_gen.samplers.bdpt.vertex import (
 )
 from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan, base_step
-from data_gen.samplers.gbdpt.light_shift import Splatted, differences
+from data_gen.samplers.gbdpt.light_shift import Link, Splatted, differences, next_link
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -80,37 +84,61 @@ class GBDPT(BDPT):
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         random = camera.random.clone()
-        kept, count = None, mi.UInt32(0)
+        kept, count, bent = None, mi.UInt32(0), mi.Bool(False)
         if plan.longest > 1 and plan.lights.emitters is not None:
             splats = {name: film.splats(name) for name in ("primal", *SHIFTS)}
-            kept, count, random = self.shifted_light_path(scene, plan, camera, random, ray, importance, splats)
+            kept, count, random, bent = self.shifted_light_path(scene, plan, camera, random, ray, importance, splats)
         L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         Δ, inside = [to_rgb(one, ray.wavelengths) for one in Δ], [inside for _, _, inside in shifted]
         # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside)
+        dr.eval(values, Δ, inside, bent)
+        if kept is not None and not plan.materials.all_connectable:
+            self.follow_bent(scene, plan, camera, splats, bent)
         film.put_all(values)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
+    def follow_bent(self, scene, plan, camera, splats, bent: mi.Bool) -> None:
+        """Splats the differences of light paths that end behind mirrors or glass: those of the ``bent`` lanes.
+
+        They are few, and their walks long: in the kernel of all lanes most of these would wait for them.
+        """
+        lanes, exists = in_packets(np.array(dr.compress(bent)), camera)
+        if not len(lanes):
+            return
+        some = camera.at(mi.UInt32(lanes))
+        ray, importance, _ = some.rays()
+        importance = dr.select(mi.Bool(exists), importance, 0)
+        *_, again = self.shifted_light_path(
+            scene, plan, some, some.random.clone(), ray, importance, splats, mi.Bool(exists)
+        )
+        dr.eval(again)
+
     @dr.syntax
-    def shifted_light_path(self, scene, plan, camera, random, camera_ray, importance, splats):
-        """``BDPT.light_path``, with the differences of all that it splats."""
+    def shifted_light_path(self, scene, plan, camera, random, camera_ray, importance, splats, again=None):
+        """``BDPT.light_path``, with the differences of all that it splats; and which lanes are bent.
+
+        Bent is what ends behind mirrors or glass. Its differences alone are splatted where the lanes are traced
+        ``again``, and all others in the first place.
+        """
         lights, materials, longest = plan.lights, plan.materials, plan.longest
         size, lens = camera.size, camera.sensor.needs_aperture_sample()
         start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
         ray, β = start.ray, start.β
         active = dr.max(β) > 0
+        if dr.hint(again is not None, mode="scalar"):
+            active &= again
         brightest = dr.rcp(dr.max(β))
         hit = scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray)
         active &= si.is_valid()
         e, p_light = lights.densities(scene, start, si)
         end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
-        depth, count = mi.UInt32(1), mi.UInt32(0)
-        # How the vertex before was left
-        p_before, survival_before, left_smoothly = mi.Float(1), mi.Float(1), mi.Bool(True)
+        depth, count, any_bent = mi.UInt32(1), mi.UInt32(0), mi.Bool(False)
+        # The vertex that light has left smoothly last
+        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
         Record = record_class(mi.variant())
         kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
         while dr.hint(active, label="light path"):
@@ -128,16 +156,26 @@ class GBDPT(BDPT):
             C, others, uv = to_camera(
                 camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
             )
-            light = to_rgb(weighted(C, others) * importance, camera_ray.wavelengths)
+            lit = dr.max(C) > 0
             pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
-            splats["primal"].add(pixel, list(light), dr.max(C) > 0)
+            if dr.hint(again is None, mode="scalar"):
+                light = to_rgb(weighted(C, others) * importance, camera_ray.wavelengths)
+                splats["primal"].add(pixel, list(light), lit)
 
             # ----------------- Its four shifts -----------------------
-            first = depth == 1
-            before = recall(kept.read(dr.maximum(depth, 2) - 2), camera_ray.time, camera_ray.wavelengths)
-            allowed = materials.connectable(bsdf) & (first | (left_smoothly & materials.connectable(before.si.bsdf())))
-            path = Splatted(y, ray.d, uv, on_lens, C, others, first, start, before, p_before, survival_before, allowed)
-            Δ = differences(scene, plan, camera, path, self.first_hit)
+            first = link.depth == 0
+            before = recall(kept.read(dr.maximum(link.depth, 1) - 1), camera_ray.time, camera_ray.wavelengths)
+            allowed = link.whole & materials.connectable(bsdf) & (first | materials.connectable(before.si.bsdf()))
+            path = Splatted(
+                *(y, ray.d, uv, on_lens, C, others, first, start, before),
+                *(link.p, link.survival, link.events, allowed),
+            )
+            bent = lit & allowed & (link.events != 0)
+            any_bent |= bent
+            if dr.hint(again is None, mode="scalar"):
+                Δ = differences(scene, plan, camera, path, self.first_hit, lit & ~bent)
+            else:
+                Δ = differences(scene, plan, camera, path, self.first_hit, bent, True)
             for name in SHIFTS:
                 one, on_film = Δ[name]
                 splats[name].add(pixel, list(to_rgb(one * importance, camera_ray.wavelengths)), on_film)
@@ -145,22 +183,20 @@ class GBDPT(BDPT):
             # -------------------- Next vertex ------------------------
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
-            left_smoothly = event_kind(sample.sampled_type) == SMOOTH
             d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
             β *= dr.select(sample.pdf > 0, f_p, 0)
-            p_before = mi.Float(sample.pdf)
             # By what is left of the light that the path began with
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
-            survival_before = dr.rcp(survival)
-            β *= survival_before
+            β /= survival
+            link = next_link(link, depth, sample, dr.rcp(survival))
             depth += 1
             ray = si.spawn_ray(d)
             hit = scene.ray_intersect_preliminary(ray, active=active)
             si = hit.compute_surface_interaction(ray)
             active &= si.is_valid()
             end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-        return kept, count, random
+        return kept, count, random, any_bent
 
     @dr.syntax
     def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):

@@ -1,6 +1,7 @@
 """Light paths that end at the camera, shifted: the last vertex moves to where a neighbouring pixel looks.
 
-The vertex before it stays. So it is the same shift as that of camera paths, seen from the other end.
+The vertex before it stays. So it is the same shift as that of camera paths, seen from the other end. Where mirrors and
+glass lie between the two, the vertex before them stays, and the copy goes through the same ones: see ``through_glass``.
 """
 
 from __future__ import annotations
@@ -12,12 +13,14 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS
+from data_gen.paths.manifold import Target, event, follow, prepend_event, walk
+from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate
 from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.pairs import difference
+from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
 
 
 @dataclass
@@ -34,16 +37,44 @@ class Splatted:
     start: LightRay
     before: Vertex
     p: mi.Float  # density with which ``before`` was left
-    survival: mi.Float  # 1 / probability to survive Russian roulette there
+    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
+    events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
     allowed: mi.Bool  # both vertices are connectable, and ``before`` was left by a smooth event
 
 
+@dataclass
+class Link:
+    """What lies between the last vertex of a light path and the one that light has left smoothly before it."""
+
+    depth: mi.UInt32  # of that one; 0 is the light's end
+    p: mi.Float  # density with which it was left
+    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
+    events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
+    whole: mi.Bool  # there is room for all of them
+
+
+def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float) -> Link:
+    """That of the next vertex, where the one at ``depth`` is left by a sampled event."""
+    smooth = event_kind(sample.sampled_type) == SMOOTH
+    code = event(sample.sampled_type)
+    events, fits = prepend_event(link.events, code)
+    return Link(
+        dr.select(smooth, depth, link.depth),
+        dr.select(smooth, sample.pdf, link.p),
+        dr.select(smooth, 1, link.survival) * survival,
+        dr.select(smooth, 0, dr.select(fits, events, link.events)),
+        smooth | (link.whole & fits & (code != 0)),
+    )
+
+
 def differences(
-    scene, plan: Plan, camera, path: Splatted, first_hit: Callable
+    scene, plan: Plan, camera, path: Splatted, first_hit: Callable, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
-    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film."""
+    """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film.
+
+    Paths are those that are ``lit``: with ``bent`` the ones with events in between, else the others.
+    """
     shifts = list(SHIFTS.values())
-    lit = dr.max(path.C) > 0
     state = (mi.UInt32(0), *(mi.Spectrum(0) for _ in shifts))
 
     def one(i, *Δ):
@@ -52,8 +83,9 @@ def differences(
         active = lit & inside(camera, uv)
 
         def pair(_):
-            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit)
-            return difference(path.C, path.others, C, r, others)
+            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit, bent)
+            weights = difference_of_one if bent else difference
+            return weights(path.C, path.others, C, r, others)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), active, pair, lambda none: none)
         return i + 1, *(dr.select(i == k, Δ1, old) for k, old in enumerate(Δ))
@@ -63,7 +95,7 @@ def differences(
     return dict(zip(SHIFTS, zip(Δ, on_film, strict=True), strict=True))
 
 
-def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
+def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bool = False):
     """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
     sensor, y = camera.sensor, path.y
@@ -102,15 +134,66 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit):
         β = before.β * f * (G * path.survival / path.p)
         return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p)
 
-    d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
+    if bent:
+        d, β, r, vc = through_glass(scene, plan, path, x, active)
+        vcm = mi.Float(0)
+    else:
+        d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
 
     # ----------------------- To the camera -----------------------
     x.wi = x.to_local(-d)
     f, _, q = evaluate(IMPORTANCE, x, bsdf, x.to_local(toward.d), active)
     C = β * f * importance * J
     seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
-    C = dr.select(seen & ~scene.ray_test(shadow, seen), C, 0)
+    # Nothing is in the way of what has been followed.
+    C = dr.select(seen if bent else seen & ~scene.ray_test(shadow, seen), C, 0)
     return C, r * J, mis.others_to_camera(Partial(vcm, vc), importance[0], cosine(x, toward.d), q)
+
+
+def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
+    """The edge from ``x`` to the vertex before, through the same ``events`` as the path from its own last vertex.
+
+    Returned are the direction in which light arrives, its β there (0 if it does not), r, and ``vc`` of ``mis``. With
+    Jacobian and densities by [Hua et al. 2019, section 3.4], for ω at either last vertex, at c what is before:
+
+        b' / b    f'_c F' / (f_c F) G              F of radiance that goes the other way
+        r         p'_c P' / (p_c P) G η² / η'²     P of the events
+        G         cos' cos_c / (cos cos'_c) dω' / dω: of the light's flux, from solid angles at c to areas at x
+
+    No other strategy follows such paths, so weights are this one's own (``pairs``).
+    """
+    y, before, lights = path.y, path.before, plan.lights
+    far = path.first & lights.far(path.start.index)
+    # ------------------------- The chain -------------------------
+    ω = -path.d
+    beside = mi.Vector3f(dr.select(path.first, path.start.end.n, mi.Vector3f(before.si.n)))
+    # Points have no normal: any plane that the light comes through will do.
+    target = Target(dr.select(path.first, path.start.end.p, before.si.p), beside, far)
+    point = path.first & path.start.delta & ~far
+    target.n = dr.select(far, -path.start.ray.d, dr.select(point, path.start.ray.d, target.n))
+    # Light came from the other side, by rays that began elsewhere: not quite to the point that it is walked to.
+    ω, base, active = walk(scene, y.si, ω, path.events, target, active)
+    ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target, active)
+    away, away1 = dr.abs(dr.dot(target.n, base.ray.d)), dr.abs(dr.dot(target.n, shot.ray.d))
+    G = J * cosine(x, ω1) / cosine(y.si, ω) * (away / away1)
+
+    # --------------------- The end that stays --------------------
+    last = mi.SurfaceInteraction3f(x)
+    last.p = shot.ray.o
+    moved, ratio, _ = lights.redirected(scene, path.start, last)
+    e, p_connect = lights.densities(scene, moved, last)
+    f, p, q = evaluate(IMPORTANCE, before.si, before.si.bsdf(), before.si.to_local(-shot.ray.d), found & ~path.first)
+    end = mis.leave(before.end, cosine(before.si, shot.ray.d), p, q, mi.Bool(False))
+    β = dr.select(path.first, moved.β, before.β * f * dr.rcp(path.p)) * path.survival
+    ratio = dr.select(path.first, ratio, p / path.p)
+    vc = dr.select(path.first, dr.select(moved.delta, 0, dr.rcp(e * p_connect)), end.vc)
+
+    # ------------------------- The edge --------------------------
+    β *= shot.weight * (shot.P / base.P * G * dr.square(base.η))
+    r = ratio * shot.P / base.P * G * dr.square(base.η / shot.η)
+    vc *= dr.rcp(shot.turns * cosine(x, ω1))
+    found &= (ratio > 0) & dr.isfinite(dr.sum(β)) & dr.isfinite(r) & dr.isfinite(vc)
+    return -ω1, dr.select(found, β, 0), dr.select(found, r, 0), dr.select(found, vc, 0)
 
 
 def inside(camera, uv: mi.Point2f) -> mi.Bool:

@@ -10,7 +10,14 @@ alone, the same for whichever strategy has found it. A path whose copy does not 
 
     Δ = -2 b / W(x)
 
-and from its dark copy there is nothing to say. [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", sections 3.5
+and from its dark copy there is nothing to say.
+
+A class of paths may be shifted by one strategy alone, by any map that does not leave the class, if all others reject
+its paths. Each has weights of its own then, and the strategy that shifts has
+
+    Δ = 2 (b' / W(y) - b / W(x)) / (1 + r)
+
+[Hua et al. 2019, "A Survey on Gradient-Domain Rendering", sections 3.5
 and 4.2; Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"]
 """
 
@@ -26,6 +33,16 @@ def difference(C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Flo
     # Both ends of a pair must come to the same: black is black in all channels.
     whole = (dr.max(shifted) > 0) & dr.isfinite(dr.sum(shifted)) & dr.isfinite(rW)
     Δ = dr.select(whole, (shifted - C) * (2 / (W + rW)), C * (-2 / W))
+    return dr.select(dr.max(C) > 0, Δ, 0)
+
+
+def difference_of_one(
+    C: mi.Spectrum, others: mi.Float, shifted: mi.Spectrum, r: mi.Float, others_shifted
+) -> mi.Spectrum:
+    """Δ of a path that this strategy alone shifts, while all others reject it: 2 (b' / W(y) - b / W(x)) / (1 + r)."""
+    whole = (dr.max(shifted) > 0) & dr.isfinite(dr.sum(shifted)) & dr.isfinite(r) & dr.isfinite(others_shifted)
+    b, b1 = C / (1 + others), shifted / (1 + others_shifted)
+    Δ = dr.select(whole, (b1 - b) * (2 / (1 + r)), -2 * b)
     return dr.select(dr.max(C) > 0, Δ, 0)
 
 

@@ -26,7 +26,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.manifold import MAX_EVENTS, Target, add_event, event, follow, shoot
 from data_gen.paths.shift import gradient_weight
 from data_gen.paths.spectrum import to_rgb
@@ -37,8 +37,6 @@ from data_gen.samplers.gpt.plan import Plan
 _BEFORE, _OPEN, _LOST = 0, 1 << 31, 1 << 30
 _EVENT_BITS = 2 * MAX_EVENTS
 _EVENTS = (1 << _EVENT_BITS) - 1
-# As in ``data_gen.passes``: rays of lanes side by side are traced together.
-_PACKET = 16
 
 
 @dataclass
@@ -110,19 +108,6 @@ def with_samples(total: mi.Color3f, samples: mi.Color3f, lanes, exists, n: int, 
     for channel, value in zip(channels, own, strict=True):
         dr.scatter_add(channel, value, lanes, exists)
     return mi.Color3f(*channels)
-
-
-def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
-    """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.
-
-    The results of a ray depend, in the last bits, on those traced with it; blocks must not depend on their pass.
-    """
-    _, counts = np.unique(lanes // (camera.pixels * camera.block), return_counts=True)
-    padded = -(-counts // _PACKET) * _PACKET
-    place = np.arange(len(lanes)) + np.repeat(np.cumsum(padded - counts) - (padded - counts), counts)
-    spread, exists = np.zeros(padded.sum(), np.uint32), np.zeros(padded.sum(), bool)
-    spread[place], exists[place] = lanes, True
-    return spread, exists
 
 
 def followed(scene, plan: Plan, first_hit, camera: CameraSamples, shift, word, survival, active) -> mi.Color3f:

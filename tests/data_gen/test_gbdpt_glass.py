@@ -1,0 +1,319 @@
+"""Light paths of ``gbdpt`` that reach the camera's first vertex through mirrors and glass, and their copies."""
+
+import numpy as np
+import pytest
+from data_gen_scenes import caustics
+from unbiased import DISTANCES, gradient_tests, load, render_ours
+
+
+def by_a_point():
+    """The same ball and mirror, lit by a point."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"point": {"type": "point", "position": [0.2, 2.6, -0.2], "intensity": _rgb(9, 9, 9)}}
+
+
+def by_the_sun():
+    """The same ball and mirror, lit from one direction."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"sun": {"type": "directional", "direction": [0.1, -1, 0.05], "irradiance": _rgb(9, 9, 9)}}
+
+
+def by_a_wall():
+    """The same ball and mirror, lit by what a lamp lights: the light's end is not what stays."""
+    from data_gen.scenes.builtin import _diffuse, _light, _wall
+
+    scene = caustics()
+    return scene | {
+        "lamp": _light([0.2, 1.2, -0.2], [0, 1, 0], (0.6, 0.6), (20, 20, 20)),
+        "ceiling": _wall([0, 2.4, 0], [0, -1, 0], (4, 4), _diffuse(0.8, 0.6, 0.5)),
+    }
+
+
+LIT = {"lamp": caustics, "point": by_a_point, "sun": by_the_sun, "wall": by_a_wall}
+
+
+class Caustics:
+    """One light path of each lane up to the first vertex behind mirrors or glass, which the camera sees."""
+
+    LENGTH = 5
+
+    def __init__(self, mi, description):
+        import drjit as dr
+
+        from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.vertex import Materials
+        from data_gen.samplers.bdpt import mis
+        from data_gen.samplers.bdpt.lights import LightEnds
+        from data_gen.samplers.bdpt.strategies import to_camera
+        from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves, scatters_smoothly
+        from data_gen.samplers.common import like_path
+        from data_gen.samplers.gbdpt.base_path import Plan
+        from data_gen.samplers.gbdpt.light_shift import Link, Splatted, next_link
+
+        self.mi, self.dr = mi, dr
+        self.scene = scene = load(mi, description, (32, 32))
+        self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
+        self.first_hit = like_path(scene, "gbdpt").first_hit
+        lights, materials = LightEnds(scene), Materials(scene, 0.05)
+        self.plan = Plan(lights, materials, 8, 100, 8)
+        ray, _, _ = camera.rays()
+        random = camera.random.clone()
+        start = lights.sample(scene, random, ray.time, ray.wavelengths)
+        si, d, β = scene.ray_intersect(start.ray), start.ray.d, start.β
+        e, p = lights.densities(scene, start, si)
+        end, there = mis.begin_light(e, p, start.delta, cosine(si, d)), si.is_valid()
+        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
+        kept = Vertex(si, β, end, mi.UInt32(0))
+        found = (Vertex(si, β, end, mi.UInt32(0)), mi.Vector3f(d), link, kept, mi.Bool(False))
+        for depth in range(1, self.LENGTH + 1):
+            y, bsdf = Vertex(si, mi.Spectrum(β), end, mi.UInt32(depth)), si.bsdf()
+            good = there & (link.events != 0) & link.whole & scatters_smoothly(bsdf) & materials.connectable(bsdf)
+            found = dr.select(good & ~found[4], (y, mi.Vector3f(d), link, kept, good), found)
+            kept = dr.select(there & scatters_smoothly(bsdf), y, kept)
+            sample, f_p = bsdf.sample(context(IMPORTANCE), si, random.next_1d(), random.next_2d(), there)
+            d, f_p, end = light_leaves(y, bsdf, sample, f_p, there)
+            β = β * f_p
+            link = next_link(link, mi.UInt32(depth), sample, mi.Float(1))
+            there &= sample.pdf > 0
+            si = scene.ray_intersect(si.spawn_ray(d), there)
+            there &= si.is_valid()
+            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+            dr.eval(found, kept, si, d, β, end, link, there)
+        y, d, link, before, good = found
+        nothing_between = lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
+        C, others, uv = to_camera(camera.sensor, camera.lens, y, y.si.bsdf(), good, nothing_between)
+        self.path = Splatted(
+            *(y, d, uv, camera.lens, C, others, link.depth == 0, start, before),
+            *(link.p, link.survival, link.events, good),
+        )
+        dr.eval(self.path)
+
+    def shift(self, path, uv, active):
+        """(C', r, others') at that place on the film."""
+        from data_gen.samplers.gbdpt.light_shift import shifted
+
+        return shifted(self.scene, self.plan, self.camera, path, uv, active, self.first_hit, True)
+
+    def copy(self, path, pixels):
+        """Its copy so many pixels to the right and half as many down: where it is, and C', r, others'."""
+        from data_gen.samplers.gbdpt.light_shift import inside
+
+        uv = path.uv + self.mi.Vector2f(pixels, pixels / 2)
+        active = path.allowed & inside(self.camera, uv) & (self.dr.max(path.C) > 0)
+        return uv, active, self.shift(path, uv, active)
+
+
+@pytest.fixture(scope="module", params=LIT)
+def paths(renderer, request):
+    return Caustics(renderer, LIT[request.param])
+
+
+@np.errstate(divide="ignore", invalid="ignore")
+def close(ours, theirs, good, median=1e-3, most=0.03):
+    error = np.abs(np.array(ours, np.float64) / np.array(theirs, np.float64) - 1)
+    error = error[..., np.array(good)]
+    assert np.median(error) < median and np.quantile(error, 0.97) < most, (np.median(error), np.quantile(error, 0.97))
+
+
+def test_a_path_is_its_own_copy_in_its_own_place(paths):
+    _, good, (C, r, others) = paths.copy(paths.path, 0)
+    assert np.array(good).sum() > 500
+    found = np.array(paths.dr.max(C) > 0)[np.array(good)]
+    assert found.mean() > 0.9
+    good &= paths.dr.max(C) > 0
+    close(C, paths.path.C, good)
+    close(r, 1, good)
+    close(others, paths.path.others, np.array(good) & (np.array(paths.path.others) > 0))
+
+
+def moved_path(paths, uv, good):
+    """The copy at ``uv`` as if light had found it: traced forward from the vertex that stays."""
+    from dataclasses import replace
+
+    from data_gen.samplers.bdpt import mis
+    from data_gen.samplers.bdpt.strategies import to_camera
+    from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, evaluate, light_leaves
+    from data_gen.samplers.gbdpt.light_shift import through_glass
+
+    mi, dr, scene, camera, path = paths.mi, paths.dr, paths.scene, paths.camera, paths.path
+    size = mi.Vector2f(camera.size)
+    ray, _ = camera.sensor.sample_ray(camera.time, camera.wavelength, uv / size, path.lens)
+    x = scene.ray_intersect(ray, good)
+    d, β, *_ = through_glass(scene, paths.plan, path, x, good & x.is_valid())
+    good &= dr.max(β) > 0
+    dr.eval(x, d, good)
+    # ------------------- To the vertex that stays ----------------
+    events, ray, last = mi.UInt32(path.events), x.spawn_ray(-d), mi.Point3f(x.p)
+    for _ in range(6):
+        here = good & (events != 0)
+        si = scene.ray_intersect(ray, here)
+        last = dr.select(here, si.p, last)
+        sample, _ = si.bsdf().sample(mi.BSDFContext(), si, number(mi, dr, events & 3), mi.Point2f(0.5), here)
+        ray = dr.select(here, si.spawn_ray(si.to_world(sample.wo)), ray)
+        events >>= 2
+        dr.eval(events, ray, last)
+    # -------------------------- And back -------------------------
+    beyond = mi.SurfaceInteraction3f(x)
+    beyond.p = last
+    start, ratio, _ = paths.plan.lights.redirected(scene, path.start, beyond)
+    start.β /= ratio
+    before = path.before.si
+    away = dr.normalize(last - before.p)
+    f, p, q = evaluate(IMPORTANCE, before, before.bsdf(), before.to_local(away), good & ~path.first)
+    # What is infinitely far away begins elsewhere.
+    far = path.first & paths.plan.lights.far(path.start.index)
+    origin = dr.select(far, last - 3 * start.ray.d, start.end.p)
+    ray = dr.select(path.first, mi.Ray3f(origin, start.ray.d), before.spawn_ray(away))
+    d = dr.select(path.first, start.ray.d, away)
+    β = dr.select(path.first, start.β, path.before.β * f / p)
+    end = mis.leave(path.before.end, cosine(before, d), p, q, mi.Bool(False))
+    si = scene.ray_intersect(ray, good)
+    e, p_light = paths.plan.lights.densities(scene, start, si)
+    begun = mis.begin_light(e, p_light, start.delta, cosine(si, d))
+    end = dr.select(path.first, begun, mis.arrive(end, cosine(si, d), dr.square(si.t)))
+    forward = [(path.events >> (2 * k)) & 3 for k in range(5, -1, -1)]
+    for code in forward:
+        here = good & (code != 0)
+        y, bsdf = Vertex(si, β, end, mi.UInt32(1)), si.bsdf()
+        sample, f_p = bsdf.sample(context(IMPORTANCE), si, number(mi, dr, code), mi.Point2f(0.5), here)
+        d_next, f_p, left = light_leaves(y, bsdf, sample, f_p, here)
+        β = dr.select(here, β * f_p, β)
+        reached = scene.ray_intersect(si.spawn_ray(d_next), here)
+        left = mis.arrive(left, cosine(reached, d_next), dr.square(reached.t))
+        si, d, end = dr.select(here, reached, si), dr.select(here, d_next, d), dr.select(here, left, end)
+        dr.eval(si, d, β, end)
+    y = Vertex(si, β, end, path.y.depth)
+    C, others, uv_back = to_camera(
+        camera.sensor,
+        path.lens,
+        y,
+        si.bsdf(),
+        good,
+        lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active),
+    )
+    p_new = dr.select(path.first, path.p, p)
+    moved = replace(path, y=y, d=d, uv=uv_back, C=C, others=others, start=start, p=p_new)
+    dr.eval(moved, good)
+    return moved, good
+
+
+def number(mi, dr, code):
+    """A random number with which an event of that code is sampled."""
+    return dr.select(code == 1, mi.Float(0), 1 - dr.epsilon(mi.Float))
+
+
+def test_copies_are_paths_that_light_could_have_found(paths):
+    """C' / r is the contribution of the copy by its own density, traced forward; weights are those along it; and the
+    copy's copy is the path, with 1 / r."""
+    uv, active, (C, r, others) = paths.copy(paths.path, 0.25)
+    asked = np.array(active).sum()
+    good = active & (paths.dr.max(C) > 0)
+    # Of large curved things; where a copy would leave them, there is none.
+    assert np.array(good).sum() > 0.4 * asked, (np.array(good).sum(), asked)
+    moved, good = moved_path(paths, uv, good)
+    offset = np.linalg.norm(np.array(moved.uv - uv), axis=0)[np.array(good)]
+    assert np.quantile(offset, 0.95) < 0.1
+    lit = good & (paths.dr.max(moved.C) > 0)
+    assert np.array(lit).sum() > 0.9 * np.array(good).sum()
+    close(C / r, moved.C, lit, most=0.1)
+    close(others, moved.others, np.array(lit) & (np.array(others) > 0), most=0.1)
+    C_back, r_back, _ = paths.shift(moved, paths.path.uv, lit)
+    back = lit & (paths.dr.max(C_back) > 0)
+    assert np.array(back).sum() > 0.97 * np.array(lit).sum()
+    close(r * r_back, 1, back, median=1e-2, most=0.1)
+    close(C_back * r, paths.path.C, back, median=1e-2, most=0.1)
+
+
+@pytest.fixture
+def long_passes(monkeypatch):
+    """A pass of 64 samples per pixel: much less of the time goes by with recording kernels."""
+    from dataclasses import replace
+
+    from data_gen.samplers import SAMPLERS
+
+    for name in ("bdpt", "gbdpt"):
+        monkeypatch.setitem(SAMPLERS, name, replace(SAMPLERS[name], batch=64))
+
+
+def z_tests(mi, description, pixels):
+    """Against differences of ``bdpt``: ``path`` finds hardly any of this light, and none of a point's."""
+    scene = load(mi, description, (32, 32))
+    references = np.stack([stack["primal"] for stack in render_ours(scene, "bdpt", 16, 64)])
+    return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
+
+
+def test_unbiased(renderer, long_passes):
+    for name, result in z_tests(renderer, caustics, 1):
+        assert result.passed, f"{name}: {result}"
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixels", DISTANCES)
+@pytest.mark.parametrize("lit", LIT)
+def test_unbiased_by_more_lights(renderer, long_passes, lit, pixels):
+    for name, result in z_tests(renderer, LIT[lit], pixels):
+        assert result.passed, f"{name}: {result}"
+
+
+def without_jacobian(follow):
+    def mutant(*args):
+        ω, shot, J, found = follow(*args)
+        return ω, shot, J * 0 + 1, found
+
+    return mutant
+
+
+def halved(weights):
+    """As if a rejected path had a copy that says the rest."""
+    return lambda C, others, shifted, r, others_shifted: weights(C, others, shifted, r, others_shifted) / 2
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("function", "mutate"), [("follow", without_jacobian), ("difference_of_one", halved)], ids=["J is 1", "half"]
+)
+def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, function, mutate):
+    from data_gen.samplers.gbdpt import light_shift
+
+    monkeypatch.setattr(light_shift, function, mutate(getattr(light_shift, function)))
+    passed = {name: result.passed for name, result in z_tests(renderer, caustics, 1)}
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+def test_less_noise_than_without(renderer, long_passes, monkeypatch):
+    """Light of one direction, through a ball and by a mirror, and straight onto the floor."""
+    from data_gen.samplers.gbdpt import light_shift
+
+    scene = load(renderer, by_the_sun, (48, 48))
+
+    def noise():
+        layers = render_ours(scene, "gbdpt", 1, 128)[0]
+        return layers["dx_var"].mean() + layers["dy_var"].mean()
+
+    followed = noise()
+
+    def lost(scene, plan, path, x, active):
+        return renderer.Vector3f(path.d), renderer.Spectrum(0), renderer.Float(0), renderer.Float(0)
+
+    monkeypatch.setattr(light_shift, "through_glass", lost)
+    without = noise()
+    assert followed < 0.5 * without, (followed, without)
+
+
+def test_the_same_bits_whatever_the_passes(renderer, monkeypatch):
+    from data_gen import passes
+    from data_gen.render import render_stack
+
+    scene = load(renderer, caustics, (24, 16))
+    whole = render_stack(scene, 32, 5, "gbdpt")
+    monkeypatch.setattr(passes, "FIRST_LANES", 1)
+    monkeypatch.setattr(passes, "PASS_SECONDS", 0.0)
+    split = render_stack(scene, 32, 5, "gbdpt")
+    for name in whole.names:
+        assert np.array_equal(whole[name], split[name]), name
