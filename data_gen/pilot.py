@@ -35,7 +35,7 @@ from ngpt.methods import reconstruct
 # Samples per pixel of each of the two stacks; of a sampler with batches at least two of those
 SPP = 8
 # Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
-_PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
+PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
 # Of what the whole render may take
 SHARE = 0.05
 # Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
@@ -46,7 +46,7 @@ _MARGIN = 1.25
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
 # Seeds far from those that users take
-_SEED = 0x9E3779B9
+SEED = 0x9E3779B9
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
         return Choice(sampler, f"{reason}; the render is too short to try others")
     entry = SAMPLERS[sampler]
     film_within(memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch)
-    with _at_most(scene, _PIXELS) as scale:
+    with at_most(scene, PIXELS) as scale:
         first = try_out(scene, sampler)
         if first is None:
             return Choice(sampler, reason, time.perf_counter() - start)
@@ -120,12 +120,12 @@ def compare_with(
     for i, name in enumerate(names[1:], 1):
         if not goes_on():
             break
-        if (trial := try_out(scene, name, _SEED + 2 * i)) is not None:
+        if (trial := try_out(scene, name, SEED + 2 * i)) is not None:
             trials[name] = trial
     return trials
 
 
-def try_out(scene: mi.Scene, sampler: str, seed: int = _SEED) -> Trial | None:
+def try_out(scene: mi.Scene, sampler: str, seed: int = SEED) -> Trial | None:
     """Two small stacks by a sampler; None where it finds, of this scene, that it cannot render it."""
     try:
         render_stack(scene, 1, seed, sampler)  # compiles
@@ -145,16 +145,16 @@ def try_out(scene: mi.Scene, sampler: str, seed: int = _SEED) -> Trial | None:
 def times_to_an_error(trials: dict[str, Trial]) -> dict[str, float]:
     """Seconds that each sampler of a pilot takes to an error of 1; no more than their ratios are of use."""
     middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
-    noise = {name: max(_noise(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
+    noise = {name: max(noise_of(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
     # Of all samplers, those with little noise count most: to what the errors are relative, and as witnesses.
-    scale = _mean({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
+    scale = mean_of({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
     times = {}
     for name, trial in trials.items():
-        error = _noise(*trial.primals, scale)
+        error = noise_of(*trial.primals, scale)
         others = {other: noise[other] for other in trials if other != name}
         if SAMPLERS[name].gradients and others:
-            witnesses = [_mean({other: trials[other].primals[i] for other in others}, others) for i in range(2)]
-            error = statistics.mean(_error(image, witnesses, scale) for image in trial.images)
+            witnesses = [mean_of({other: trials[other].primals[i] for other in others}, others) for i in range(2)]
+            error = statistics.mean(error_of(image, witnesses, scale) for image in trial.images)
         times[name] = max(error, 1e-9) * trial.seconds
     return times
 
@@ -169,19 +169,19 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     return best, f"chosen by a pilot: {found}"
 
 
-def _mean(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
+def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
     """Of images by name, weighted by 1 / their noise."""
     weights = {name: 1 / noise[name] for name in images}
     return sum(weights[name] * image for name, image in images.items()) / sum(weights.values())
 
 
-def _noise(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
+def noise_of(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
     """The relMSE of each of two independent unbiased images, by their difference; trimmed as the metric is."""
     errors = np.square(a - b) / 2 / _denominator(scale)
     return trimmed_mean(errors, errors, _TRIM)
 
 
-def _error(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
+def error_of(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
     """The relMSE of an image by two independent unbiased ones; trimmed as the metric is."""
     a, b = witnesses
     under = _denominator(scale)
@@ -194,7 +194,7 @@ def _denominator(scale: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def _at_most(scene: mi.Scene, pixels: int):
+def at_most(scene: mi.Scene, pixels: int):
     """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it.
 
     A cropped film stays as it is: its window could not be set again.

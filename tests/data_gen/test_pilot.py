@@ -74,7 +74,7 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
 
     scene = load(renderer, "diffuse", (48, 32))
     before = render_stack(scene, 2, 0, "gpt")
-    monkeypatch.setattr(pilot, "_PIXELS", 24 * 16)
+    monkeypatch.setattr(pilot, "PIXELS", 24 * 16)
     sizes = []
     tried = pilot.try_out
     monkeypatch.setattr(

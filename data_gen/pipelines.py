@@ -1,0 +1,202 @@
+"""The whole way to an image, a sampler and a method, chosen by the error that it is expected to leave in the end.
+
+Each sampler that could render the scene renders four small stacks. Every method that can use them reconstructs each of
+the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
+the other samplers, whose noise has no mean (``data_gen.pilot``): so what a method blurs or loses counts. From the
+pilot's samples to those that fit into the time errors fall by a power of the samples. Part of that power is what the
+pilot saw from one stack to two, the rest what the method did on the scenes of the table of advice.
+
+Samples are even, or shared out (``data_gen.adaptive``) where that is expected to pay for itself: the gain is that of
+the pilot's expected errors, pixel by pixel, were they known.
+
+Not handled: light that no sampler has found in the pilot.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.adaptive import LEAST, Adaptive, assess, gain
+from data_gen.pilot import SEED, SPP, error_of, mean_of, noise_of
+from data_gen.render import render_stack
+from data_gen.samplers import SAMPLERS
+from ngpt.errors import NgptError
+from ngpt.measure.advice import falls, read_table
+from ngpt.merging import merge
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+
+# The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
+WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
+WITHOUT = ("primal", "oidn", "ngpt-primal")
+# Of the power by which errors fall, the share that the pilot decides, and the steepest and flattest that it may be
+SEEN, STEEPEST, FLATTEST = 0.4, -1.1, -0.2
+# Of the gain by which shared out samples are better than even ones, the power that is left of it: what is known of the
+# need has noise. And the samples from which on they are thought of.
+REALISED, FROM = 0.7, 2 * LEAST
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image."""
+
+    stacks: list[GradientStack]
+    seconds: float
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A sampler and a method, as a pilot saw them.
+
+    ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
+    ``steps``     the powers of the samples by which it falls: as the pilot saw it, and as the table of advice has it
+    ``seconds``   of one sample of the whole image
+    ``after``     those of the method
+    ``adaptive``  error of shared out samples over that of even ones, 1 where samples are even
+    ``choosing``  seconds of the method that shares them out, each time
+    """
+
+    sampler: str
+    method: str
+    spp: int
+    error: float
+    steps: tuple[float, float]
+    seconds: float
+    after: float
+    adaptive: float = 1.0
+    choosing: float = 0.0
+
+    @property
+    def shared(self) -> bool:
+        """Whether samples are shared out."""
+        return self.choosing > 0
+
+    @property
+    def fall(self) -> float:
+        """The power of the samples by which the error falls."""
+        seen, known = self.steps
+        return min(max(SEEN * seen + (1 - SEEN) * known, STEEPEST), FLATTEST)
+
+    def samples(self, seconds: float) -> float:
+        """How many samples per pixel fit into the time; less than 1 where none do."""
+        spp = (seconds - self.after) / self.seconds
+        if not self.shared or spp <= LEAST:
+            return spp
+        return spp - self.choosing * math.ceil(math.log2(spp / LEAST) + 1) / self.seconds
+
+    def expected(self, spp: float) -> float:
+        """The error after so many samples; infinite where there are too few."""
+        if spp < (FROM if self.shared else max(1, SAMPLERS[self.sampler].batch)):
+            return math.inf
+        return self.error * self.adaptive**REALISED * (spp / self.spp) ** self.fall
+
+
+def try_pipelines(
+    scene: mi.Scene,
+    samplers: Sequence[str],
+    goes_on: Callable[[], bool] = lambda: True,
+    clock: Callable[[], float] = time.perf_counter,
+    only: str = "auto",
+) -> list[Pipeline]:
+    """All pipelines of the samplers, as far as there is time: the first sampler is always tried.
+
+    ``clock`` is what seconds are measured by, ``only`` the one method to consider. Raises NgptError where no sampler
+    can render the scene.
+    """
+    trials: dict[str, Trial] = {}
+    for i, name in enumerate(samplers):
+        if trials and not goes_on():
+            break
+        if (trial := _try_out(scene, name, SEED + 8 * i, clock)) is not None:
+            trials[name] = trial
+    if not trials:
+        raise NgptError(f"none of the samplers {', '.join(samplers)} can render the scene")
+    return measure(trials, clock, only)
+
+
+def _try_out(scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float]) -> Trial | None:
+    try:
+        render_stack(scene, 1, seed, sampler)  # compiles
+    except NgptError:
+        return None
+    spp = max(SPP, 2 * SAMPLERS[sampler].batch)
+    stacks, seconds = [], []
+    for i in range(4):
+        start = clock()
+        stacks.append(render_stack(scene, spp, seed + i, sampler))
+        seconds.append(clock() - start)
+    return Trial(stacks, statistics.median(seconds) / spp)
+
+
+def measure(trials: dict[str, Trial], clock: Callable[[], float] = time.perf_counter, only: str = "auto"):
+    """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use."""
+    known = falls(read_table())
+    primals = {name: [stack["primal"].astype(np.float64) for stack in trial.stacks] for name, trial in trials.items()}
+    middle = sum(sum(images) / 4 for images in primals.values()) / len(primals)
+    noise = {name: max(noise_of(*images[:2], middle), 1e-12) for name, images in primals.items()}
+    scale = mean_of({name: sum(images) / 4 for name, images in primals.items()}, noise)
+    found = []
+    for name, trial in trials.items():
+        halves = [merge(trial.stacks[:2]), merge(trial.stacks[2:])]
+        need = None
+        for method in methods_for(name, only):
+            single, double, after = [], [], []
+            for half in range(2):
+                witnesses = _witnesses(primals, noise, name, 1 - half)
+                for stack in trial.stacks[2 * half : 2 * half + 2]:
+                    single.append(error_of(reconstruct(stack, method).image, witnesses, scale))
+                start = clock()
+                image = reconstruct(halves[half], method).image
+                after.append(clock() - start)
+                double.append(error_of(image, witnesses, scale))
+            one, two = max(statistics.mean(single), 1e-9), max(statistics.mean(double), 1e-9)
+            spp = int(halves[0].attributes["ngpt:spp"])
+            steps = (math.log2(two / one), known.get(method, -1.0))
+            # Of both: at twice the samples, the one that was measured there and the one that falls to it.
+            error = math.sqrt(two * one * 2 ** max(-1.0, min(steps[1], 0.0)))
+            pipeline = Pipeline(name, method, spp, error, steps, trial.seconds, min(after))
+            found.append(pipeline)
+            if not SAMPLERS[name].batch:
+                if need is None:
+                    need = _need(merge(halves), clock)
+                found.append(replace(pipeline, adaptive=need[0], choosing=need[1]))
+    return found
+
+
+def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, float]:
+    """What sharing samples out is expected to gain, and the seconds of each choice."""
+    method = Adaptive().chosen_by(stack)
+    start = clock()
+    found = assess(stack, method)
+    return gain(found.relative), max(clock() - start, 1e-9)
+
+
+def methods_for(sampler: str, only: str = "auto") -> list[str]:
+    """What may reconstruct the sampler's stacks, of what runs here."""
+    names = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
+    return [m for m in (names if only == "auto" else (only,)) if not METHODS[m].missing()]
+
+
+def _witnesses(primals: dict, noise: dict[str, float], sampler: str, half: int) -> list[np.ndarray]:
+    """Two independent images that the sampler's other half has no part in: that ``half`` of its own, all of others."""
+    sides = []
+    for i in range(2):
+        images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in primals.items() if n != sampler}
+        weights = {n: noise[n] / 2 for n in images}
+        images[sampler], weights[sampler] = primals[sampler][2 * half + i], noise[sampler]
+        fair = [n for n in images if not SAMPLERS[n].biased] or list(images)
+        sides.append(mean_of({n: images[n] for n in fair}, weights))
+    return sides
+
+
+def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
+    """Those of which at least a sample fits into the time, the one to take first."""
+    fit = [p for p in pipelines if p.samples(seconds) >= 1 and math.isfinite(p.expected(p.samples(seconds)))]
+    return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))
