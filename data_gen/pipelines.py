@@ -24,7 +24,8 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.adaptive import LEAST, Adaptive, assess, gain
-from data_gen.pilot import SEED, SPP, error_of, mean_of, noise_of
+from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.pilot import PIXELS, SEED, SPP, at_most, candidates, error_of, mean_of, noise_of
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
@@ -33,11 +34,13 @@ from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
+# Of the time that there is, after which no further sampler is tried
+SHARE = 0.1
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
 WITHOUT = ("primal", "oidn", "ngpt-primal")
 # Of the power by which errors fall, the share that the pilot decides, and the steepest and flattest that it may be
-SEEN, STEEPEST, FLATTEST = 0.4, -1.1, -0.2
+SEEN, STEEPEST, FLATTEST = 0.6, -1.1, -0.2
 # Of the gain by which shared out samples are better than even ones, the power that is left of it: what is known of the
 # need has noise. And the samples from which on they are thought of.
 REALISED, FROM = 0.7, 2 * LEAST
@@ -126,13 +129,18 @@ def _try_out(scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float
         render_stack(scene, 1, seed, sampler)  # compiles
     except NgptError:
         return None
-    spp = max(SPP, 2 * SAMPLERS[sampler].batch)
-    stacks, seconds = [], []
+    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
+    stacks, seconds, begin = [], [], []
     for i in range(4):
+        start = clock()
+        render_stack(scene, least, seed + i, sampler)
+        begin.append(clock() - start)
         start = clock()
         stacks.append(render_stack(scene, spp, seed + i, sampler))
         seconds.append(clock() - start)
-    return Trial(stacks, statistics.median(seconds) / spp)
+    # What a render takes to begin is no part of what a sample takes.
+    each = (statistics.median(seconds) - statistics.median(begin)) / (spp - least)
+    return Trial(stacks, max(each, 0.2 * statistics.median(seconds) / spp))
 
 
 def measure(trials: dict[str, Trial], clock: Callable[[], float] = time.perf_counter, only: str = "auto"):
@@ -181,7 +189,12 @@ def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, floa
 def methods_for(sampler: str, only: str = "auto") -> list[str]:
     """What may reconstruct the sampler's stacks, of what runs here."""
     names = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
-    return [m for m in (names if only == "auto" else (only,)) if not METHODS[m].missing()]
+    if only != "auto":
+        lack = METHODS[only].missing() if only in METHODS else f"there is no method '{only}'"
+        if lack:
+            raise NgptError(f"method '{only}' cannot be used: {lack}; name another, or auto")
+        names = (only,) if SAMPLERS[sampler].gradients or "dx" not in METHODS[only].needs else ()
+    return [m for m in names if not METHODS[m].missing()]
 
 
 def _witnesses(primals: dict, noise: dict[str, float], sampler: str, half: int) -> list[np.ndarray]:
@@ -200,3 +213,60 @@ def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
     """Those of which at least a sample fits into the time, the one to take first."""
     fit = [p for p in pipelines if p.samples(seconds) >= 1 and math.isfinite(p.expected(p.samples(seconds)))]
     return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do with the seconds that are left, why, and the seconds that it took to know.
+
+    ``sampler``, ``method``  of the image
+    ``shared``               whether samples are to be shared out
+    ``render``               seconds for the render, those of the method taken off
+    """
+
+    sampler: str
+    method: str
+    shared: bool
+    render: float
+    reason: str
+
+
+def plan(scene: mi.Scene, seconds: float, method: str = "auto", memory: int = DEFAULT_MEMORY) -> Plan:
+    """How to use so many ``seconds``, those of the pilot and of the method included.
+
+    Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
+    then ``primal``, then all others that ``--sampler auto`` compares, and begins none after a tenth of the time. What
+    it measures changes from run to run. Raises NgptError for a method that does not run here or cannot use any of the
+    stacks, and where nothing fits into the time.
+    """
+    start = time.perf_counter()
+    names = candidates(scene)
+    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    if not able:
+        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
+    entry = SAMPLERS[able[0]]
+    film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
+    with at_most(scene, PIXELS) as scale:
+        found = try_pipelines(scene, able, lambda: time.perf_counter() - start < SHARE * seconds, only=method)
+    left = seconds - (time.perf_counter() - start)
+    whole = [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+    ranked = choose(whole, left)
+    if not ranked:
+        raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
+    first = ranked[0]
+    return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+
+
+def _turn(first: str) -> Callable[[str], int]:
+    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
+
+
+def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
+    """A line: what is expected of the first, and of the best by each other sampler."""
+    errors = {}
+    for p in ranked:
+        errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
+    (least, first), *others = errors.values()
+    what = f"expected to leave an error of {math.sqrt(least):.2g} by '{first.method}'"
+    rivals = [f"{math.sqrt(e):.2g} by '{p.sampler}' and '{p.method}'" for e, p in others]
+    return ", ".join([what, *rivals])
