@@ -17,6 +17,7 @@ import json
 import math
 import statistics
 import time
+from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -81,7 +82,6 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
                 stacks[name][n] = more if not done else merge([stacks[name][done], more])
                 done = n
             cost[name] = (time.process_time() - start) / done
-        ends = {name: list(each.values())[-1] for name, each in stacks.items()}
         # The reference is of the sampler with the least noise at equal time.
         fair = [name for name in names if not SAMPLERS[name].biased]
         variance = {n: pilot_noise(stacks[n][16], stacks[n][64]) * cost[n] for n in fair}
@@ -91,7 +91,6 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
         shared: dict[str, dict[int, object]] = {}
         for name in {p.sampler for p in found if p.shared}:
             shared[name] = {n: render_stack(scene, n, n, name, adaptive=Adaptive()) for n in (64, 256)}
-    del ends
     for p in found:
         errors, after = {}, []
         for n, stack in (shared if p.shared else stacks)[p.sampler].items():
@@ -128,8 +127,6 @@ def cells(entry: dict) -> list[dict]:
         seconds = n * unit + max(row["after"] for row in entry["rows"]) / 2
         errors = {}
         for p, row in zip(pipelines, entry["rows"], strict=True):
-            from dataclasses import replace
-
             spp = replace(p, seconds=row["seconds"], after=row["after"]).samples(seconds)
             if spp >= (FROM if p.shared else 2):
                 errors[name_of(p)] = true_error(row["errors"], spp)
