@@ -196,7 +196,7 @@ def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, floa
 
 def methods_for(sampler: str, only: str = "auto") -> list[str]:
     """What may reconstruct the sampler's stacks, of what runs here."""
-    names = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
+    names: tuple[str, ...] = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
     if only != "auto":
         lack = METHODS[only].missing() if only in METHODS else f"there is no method '{only}'"
         if lack:
@@ -271,7 +271,7 @@ def _turn(first: str) -> Callable[[str], int]:
 
 def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
     """A line: what is expected of the first, and of the best by each other sampler."""
-    errors = {}
+    errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
     (least, first), *others = errors.values()
