@@ -3,11 +3,17 @@
     python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 96 54]
     python -m bench.pipelines --table        print what the file says, with the rules as they are now
 
-Measured are, for each sampler, method, and samples even or shared out, the errors (trimmed relMSE against two halves of
-a reference) at some numbers of samples, and the seconds of a sample and of the method. Seconds are of the processor, on
-all cores together, so that a busy machine counts little. The pilot (data_gen/pipelines.py) is not told any of it. At
-equal time, which is that of 16, 64 and 256 samples of ``gpt``, each pipeline has the error between the two measured
-ones next to it, on a straight line of logarithms. Regret is the error of what the pilot chose over the least.
+All samplers take turns: each renders four parts of fixed numbers of samples, chosen so that a part takes about the time
+of 64 samples of the first sampler. What a sample costs over one of the first is the median of the ratios of the parts,
+in seconds of the processor on all cores together. So a busy machine counts little. Errors (trimmed relMSE against two
+halves of a reference) are those of each method on a few samples, on one part and on all four, with samples even or
+shared out. Seconds of the methods are measured in the same turns. Stacks are kept in --cache, so that a benchmark that
+was broken off goes on, and rules can be judged anew without a render.
+
+The pilot (data_gen/pipelines.py) is not told any of it. Times are those of 16, 64 and 256 samples of the first sampler
+and of the slowest method, so that every pipeline fits into each of them. Of the samples that a pipeline has time for,
+the error is on the straight line of logarithms between the measured ones. Regret is the error of what the pilot chose
+over the least of all.
 
 Nothing may be chosen by scenes ``--apart``.
 """
@@ -17,20 +23,22 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
 from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
+from ngpt.io.exr import read, write
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
+from ngpt.stack import GradientStack
 
 LADDER = (16, 64, 256)
-# Samples of these cost several of gpt.
-SLOW = ("bdpt", "gbdpt", "ppm", "gpm")
-_REFERENCE = 1 << 20
+PARTS = 4
+_REFERENCE, _SHARED = 1 << 20, 1 << 21
 
 
 def main() -> None:
@@ -39,7 +47,8 @@ def main() -> None:
     parser.add_argument("--apart", nargs="+", default=[])
     parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--samplers", nargs="+", help="default: those that `--sampler auto` would compare")
-    parser.add_argument("--reference-spp", type=int, default=2048)
+    parser.add_argument("--reference", type=int, default=512, help="samples of a half, in samples of the first sampler")
+    parser.add_argument("--cache", type=Path, default=Path("out/pipelines"), help="folder for stacks")
     parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/pipelines.json"))
     args = parser.parse_args()
@@ -58,53 +67,140 @@ def main() -> None:
     print(*table(result), sep="\n")
 
 
+class Kept:
+    """Stacks and numbers of a scene in a folder: what is there is not made again."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def stack(self, name: str, make: Callable[[], GradientStack]) -> GradientStack:
+        path = self.folder / f"{name}.exr"
+        if not path.exists():
+            write(path, make())
+        return read(path)
+
+    def numbers(self, name: str, make: Callable[[], dict]) -> dict:
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            save(path, make())
+        return json.loads(path.read_text())
+
+
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
     from data_gen import passes, pilot, pipelines
-    from data_gen.adaptive import Adaptive
+    from data_gen.adaptive import LEAST, Adaptive
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
-    names = args.samplers or pilot.candidates(scene)
-    found = pipelines.try_pipelines(scene, names, clock=time.process_time)
-    names = list(dict.fromkeys(p.sampler for p in found))
-    rows: list[dict] = []
-    cost: dict[str, float] = {}
-    stacks: dict[str, dict[int, object]] = {}
-    with patch.object(passes, "PASS_SECONDS", 60.0):
-        for name in names:
-            ladder = LADDER[:2] if name in SLOW else LADDER
-            stacks[name], done, start = {}, 0, time.process_time()
-            for n in ladder:
-                more = render_stack(scene, n - done, n, name)
-                stacks[name][n] = more if not done else merge([stacks[name][done], more])
-                done = n
-            cost[name] = (time.process_time() - start) / done
-        # The reference is of the sampler with the least noise at equal time.
-        fair = [name for name in names if not SAMPLERS[name].biased]
-        variance = {n: pilot_noise(stacks[n][16], stacks[n][64]) * cost[n] for n in fair}
-        quiet = min(variance, key=lambda n: variance[n])
-        spp = max(int(args.reference_spp // 2 * min(1.0, cost.get("primal", cost[quiet]) / cost[quiet])), 128)
-        halves = [render_stack(scene, spp, _REFERENCE | i, quiet)["primal"] for i in range(2)]
-        shared: dict[str, dict[int, object]] = {}
-        for name in {p.sampler for p in found if p.shared}:
-            shared[name] = {n: render_stack(scene, n, n, name, adaptive=Adaptive()) for n in (64, 256)}
-    for p in found:
-        errors, after = {}, []
-        for n, stack in (shared if p.shared else stacks)[p.sampler].items():
+    kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
+    trials = {}
+    for i, name in enumerate(args.samplers or pilot.candidates(scene)):
+        if (trial := _trial(kept, scene, name, pilot.SEED + 8 * i)) is not None:
+            trials[name] = trial
+    first, names = next(iter(trials)), list(trials)
+    compiled: set[str] = set()
+
+    def render(key: str, name: str, spp: int, seed: int, **more) -> GradientStack:
+        def make() -> GradientStack:
+            if name not in compiled:
+                render_stack(scene, 1, seed, name)
+                compiled.add(name)
             start = time.process_time()
-            image = reconstruct(stack, p.method).image
-            after.append(time.process_time() - start)
-            errors[str(n)] = max(relmse_trimmed(image, *halves), 1e-9)
-        rows.append({"pilot": vars(p), "errors": errors, "seconds": cost[p.sampler], "after": statistics.median(after)})
-    return {"reference": [quiet, spp], "first": names[0], "rows": rows}
+            stack = render_stack(scene, spp, seed, name, **more)
+            stack.attributes["bench:seconds"] = time.process_time() - start
+            return stack
+
+        return kept.stack(f"{key}-{spp}-{name}", make)
+
+    part = {}  # samples of a part, by sampler
+    for name, trial in trials.items():
+        batch = max(1, SAMPLERS[name].batch)
+        part[name] = max(
+            4 * LEAST // PARTS, 8 * batch, round(64 * trials[first].seconds / trial.seconds / batch) * batch
+        )
+        part[name] = kept.numbers(f"part-{name}", lambda spp=part[name]: {"spp": spp})["spp"]
+    even: dict[str, dict[int, list[GradientStack]]] = {name: {part[name] // 4: [], part[name]: []} for name in names}
+    shared: dict[str, dict[int, list[GradientStack]]] = {}
+    with patch.object(passes, "PASS_SECONDS", 60.0):
+        for i in range(PARTS):
+            for name in names:
+                even[name][part[name]].append(render(f"part{i}", name, part[name], i))
+        cost = {name: _cost(even[name][part[name]]) for name in names}
+        relative = {
+            name: statistics.median(
+                _cost([ours]) / _cost([theirs])
+                for ours, theirs in zip(even[name][part[name]], even[first][part[first]], strict=True)
+            )
+            for name in names
+        }
+        for name in names:
+            few = part[name] // 4
+            even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
+            even[name][PARTS * part[name]] = [merge(even[name][part[name]])]
+            if not SAMPLERS[name].batch:
+                shared[name] = {
+                    n: [render("shared", name, n, _SHARED, adaptive=Adaptive())]
+                    for n in (part[name], PARTS * part[name])
+                }
+        # The reference is of the sampler with the least noise at equal time.
+        middle = sum(even[n][PARTS * part[n]][0]["primal"].astype("f8") for n in names) / len(names)
+        noise = {
+            n: pilot.noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
+            for n in names
+            if not SAMPLERS[n].biased
+        }
+        quiet = min(noise, key=lambda n: noise[n])
+        batch = max(1, SAMPLERS[quiet].batch)
+        spp = max(1, round(args.reference / relative[quiet] / batch)) * batch
+        spp = kept.numbers(f"reference-{quiet}-{args.reference}", lambda: {"spp": spp})["spp"]
+        halves = [render(f"reference{i}", quiet, spp, _REFERENCE | i)["primal"] for i in range(2)]
+
+    rows: list[dict] = []
+    for p in pipelines.measure(trials, time.process_time):
+        errors, after = {}, []
+        for n, stacks in (shared if p.shared else even)[p.sampler].items():
+            each = []
+            for stack in stacks:
+                start = time.process_time()
+                image = reconstruct(stack, p.method).image
+                after.append(time.process_time() - start)
+                each.append(relmse_trimmed(image, *halves))
+            errors[str(n)] = max(statistics.mean(each), 1e-9)
+        # In units of the first sampler's, whose seconds are those of the same turns.
+        rows.append(
+            {"pilot": vars(p), "errors": errors}
+            | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
+        )
+    return {"reference": [quiet, spp], "first": first, "rows": rows}
 
 
-def pilot_noise(few, many) -> float:
-    """Relative noise of a sample by the difference of an image and a longer one that holds it."""
-    return relmse_trimmed(few["primal"], many["primal"]) / (1 / 16 - 1 / 64)
+def _trial(kept: Kept, scene, name: str, seed: int):
+    """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene."""
+    from data_gen import pipelines
+
+    made = []
+
+    def make() -> dict:
+        trial = pipelines.try_out(scene, name, seed, time.process_time)
+        if trial is not None:
+            made.extend(trial.stacks)
+            for i, stack in enumerate(trial.stacks):
+                kept.stack(f"pilot{i}-{name}", lambda stack=stack: stack)
+        return {"seconds": None if trial is None else trial.seconds}
+
+    seconds = kept.numbers(f"pilot-{name}", make)["seconds"]
+    if seconds is None:
+        return None
+    return pipelines.Trial([kept.stack(f"pilot{i}-{name}", lambda: made[i]) for i in range(4)], seconds)
+
+
+def _cost(stacks: list[GradientStack]) -> float:
+    """Seconds of a sample, the median of stacks."""
+    return statistics.median(stack.attributes["bench:seconds"] / stack.attributes["ngpt:spp"] for stack in stacks)
 
 
 def true_error(errors: dict[str, float], spp: float) -> float:
@@ -123,8 +219,8 @@ def cells(entry: dict) -> list[dict]:
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
     found = []
     for n in LADDER:
-        # So much that samples and the slowest of the methods fit.
-        seconds = n * unit + max(row["after"] for row in entry["rows"]) / 2
+        # So much that the slowest of the methods fits too.
+        seconds = n * unit + max(row["after"] for row in entry["rows"])
         errors = {}
         for p, row in zip(pipelines, entry["rows"], strict=True):
             spp = replace(p, seconds=row["seconds"], after=row["after"]).samples(seconds)
