@@ -1,6 +1,6 @@
 """Is the sampler and method that a pilot chooses as good as the best of all: scene by scene, at equal time.
 
-    python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 96 54]
+    python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 64 36]
     python -m bench.pipelines --table        print what the file says, with the rules as they are now
 
 All samplers take turns: each renders four parts of fixed numbers of samples, chosen so that a part takes about the time
@@ -45,7 +45,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", default=[])
     parser.add_argument("--apart", nargs="+", default=[])
-    parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--size", type=int, nargs=2, default=(64, 36), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--samplers", nargs="+", help="default: those that `--sampler auto` would compare")
     parser.add_argument("--reference", type=int, default=512, help="samples of a half, in samples of the first sampler")
     parser.add_argument("--cache", type=Path, default=Path("out/pipelines"), help="folder for stacks")
@@ -195,7 +195,7 @@ def _trial(kept: Kept, scene, name: str, seed: int):
     seconds = kept.numbers(f"pilot-{name}", make)["seconds"]
     if seconds is None:
         return None
-    return pipelines.Trial([kept.stack(f"pilot{i}-{name}", lambda: made[i]) for i in range(4)], seconds)
+    return pipelines.Trial([kept.stack(f"pilot{i}-{name}", lambda i=i: made[i]) for i in range(4)], seconds)
 
 
 def _cost(stacks: list[GradientStack]) -> float:

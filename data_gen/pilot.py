@@ -6,6 +6,11 @@ images by all other samplers together: their noise has no mean, as in ``ngpt.mea
 without gradients is its noise, half the mean squared difference of its two images. Errors fall as 1 / n with the number
 of samples, so error times time says how long a sampler takes to a given error.
 
+The image of a biased sampler (photons) is judged as a reconstruction is, and no biased sampler judges others. Its error
+falls as n^(-2/3) only, so it is the time to the error that the scene's own sampler has at the end that counts. Where it
+finds most of the light, those that judge it have much noise: twice the standard error is added to what they say. So it
+is chosen where it is better beyond doubt, and not in scenes whose light it alone can find.
+
 The difference of two reconstructions would not do: light that a sampler finds in one pixel of a thousand is an outlier,
 which ``wcv`` takes out of both. What a pilot cannot see is light that none of the samplers has found.
 """
@@ -41,6 +46,8 @@ SHARE = 0.05
 # Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
 # of which a core or two make a million a second
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
+# Of the standard error of what is said of a biased sampler, and the power by which its errors fall
+_DOUBT, _FALL = 2.0, 2 / 3
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.25
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
@@ -72,15 +79,17 @@ class Choice:
     seconds: float = 0.0
 
 
-def candidates(scene: mi.Scene) -> list[str]:
-    """What could render the scene: the sampler that its description stands for, and then those to be compared with."""
+def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
+    """What could render the scene: the sampler that its description stands for, and then those to be compared with.
+
+    Those of them that are ``biased`` come last, if at all.
+    """
     facts = scene_facts(scene)
     first, _ = choose(facts)
     if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
         return [first]
-    return [first] + [
-        name for name, sampler in SAMPLERS.items() if name != first and sampler.tried and not sampler.refuses(facts)
-    ]
+    able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
+    return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
 
 
 def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, memory: int = DEFAULT_MEMORY) -> Choice:
@@ -93,7 +102,7 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
     """
     start = time.perf_counter()
     sampler, reason = choose(scene_facts(scene))
-    names = candidates(scene)
+    names = candidates(scene, biased=True)
     if len(names) == 1:
         return Choice(sampler, reason)
     paths = math.inf if spp is None else spp * math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
@@ -106,9 +115,9 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
         if first is None:
             return Choice(sampler, reason, time.perf_counter() - start)
         by_samples = math.inf if spp is None else first.seconds * spp / SPP * scale
-        limit = start + SHARE * min(by_samples, math.inf if seconds is None else seconds)
-        trials = compare_with(scene, names, first, lambda: time.perf_counter() < limit)
-    best, why = judge(sampler, times_to_an_error(trials))
+        whole = min(by_samples, math.inf if seconds is None else seconds)
+        trials = compare_with(scene, names, first, lambda: time.perf_counter() < start + SHARE * whole)
+    best, why = judge(sampler, times_to_an_error(trials, whole / scale))
     return Choice(best, why, time.perf_counter() - start)
 
 
@@ -142,20 +151,29 @@ def try_out(scene: mi.Scene, sampler: str, seed: int = SEED) -> Trial | None:
     return Trial((images[0], images[1]), (primals[0], primals[1]), min(seconds))
 
 
-def times_to_an_error(trials: dict[str, Trial]) -> dict[str, float]:
-    """Seconds that each sampler of a pilot takes to an error of 1; no more than their ratios are of use."""
+def times_to_an_error(trials: dict[str, Trial], seconds: float = math.inf) -> dict[str, float]:
+    """Seconds that each sampler of a pilot, the first of which is unbiased, takes to an error of 1; no more than their
+    ratios are of use. Those of biased samplers are of a render, as large as the pilot's, that takes so many ``seconds``
+    by the first."""
     middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
     noise = {name: max(noise_of(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
     # Of all samplers, those with little noise count most: to what the errors are relative, and as witnesses.
     scale = mean_of({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
-    times = {}
+    times: dict[str, float] = {}
     for name, trial in trials.items():
+        biased = SAMPLERS[name].biased
         error = noise_of(*trial.primals, scale)
-        others = {other: noise[other] for other in trials if other != name}
-        if SAMPLERS[name].gradients and others:
+        others = {other: noise[other] for other in trials if other != name and not SAMPLERS[other].biased}
+        if (SAMPLERS[name].gradients or biased) and others:
             witnesses = [mean_of({other: trials[other].primals[i] for other in others}, others) for i in range(2)]
             error = statistics.mean(error_of(image, witnesses, scale) for image in trial.images)
+            if biased:
+                error = max(error, 0.0) + _DOUBT * doubt_of(trial.images[0], witnesses, scale)
         times[name] = max(error, 1e-9) * trial.seconds
+        if biased:
+            first = next(iter(times.values()))
+            power = 1 / _FALL
+            times[name] = first * trial.seconds * (max(error, 1e-9) / first) ** power * seconds ** (power - 1)
     return times
 
 
@@ -186,6 +204,13 @@ def error_of(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> f
     a, b = witnesses
     under = _denominator(scale)
     return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
+
+
+def doubt_of(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
+    """The standard error of ``error_of``, by how much pixels differ."""
+    a, b = witnesses
+    values = ((x - a) * (x - b) / _denominator(scale)).mean(axis=-1)
+    return float(values.std()) / math.sqrt(values.size)
 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:
