@@ -36,6 +36,8 @@ from ngpt.stack import GradientStack
 
 # Of the time that there is, after which no further sampler is tried
 SHARE = 0.1
+# Seconds from which on the pilot's images are as large as they ever are, and the least share of that
+LONG, LEAST_PIXELS = 200.0, 1 / 16
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
 WITHOUT = ("primal", "oidn", "ngpt-primal")
@@ -240,24 +242,30 @@ class Plan:
     reason: str
 
 
-def plan(scene: mi.Scene, seconds: float, method: str = "auto", memory: int = DEFAULT_MEMORY) -> Plan:
-    """How to use so many ``seconds``, those of the pilot and of the method included.
+def plan(
+    scene: mi.Scene,
+    seconds: float,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Plan:
+    """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
 
     Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
-    then ``primal``, then all others that ``--sampler auto`` compares, and begins none after a tenth of the time. What
-    it measures changes from run to run. Raises NgptError for a method that does not run here or cannot use any of the
-    stacks, and where nothing fits into the time.
+    then ``primal``, then all unbiased others that ``--sampler auto`` compares, and begins none after a tenth of the
+    time. The less time, the smaller are its images. What it measures changes from run to run. Raises NgptError for a
+    method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
     """
-    start = time.perf_counter()
+    start = clock()
     names = candidates(scene)
     able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
     entry = SAMPLERS[able[0]]
     film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
-    with at_most(scene, PIXELS) as scale:
-        found = try_pipelines(scene, able, lambda: time.perf_counter() - start < SHARE * seconds, only=method)
-    left = seconds - (time.perf_counter() - start)
+    with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
+        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, clock, method)
+    left = seconds - (clock() - start)
     whole = [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
     ranked = choose(whole, left)
     if not ranked:

@@ -45,7 +45,6 @@ def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
     from data_gen.pilot import judge, times_to_an_error
 
     others = {"gpt": trial(2.0, 1.0, error=0.5), "primal": trial(1.0, 1.0)}
-    times = times_to_an_error(others)
     trials = others | {"ppm": trial(0.001, 1.0, error=0.001, bias=0.1)}
     short, long = (times_to_an_error(trials, seconds) for seconds in (100.0, 1e6))
     assert judge("gpt", short)[0] == "ppm" and judge("gpt", long)[0] == "gpt"

@@ -1,5 +1,6 @@
 """Which sampler and method a pilot chooses: by the error that it expects of the final image."""
 
+import itertools
 import math
 
 import numpy as np
@@ -52,10 +53,13 @@ def trials(rng):
     }
 
 
-def test_what_is_measured_is_the_true_error(renderer, rng):
+def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
     """Of every method, whatever it blurs: no pilot knows the truth."""
+    from data_gen import pipelines
     from data_gen.pipelines import measure, methods_for
 
+    monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
+    monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
     made = trials(rng)
     found = measure(made)
     names = {(p.sampler, p.method) for p in found}
@@ -108,20 +112,49 @@ def test_the_gain_of_shared_out_samples(renderer):
     assert gain(need) == pytest.approx(1.5**2 / 2.5)
 
 
+def ticking(tick):
+    """A clock that goes on by as much whenever it is looked at."""
+    seconds = itertools.count()
+    return lambda: tick * next(seconds)
+
+
 def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
     from data_gen import pipelines
 
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
     monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
-    found = pipelines.plan(scene, 200.0)
+    found = pipelines.plan(scene, 200.0, clock=ticking(0.01))
     assert found.sampler in ("gpt", "primal") and found.method in pipelines.methods_for(found.sampler)
     assert 0 < found.render < 200 and "expected to leave an error of" in found.reason
     assert tuple(scene.sensors()[0].film().size()) == (48, 32)
     with pytest.raises(NgptError, match="there is no method 'none'"):
         pipelines.plan(scene, 200.0, "none")
     with pytest.raises(NgptError, match="nothing fits into"):
-        pipelines.plan(scene, 1e-3, "wcv")
+        pipelines.plan(scene, 1.0, "wcv", clock=ticking(0.1))
+
+
+def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
+    """The first two always; and the less time there is, the smaller the images."""
+    from data_gen import pipelines
+
+    scene = load(renderer, "diffuse", (48, 32))
+    monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
+    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
+    tried, sizes = [], []
+
+    def try_out(scene, name, seed, clock):
+        for _ in range(8):
+            clock()
+        tried.append(name)
+        sizes.append(tuple(int(n) for n in scene.sensors()[0].film().size()))
+
+    monkeypatch.setattr(pipelines, "try_out", try_out)
+    for seconds, names, size in ((20.0, 2, (8, 5)), (250.0, 3, (24, 16)), (300.0, 4, (24, 16))):
+        tried.clear()
+        with pytest.raises(NgptError, match="none of the samplers"):
+            pipelines.plan(scene, seconds, clock=ticking(1.0))
+        assert tried == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):
