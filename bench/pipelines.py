@@ -215,7 +215,7 @@ def cells(entry: dict) -> list[dict]:
     """For each time of ``LADDER`` samples of the first sampler: name -> error, and the pilot's choice."""
     from data_gen.pipelines import FROM, Pipeline, choose
 
-    pipelines = [Pipeline(**row["pilot"] | {"steps": tuple(row["pilot"]["steps"])}) for row in entry["rows"]]
+    pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
     found = []
     for n in LADDER:

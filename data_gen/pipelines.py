@@ -4,7 +4,7 @@ Each sampler that could render the scene renders four small stacks. Every method
 the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
 the other samplers, whose noise has no mean (``data_gen.pilot``): so what a method blurs or loses counts. From the
 pilot's samples to those that fit into the time errors fall by a power of the samples. Part of that power is what the
-pilot saw from one stack to two, the rest what the method did on the scenes of the table of advice.
+pilot saw from one stack to two, the rest what is usual for methods of its kind.
 
 Samples are even, or shared out (``data_gen.adaptive``) where that is expected to pay for itself: the gain is that of
 the pilot's expected errors, pixel by pixel, were they known.
@@ -29,7 +29,6 @@ from data_gen.pilot import PIXELS, SEED, SPP, at_most, candidates, error_of, mea
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
-from ngpt.measure.advice import falls, read_table
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
@@ -41,11 +40,13 @@ LONG, LEAST_PIXELS = 200.0, 1 / 16
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
 WITHOUT = ("primal", "oidn", "ngpt-primal")
-# Of the power by which errors fall, the share that the pilot decides, and the steepest and flattest that it may be
-SEEN, STEEPEST, FLATTEST = 0.6, -1.1, -0.2
+# The powers of the samples by which errors usually fall: those of gradients, of denoisers without, of the image itself;
+# of a power, the share that the pilot decides, and the steepest and flattest that it may be
+BY_GRADIENTS, BY_DENOISERS, AS_IT_IS = -0.9, -0.55, -1.0
+SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
 # The power by which shared out samples are better than the pilot says, whose need is smoother than it is; and the
-# samples from which on they are thought of. By python -m bench.pipelines, on scenes that are not apart.
-REALISED, FROM = 1.3, 2 * LEAST
+# samples from which on they are thought of. These numbers are those of python -m bench.pipelines on scenes not apart.
+REALISED, FROM = 1.5, 2 * LEAST
 
 
 @dataclass(frozen=True)
@@ -61,7 +62,7 @@ class Pipeline:
     """A sampler and a method, as a pilot saw them.
 
     ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
-    ``steps``     the powers of the samples by which it falls: as the pilot saw it, and as the table of advice has it
+    ``step``      the power of the samples by which it falls, as the pilot saw it
     ``seconds``   of one sample of the whole image
     ``after``     those of the method
     ``adaptive``  error of shared out samples over that of even ones, 1 where samples are even
@@ -72,7 +73,7 @@ class Pipeline:
     method: str
     spp: int
     error: float
-    steps: tuple[float, float]
+    step: float
     seconds: float
     after: float
     adaptive: float = 1.0
@@ -86,8 +87,7 @@ class Pipeline:
     @property
     def fall(self) -> float:
         """The power of the samples by which the error falls."""
-        seen, known = self.steps
-        return min(max(SEEN * seen + (1 - SEEN) * known, STEEPEST), FLATTEST)
+        return min(max(SEEN * self.step + (1 - SEEN) * usual_fall(self.method), STEEPEST), FLATTEST)
 
     def samples(self, seconds: float) -> float:
         """How many samples per pixel fit into the time; less than 1 where none do."""
@@ -101,6 +101,13 @@ class Pipeline:
         if spp < (FROM if self.shared else max(1, SAMPLERS[self.sampler].batch)):
             return math.inf
         return self.error * self.adaptive**REALISED * (spp / self.spp) ** self.fall
+
+
+def usual_fall(method: str) -> float:
+    """The power of the samples by which errors of a method usually fall."""
+    if method == "primal":
+        return AS_IT_IS
+    return BY_GRADIENTS if "dx" in METHODS[method].needs else BY_DENOISERS
 
 
 def try_pipelines(
@@ -148,7 +155,6 @@ def try_out(scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float]
 
 def measure(trials: dict[str, Trial], clock: Callable[[], float] = time.perf_counter, only: str = "auto"):
     """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use."""
-    known = falls(read_table())
     primals = {name: [stack["primal"].astype(np.float64) for stack in trial.stacks] for name, trial in trials.items()}
     middle = sum(sum(images) / 4 for images in primals.values()) / len(primals)
     noise = {name: max(noise_of(*images[:2], middle), 1e-12) for name, images in primals.items()}
@@ -168,10 +174,9 @@ def measure(trials: dict[str, Trial], clock: Callable[[], float] = time.perf_cou
             one = _expected([single[:2], single[2:]], [[w, w] for w in witnesses], scale)
             two = _expected([double], [witnesses], scale)
             spp = int(halves[0].attributes["ngpt:spp"])
-            steps = (math.log2(two / one), known.get(method, -1.0))
             # Of both: at twice the samples, the one that was measured there and the one that falls to it.
-            error = math.sqrt(two * one * 2 ** max(-1.0, min(steps[1], 0.0)))
-            pipeline = Pipeline(name, method, spp, error, steps, trial.seconds, min(after))
+            error = math.sqrt(two * one * 2 ** usual_fall(method))
+            pipeline = Pipeline(name, method, spp, error, math.log2(two / one), trial.seconds, min(after))
             found.append(pipeline)
             if not SAMPLERS[name].batch:
                 if need is None:

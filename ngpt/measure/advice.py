@@ -170,12 +170,6 @@ class Laws:
         return float(np.median([s for scene in self.scenes for s in scene["methods"][method]["reconstruct"]]))
 
 
-def falls(table: dict[str, Any], left_out: str = "") -> dict[str, float]:
-    """By which power of the samples the errors of each method fall, in the mean of the table's scenes."""
-    laws = Laws(table, left_out)
-    return {method: float(weights[1]) - 1 for method, weights in laws.weights.items()}
-
-
 def _pilot(scene: dict[str, Any]) -> np.ndarray:
     return np.log([scene["noise"], scene["gain"]])
 

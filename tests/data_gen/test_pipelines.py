@@ -18,7 +18,7 @@ SHAPE = (48, 64)
 def pipeline(sampler="gpt", method="wcv", error=0.01, fall=-0.8, seconds=0.01, after=0.0, **more):
     from data_gen.pipelines import Pipeline
 
-    return Pipeline(sampler, method, 16, error, (fall, fall), seconds, after, **more)
+    return Pipeline(sampler, method, 16, error, fall, seconds, after, **more)
 
 
 def truth():
@@ -70,7 +70,7 @@ def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
         # Twice the square root of how far a mean over so few pixels can be off
         assert p.error == pytest.approx(np.mean(errors), rel=0.35, abs=1e-4), p
     noise = next(p for p in found if (p.sampler, p.method, p.shared) == ("primal", "primal", False))
-    assert noise.steps[0] == pytest.approx(-1, abs=0.15)
+    assert noise.step == pytest.approx(-1, abs=0.15)
 
 
 def test_the_best_depends_on_the_time(renderer):
