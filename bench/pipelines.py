@@ -245,12 +245,15 @@ def table(result: dict) -> list[str]:
             regrets[entry["apart"]].append(ratios[cell["choice"]])
             for name, ratio in ratios.items():
                 fixed[entry["apart"]].setdefault(name, []).append(ratio)
+                if not name.endswith(" shared"):
+                    best = ratios.get(f"{name} shared", ratio)
+                    fixed[entry["apart"]].setdefault(f"{name}, shared where there are enough", []).append(best)
             lines.append(f"| {scene} | {cell['spp']} | `{cell['choice']}` | {ratios[cell['choice']]:.2f} | `{least}` |")
     for apart, title in ((False, "chosen on"), (True, "apart")):
         if rows := regrets[apart]:
             lines.append(f"{title}: {mean_log(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
             whole = {n: mean_log(r) for n, r in fixed[apart].items() if len(r) == len(rows)}
-            for name in sorted(whole, key=lambda n: whole[n])[:6]:
+            for name in sorted(whole, key=lambda n: whole[n])[:8]:
                 lines.append(f"  always {name}: {whole[name]:.3f}, {max(fixed[apart][name]):.2f}")
     return lines
 

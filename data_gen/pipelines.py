@@ -40,13 +40,14 @@ LONG, LEAST_PIXELS = 200.0, 1 / 16
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
 WITHOUT = ("primal", "oidn", "ngpt-primal")
-# The powers of the samples by which errors usually fall: those of gradients, of denoisers without, of the image itself;
-# of a power, the share that the pilot decides, and the steepest and flattest that it may be
-BY_GRADIENTS, BY_DENOISERS, AS_IT_IS = -0.9, -0.55, -1.0
+# These numbers are those of python -m bench.pipelines on scenes not apart.
+# The powers of the samples by which errors usually fall, of methods that use gradients and of denoisers; the share that
+# the pilot has in such a power, and the steepest and flattest that it may be
+BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
-# The power by which shared out samples are better than the pilot says, whose need is smoother than it is; and the
-# samples from which on they are thought of. These numbers are those of python -m bench.pipelines on scenes not apart.
-REALISED, FROM = 1.5, 2 * LEAST
+# The power by which shared out samples with gradients are better than the pilot says, whose need is smoother than it
+# is; and the samples from which on they are thought of
+REALISED, FROM = 2.0, 2 * LEAST
 
 
 @dataclass(frozen=True)
@@ -65,7 +66,7 @@ class Pipeline:
     ``step``      the power of the samples by which it falls, as the pilot saw it
     ``seconds``   of one sample of the whole image
     ``after``     those of the method
-    ``adaptive``  error of shared out samples over that of even ones, 1 where samples are even
+    ``adaptive``  error of shared out samples over that of even ones, as the need for them says; 1: samples are even
     ``choosing``  seconds of the method that shares them out, each time
     """
 
@@ -87,26 +88,49 @@ class Pipeline:
     @property
     def fall(self) -> float:
         """The power of the samples by which the error falls."""
-        return min(max(SEEN * self.step + (1 - SEEN) * usual_fall(self.method), STEEPEST), FLATTEST)
+        usual = usual_fall(self.method)
+        if self.method == "primal":
+            return usual
+        return min(max(SEEN * self.step + (1 - SEEN) * usual, STEEPEST), FLATTEST)
+
+    @property
+    def gain(self) -> float:
+        """The error over that of as many even samples."""
+        return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
 
     def samples(self, seconds: float) -> float:
         """How many samples per pixel fit into the time; less than 1 where none do."""
         spp = (seconds - self.after) / self.seconds
-        if not self.shared or spp <= LEAST:
-            return spp
-        return spp - self.choosing * math.ceil(math.log2(spp / LEAST) + 1) / self.seconds
+        return spp - self._choices(spp) / self.seconds
+
+    def takes(self, spp: float) -> float:
+        """The seconds of so many samples and of the method."""
+        return spp * self.seconds + self._choices(spp) + self.after
+
+    def _choices(self, spp: float) -> float:
+        """Seconds in which samples are shared out: each time, their number doubles."""
+        return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
+
+    @property
+    def least(self) -> int:
+        """Samples below which nothing is expected."""
+        return FROM if self.shared else max(1, SAMPLERS[self.sampler].batch)
 
     def expected(self, spp: float) -> float:
         """The error after so many samples; infinite where there are too few."""
-        if spp < (FROM if self.shared else max(1, SAMPLERS[self.sampler].batch)):
+        if spp < self.least:
             return math.inf
-        return self.error * self.adaptive**REALISED * (spp / self.spp) ** self.fall
+        return self.error * self.gain * (spp / self.spp) ** self.fall
+
+    def needed(self, error: float) -> float:
+        """The samples that are expected to leave the error, or the least there are."""
+        return max(self.least, self.spp * (error / (self.error * self.gain)) ** (1 / self.fall))
 
 
 def usual_fall(method: str) -> float:
     """The power of the samples by which errors of a method usually fall."""
     if method == "primal":
-        return AS_IT_IS
+        return -1.0  # The samples are independent.
     return BY_GRADIENTS if "dx" in METHODS[method].needs else BY_DENOISERS
 
 
@@ -231,6 +255,26 @@ def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
     return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))
 
 
+def explore(
+    scene: mi.Scene,
+    seconds: float = LONG,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[Pipeline]:
+    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them."""
+    start = clock()
+    names = candidates(scene)
+    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    if not able:
+        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
+    entry = SAMPLERS[able[0]]
+    film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
+    with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
+        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, clock, method)
+    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+
+
 @dataclass(frozen=True)
 class Plan:
     """What to do with the seconds that are left, why, and the seconds that it took to know.
@@ -262,16 +306,8 @@ def plan(
     method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
     """
     start = clock()
-    names = candidates(scene)
-    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
-    if not able:
-        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
-    entry = SAMPLERS[able[0]]
-    film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
-    with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
-        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, clock, method)
+    whole = explore(scene, seconds, method, memory, clock)
     left = seconds - (clock() - start)
-    whole = [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
     ranked = choose(whole, left)
     if not ranked:
         raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
