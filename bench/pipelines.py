@@ -175,7 +175,14 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
             {"pilot": vars(p), "errors": errors}
             | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
         )
-    return {"reference": [quiet, spp], "first": first, "rows": rows}
+    return {"reference": [quiet, spp], "first": first, "rows": [rounded(row) for row in rows]}
+
+
+def rounded(value):
+    """Numbers to five digits, in dicts too."""
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
 def _trial(kept: Kept, scene, name: str, seed: int):
