@@ -38,6 +38,9 @@ from ngpt.stack import GradientStack
 
 LADDER = (16, 64, 256)
 PARTS = 4
+# Samples of the first sampler that a sampler's trial may cost: what the pilot of a 14 times larger image allows, in the
+# time of 256 samples. What is dearer is left out of the comparison, too.
+DEAREST = 700
 _REFERENCE, _SHARED = 1 << 20, 1 << 21
 
 
@@ -99,7 +102,8 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
     trials = {}
     for i, name in enumerate(args.samplers or pilot.candidates(scene)):
-        if (trial := _trial(kept, scene, name, pilot.SEED + 8 * i)) is not None:
+        limit = DEAREST * trials[first].seconds if (first := next(iter(trials), None)) else math.inf
+        if (trial := _trial(kept, scene, name, pilot.SEED + 8 * i, limit)) is not None:
             trials[name] = trial
     first, names = next(iter(trials)), list(trials)
     compiled: set[str] = set()
@@ -123,7 +127,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
             4 * LEAST // PARTS, 8 * batch, round(64 * trials[first].seconds / trial.seconds / batch) * batch
         )
         part[name] = kept.numbers(f"part-{name}", lambda spp=part[name]: {"spp": spp})["spp"]
-    even: dict[str, dict[int, list[GradientStack]]] = {name: {part[name] // 4: [], part[name]: []} for name in names}
+    even: dict[str, dict[int, list[GradientStack]]] = {name: {part[name]: []} for name in names}
     shared: dict[str, dict[int, list[GradientStack]]] = {}
     with patch.object(passes, "PASS_SECONDS", 60.0):
         for i in range(PARTS):
@@ -139,7 +143,8 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
         }
         for name in names:
             few = part[name] // 4
-            even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
+            if few >= 2 * SAMPLERS[name].batch:  # else it has no variances
+                even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
             even[name][PARTS * part[name]] = [merge(even[name][part[name]])]
             if not SAMPLERS[name].batch:
                 shared[name] = {
@@ -185,14 +190,14 @@ def rounded(value):
     return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
-def _trial(kept: Kept, scene, name: str, seed: int):
-    """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene."""
+def _trial(kept: Kept, scene, name: str, seed: int, limit: float):
+    """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene, or not in the time."""
     from data_gen import pipelines
 
     made = []
 
     def make() -> dict:
-        trial = pipelines.try_out(scene, name, seed, time.process_time)
+        trial = pipelines.try_out(scene, name, seed, time.process_time, limit)
         if trial is not None:
             made.extend(trial.stacks)
             for i, stack in enumerate(trial.stacks):

@@ -41,8 +41,8 @@ from ngpt.methods import reconstruct
 SPP = 8
 # Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
 PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
-# Of what the whole render may take
-SHARE = 0.05
+# Of what the whole render may take: after this share no trial is begun, and what each may take
+SHARE, DEAREST = 0.05, 0.1
 # Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
 # of which a core or two make a million a second
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
@@ -116,31 +116,42 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
             return Choice(sampler, reason, time.perf_counter() - start)
         by_samples = math.inf if spp is None else first.seconds * spp / SPP * scale
         whole = min(by_samples, math.inf if seconds is None else seconds)
-        trials = compare_with(scene, names, first, lambda: time.perf_counter() < start + SHARE * whole)
+        trials = compare_with(scene, names, first, lambda: time.perf_counter() < start + SHARE * whole, DEAREST * whole)
     best, why = judge(sampler, times_to_an_error(trials, whole / scale))
     return Choice(best, why, time.perf_counter() - start)
 
 
 def compare_with(
-    scene: mi.Scene, names: list[str], first: Trial, goes_on: Callable[[], bool] = lambda: True
+    scene: mi.Scene,
+    names: list[str],
+    first: Trial,
+    goes_on: Callable[[], bool] = lambda: True,
+    limit: float = math.inf,
 ) -> dict[str, Trial]:
-    """The trials of samplers by name, the first of which is known, as far as there is time for them."""
+    """The trials of samplers by name, the first of which is known, as far as there is time for them; each may take
+    ``limit`` seconds."""
     trials = {names[0]: first}
     for i, name in enumerate(names[1:], 1):
         if not goes_on():
             break
-        if (trial := try_out(scene, name, SEED + 2 * i)) is not None:
+        if (trial := try_out(scene, name, SEED + 2 * i, limit)) is not None:
             trials[name] = trial
     return trials
 
 
-def try_out(scene: mi.Scene, sampler: str, seed: int = SEED) -> Trial | None:
-    """Two small stacks by a sampler; None where it finds, of this scene, that it cannot render it."""
+def try_out(scene: mi.Scene, sampler: str, seed: int = SEED, limit: float = math.inf) -> Trial | None:
+    """Two small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
+    expected to take longer than the ``limit``."""
+    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
     try:
         render_stack(scene, 1, seed, sampler)  # compiles
     except NgptError:
         return None
-    spp = max(SPP, 2 * SAMPLERS[sampler].batch)
+    if limit < math.inf:
+        start = time.perf_counter()
+        render_stack(scene, least, seed, sampler)
+        if 2 * spp / least * (time.perf_counter() - start) > limit:
+            return None
     stacks, seconds = [], []
     for i in range(2):
         start = time.perf_counter()

@@ -33,8 +33,8 @@ from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
-# Of the time that there is, after which no further sampler is tried
-SHARE = 0.1
+# Of the time that there is, after which no further sampler is tried, and what each may take
+SHARE, DEAREST = 0.1, 0.2
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
@@ -138,32 +138,41 @@ def try_pipelines(
     scene: mi.Scene,
     samplers: Sequence[str],
     goes_on: Callable[[], bool] = lambda: True,
+    limit: float = math.inf,
     clock: Callable[[], float] = time.perf_counter,
     only: str = "auto",
 ) -> list[Pipeline]:
     """All pipelines of the samplers, as far as there is time: the first two are always tried.
 
-    ``clock`` is what seconds are measured by, ``only`` the one method to consider. Raises NgptError where no sampler
-    can render the scene.
+    Each other one may take ``limit`` seconds. ``clock`` is what seconds are measured by, ``only`` the one method to
+    consider. Raises NgptError where no sampler can render the scene.
     """
     trials: dict[str, Trial] = {}
     for i, name in enumerate(samplers):
         if i > 1 and not goes_on():
             break
-        if (trial := try_out(scene, name, SEED + 8 * i, clock)) is not None:
+        if (trial := try_out(scene, name, SEED + 8 * i, clock, limit if i > 1 else math.inf)) is not None:
             trials[name] = trial
     if not trials:
         raise NgptError(f"none of the samplers {', '.join(samplers)} can render the scene")
     return measure(trials, clock, only)
 
 
-def try_out(scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float]) -> Trial | None:
-    """Four small stacks by a sampler; None where it finds, of this scene, that it cannot render it."""
+def try_out(
+    scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float], limit: float = math.inf
+) -> Trial | None:
+    """Four small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
+    expected to take longer than the ``limit``."""
+    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
     try:
         render_stack(scene, 1, seed, sampler)  # compiles
     except NgptError:
         return None
-    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
+    if limit < math.inf:
+        start = clock()
+        render_stack(scene, least, seed, sampler)
+        if 4 * (spp / least + 1) * (clock() - start) > limit:
+            return None
     stacks, seconds, begin = [], [], []
     for i in range(4):
         start = clock()
@@ -271,7 +280,7 @@ def explore(
     entry = SAMPLERS[able[0]]
     film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
     with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
-        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, clock, method)
+        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, DEAREST * seconds, clock, method)
     return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
 
 

@@ -143,7 +143,8 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
     tried, sizes = [], []
 
-    def try_out(scene, name, seed, clock):
+    def try_out(scene, name, seed, clock, limit):
+        assert limit == (math.inf if len(tried) < 2 else 0.2 * seconds)
         for _ in range(8):
             clock()
         tried.append(name)
@@ -155,6 +156,15 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
         with pytest.raises(NgptError, match="none of the samplers"):
             pipelines.plan(scene, seconds, clock=ticking(1.0))
         assert tried == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
+
+
+def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
+    from data_gen.pipelines import try_out
+
+    scene = load(renderer, "diffuse", (16, 12))
+    # One look at the clock before a render of a sample, one after it: four renders of 8 and of 1 take 36 times that.
+    assert try_out(scene, "primal", 0, ticking(1.0), 35.0) is None
+    assert len(try_out(scene, "primal", 0, ticking(1.0), 37.0).stacks) == 4
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):
