@@ -102,8 +102,8 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
     """
     start = time.perf_counter()
     sampler, reason = choose(scene_facts(scene))
-    names = candidates(scene, biased=True)
-    if len(names) == 1:
+    able = candidates(scene, biased=True)
+    if len(able) == 1:
         return Choice(sampler, reason)
     paths = math.inf if spp is None else spp * math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
     if paths < _LEAST_PATHS or (seconds is not None and seconds < _LEAST_SECONDS):
@@ -116,8 +116,14 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
             return Choice(sampler, reason, time.perf_counter() - start)
         by_samples = math.inf if spp is None else first.seconds * spp / SPP * scale
         whole = min(by_samples, math.inf if seconds is None else seconds)
-        trials = compare_with(scene, names, first, lambda: time.perf_counter() < start + SHARE * whole, DEAREST * whole)
-    best, why = judge(sampler, times_to_an_error(trials, whole / scale))
+        trials = compare_with(scene, able, first, lambda: time.perf_counter() < start + SHARE * whole, DEAREST * whole)
+    times, unsure = times_to_an_error(trials, whole / scale), doubtful(trials)
+    best, why = judge(sampler, times)
+    if best not in unsure:
+        best, why = judge(sampler, {name: t for name, t in times.items() if name not in unsure})
+        if unsure:
+            names = " and ".join(f"'{name}'" for name in unsure)
+            why += f"; the others find too little of the light to judge {names}"
     return Choice(best, why, time.perf_counter() - start)
 
 
@@ -166,26 +172,48 @@ def times_to_an_error(trials: dict[str, Trial], seconds: float = math.inf) -> di
     """Seconds that each sampler of a pilot, the first of which is unbiased, takes to an error of 1; no more than their
     ratios are of use. Those of biased samplers are of a render, as large as the pilot's, that takes so many ``seconds``
     by the first."""
-    middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
-    noise = {name: max(noise_of(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
-    # Of all samplers, those with little noise count most: to what the errors are relative, and as witnesses.
-    scale = mean_of({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
+    noise, scale = _noise_and_scale(trials)
     times: dict[str, float] = {}
     for name, trial in trials.items():
-        biased = SAMPLERS[name].biased
         error = noise_of(*trial.primals, scale)
-        others = {other: noise[other] for other in trials if other != name and not SAMPLERS[other].biased}
-        if (SAMPLERS[name].gradients or biased) and others:
-            witnesses = [mean_of({other: trials[other].primals[i] for other in others}, others) for i in range(2)]
-            error = statistics.mean(error_of(image, witnesses, scale) for image in trial.images)
-            if biased:
-                error = max(error, 0.0) + _DOUBT * doubt_of(trial.images[0], witnesses, scale)
+        if SAMPLERS[name].biased:
+            error, doubt = _judged(trials, name, noise, scale)
+            error = max(error, 0.0) + _DOUBT * doubt
+        elif SAMPLERS[name].gradients and len(_fair(trials, name)):
+            error, _ = _judged(trials, name, noise, scale)
         times[name] = max(error, 1e-9) * trial.seconds
-        if biased:
-            first = next(iter(times.values()))
-            power = 1 / _FALL
+        if SAMPLERS[name].biased:
+            first, power = next(iter(times.values())), 1 / _FALL
             times[name] = first * trial.seconds * (max(error, 1e-9) / first) ** power * seconds ** (power - 1)
     return times
+
+
+def doubtful(trials: dict[str, Trial]) -> list[str]:
+    """The biased samplers of whose error the others are not sure, since they find too little of the light."""
+    noise, scale = _noise_and_scale(trials)
+    judged = {name: _judged(trials, name, noise, scale) for name in trials if SAMPLERS[name].biased}
+    return [name for name, (error, doubt) in judged.items() if _DOUBT * doubt > error]
+
+
+def _noise_and_scale(trials: dict[str, Trial]) -> tuple[dict[str, float], np.ndarray]:
+    """The noise of each sampler's image, and what errors are relative to: of all samplers, those with little noise
+    count most, as they do as witnesses."""
+    middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
+    noise = {name: max(noise_of(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
+    return noise, mean_of({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
+
+
+def _fair(trials: dict[str, Trial], name: str) -> list[str]:
+    """Who may judge a sampler: all others that are unbiased."""
+    return [other for other in trials if other != name and not SAMPLERS[other].biased]
+
+
+def _judged(trials: dict[str, Trial], name: str, noise: dict[str, float], scale: np.ndarray) -> tuple[float, float]:
+    """The error of a sampler's images by the others, and the standard error of that."""
+    others = _fair(trials, name)
+    witnesses = [mean_of({o: trials[o].primals[i] for o in others}, noise) for i in range(2)]
+    error = statistics.mean(error_of(image, witnesses, scale) for image in trials[name].images)
+    return error, doubt_of(trials[name].images[0], witnesses, scale)
 
 
 def judge(default: str, times: dict[str, float]) -> tuple[str, str]:

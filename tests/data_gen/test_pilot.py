@@ -42,7 +42,7 @@ def test_light_that_a_reconstruction_has_lost_counts(renderer):
 
 def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
     """Their blur counts, and falls slower than noise; a witness they are not."""
-    from data_gen.pilot import judge, times_to_an_error
+    from data_gen.pilot import doubtful, judge, times_to_an_error
 
     others = {"gpt": trial(2.0, 1.0, error=0.5), "primal": trial(1.0, 1.0)}
     trials = others | {"ppm": trial(0.001, 1.0, error=0.001, bias=0.1)}
@@ -52,7 +52,9 @@ def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
     assert long["ppm"] / long["gpt"] == pytest.approx(100 * short["ppm"] / short["gpt"])
     # The mean of those who find the light is not sure of it.
     dark = {"gpt": trial(900.0, 1.0, error=0.02), "primal": trial(900.0, 1.0), "ppm": trials["ppm"]}
-    assert judge("gpt", times_to_an_error(dark, 100.0))[0] == "gpt"
+    assert judge("gpt", times_to_an_error(dark, 100.0))[0] == "gpt" and doubtful(dark) == ["ppm"]
+    clear = {"gpt": trial(0.01, 1.0, error=0.001), "primal": trial(0.01, 1.0), "ppm": trials["ppm"]}
+    assert doubtful(clear) == [] and doubtful(others) == []
 
 
 def test_a_choice_needs_a_margin():
