@@ -180,7 +180,28 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
             {"pilot": vars(p), "errors": errors}
             | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
         )
-    return {"reference": [quiet, spp], "first": first, "rows": [rounded(row) for row in rows]}
+    auto = choice_of_auto(trials)
+    return {"reference": [quiet, spp], "first": first, "auto": auto, "rows": [rounded(row) for row in rows]}
+
+
+def choice_of_auto(trials: dict) -> str:
+    """The sampler that `--sampler auto` chooses by two of the stacks of each."""
+    from data_gen import pilot
+
+    judged = {}
+    for name, trial in trials.items():
+        two = trial.stacks[:2]
+        images = tuple(reconstruct(stack, simple(name)).image for stack in two)
+        primals = tuple(stack["primal"] for stack in two)
+        judged[name] = pilot.Trial(images, primals, trial.seconds * two[0].attributes["ngpt:spp"])
+    return pilot.judge(next(iter(trials)), pilot.times_to_an_error(judged))[0]
+
+
+def simple(sampler: str) -> str:
+    """The method by which `--sampler auto` compares samplers."""
+    from data_gen.samplers import SAMPLERS
+
+    return "wcv" if SAMPLERS[sampler].gradients else "primal"
 
 
 def rounded(value):
@@ -224,7 +245,8 @@ def true_error(errors: dict[str, float], spp: float) -> float:
 
 
 def cells(entry: dict) -> list[dict]:
-    """For each time of ``LADDER`` samples of the first sampler: name -> error, and the pilot's choice."""
+    """For each time of ``LADDER`` samples of the first sampler: name -> error, the pilot's choice, and the error by the
+    sampler that `--sampler auto` chooses over that by the best, both by a simple method."""
     from data_gen.pipelines import FROM, Pipeline, choose
 
     pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
@@ -239,7 +261,11 @@ def cells(entry: dict) -> list[dict]:
             if spp >= (FROM if p.shared else 2):
                 errors[name_of(p)] = true_error(row["errors"], spp)
         ranked = [p for p in choose(pipelines, seconds) if name_of(p) in errors]
-        found.append({"spp": n, "errors": errors, "choice": name_of(ranked[0])})
+        by_sampler = {
+            p.sampler: errors[name] for p in pipelines if (name := f"{p.sampler} {simple(p.sampler)}") in errors
+        }
+        auto = by_sampler.get(entry["auto"], math.inf) / min(by_sampler.values())
+        found.append({"spp": n, "errors": errors, "choice": name_of(ranked[0]), "auto": auto})
     return found
 
 
@@ -249,12 +275,16 @@ def name_of(p) -> str:
 
 def table(result: dict) -> list[str]:
     """Lines: choice, regret, the best, for each scene and time; then geometric mean and worst; and of fixed choices."""
-    lines, regrets, fixed = [], {False: [], True: []}, {False: {}, True: {}}
+    lines, fixed = [], {False: {}, True: {}}
+    regrets: dict[bool, list] = {False: [], True: []}
+    autos: dict[bool, list] = {False: [], True: []}
     for scene, entry in result["scenes"].items():
         for cell in cells(entry):
             least = min(cell["errors"], key=lambda n: cell["errors"][n])
             ratios = {name: e / cell["errors"][least] for name, e in cell["errors"].items()}
             regrets[entry["apart"]].append(ratios[cell["choice"]])
+            if math.isfinite(cell["auto"]):
+                autos[entry["apart"]].append(cell["auto"])
             for name, ratio in ratios.items():
                 fixed[entry["apart"]].setdefault(name, []).append(ratio)
                 if not name.endswith(" shared"):
@@ -264,6 +294,8 @@ def table(result: dict) -> list[str]:
     for apart, title in ((False, "chosen on"), (True, "apart")):
         if rows := regrets[apart]:
             lines.append(f"{title}: {mean_log(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
+            by_auto = autos[apart]
+            lines.append(f"  sampler auto, of samplers alone: {mean_log(by_auto):.3f}, {max(by_auto):.2f}")
             whole = {n: mean_log(r) for n, r in fixed[apart].items() if len(r) == len(rows)}
             for name in sorted(whole, key=lambda n: whole[n])[:8]:
                 lines.append(f"  always {name}: {whole[name]:.3f}, {max(fixed[apart][name]):.2f}")

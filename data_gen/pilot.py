@@ -178,7 +178,7 @@ def times_to_an_error(trials: dict[str, Trial], seconds: float = math.inf) -> di
         error = noise_of(*trial.primals, scale)
         if SAMPLERS[name].biased:
             error, doubt = _judged(trials, name, noise, scale)
-            error = max(error, 0.0) + _DOUBT * doubt
+            error += _DOUBT * doubt
         elif SAMPLERS[name].gradients and len(_fair(trials, name)):
             error, _ = _judged(trials, name, noise, scale)
         times[name] = max(error, 1e-9) * trial.seconds
@@ -213,6 +213,8 @@ def _judged(trials: dict[str, Trial], name: str, noise: dict[str, float], scale:
     others = _fair(trials, name)
     witnesses = [mean_of({o: trials[o].primals[i] for o in others}, noise) for i in range(2)]
     error = statistics.mean(error_of(image, witnesses, scale) for image in trials[name].images)
+    # What its two images differ by is sure, where noise of the others hides the rest.
+    error = max(error, noise_of(*trials[name].images, scale))
     return error, doubt_of(trials[name].images[0], witnesses, scale)
 
 

@@ -40,6 +40,15 @@ def test_light_that_a_reconstruction_has_lost_counts(renderer):
     assert judge("gpt", times)[0] == "bdpt"
 
 
+def test_an_error_is_no_less_than_what_two_images_differ_by(renderer):
+    """Where noise of the others says that there is none, or less than none."""
+    from data_gen.pilot import times_to_an_error
+
+    for noise in np.linspace(8, 12, 9):
+        trials = {"gpt": trial(noise, 1.0, error=0.01), "primal": trial(noise, 1.0)}
+        assert times_to_an_error(trials)["gpt"] > 0.009
+
+
 def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
     """Their blur counts, and falls slower than noise; a witness they are not."""
     from data_gen.pilot import doubtful, judge, times_to_an_error
