@@ -140,8 +140,8 @@ class GBDPT(BDPT):
         link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
         Record = record_class(mi.variant())
         kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
-        # The vertex that light has left smoothly last. It is kept as well, but Dr.Jit 1.5 (LLVM) reads from the place of
-        # another lane where the loop that writes reads from different ones.
+        # The vertex that light has left smoothly last. It is kept as well, but where the loop that writes reads from
+        # places that differ from lane to lane, Dr.Jit 1.5 (LLVM) takes those of other lanes.
         left = dr.zeros(Record, dr.width(depth))
         while dr.hint(active, label="light path"):
             y = Vertex(si, β, end, depth)
