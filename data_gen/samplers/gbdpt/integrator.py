@@ -137,16 +137,19 @@ class GBDPT(BDPT):
         e, p_light = lights.densities(scene, start, si)
         end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
         depth, count, any_bent = mi.UInt32(1), mi.UInt32(0), mi.Bool(False)
-        # The vertex that light has left smoothly last
         link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
         Record = record_class(mi.variant())
         kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
+        # The vertex that light has left smoothly last. It is kept as well, but where the loop that writes reads from
+        # places that differ from lane to lane, Dr.Jit 1.5 (LLVM) takes those of other lanes.
+        left = dr.zeros(Record, dr.width(depth))
         while dr.hint(active, label="light path"):
             y = Vertex(si, β, end, depth)
             bsdf = si.bsdf()
             smooth = active & scatters_smoothly(bsdf)
             # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
-            kept.write(record(ray, hit, y, smooth), depth - 1, active)
+            here = record(ray, hit, y, smooth)
+            kept.write(here, depth - 1, active)
             count = dr.select(active, depth, count)
 
             # ------------------- To the camera -----------------------
@@ -164,7 +167,7 @@ class GBDPT(BDPT):
 
             # ----------------- Its four shifts -----------------------
             first = link.depth == 0
-            before = recall(kept.read(dr.maximum(link.depth, 1) - 1), camera_ray.time, camera_ray.wavelengths)
+            before = recall(left, camera_ray.time, camera_ray.wavelengths)
             allowed = link.whole & materials.connectable(bsdf) & (first | materials.connectable(before.si.bsdf()))
             path = Splatted(
                 *(y, ray.d, uv, on_lens, C, others, first, start, before),
@@ -190,6 +193,7 @@ class GBDPT(BDPT):
             active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
             β /= survival
             link = next_link(link, depth, sample, dr.rcp(survival))
+            left = dr.select(link.depth == depth, here, left)
             depth += 1
             ray = si.spawn_ray(d)
             hit = scene.ray_intersect_preliminary(ray, active=active)
