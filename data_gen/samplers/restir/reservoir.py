@@ -1,0 +1,130 @@
+r"""Reservoirs: of many paths one, with a weight that makes up for the others. Pure functions on arrays.
+
+A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is unbiased for the integral over
+all paths, for whatever path it holds: W is an estimate of 1 / density. ``M``, the confidence, says how many candidates
+have been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget.
+
+All values are light, or one sign of a difference: never negative. What paths are chosen by, p̂, is their luminance.
+
+| quantity | formula | identity |
+|---|---|---|
+| resampling weight of path l | w = m p̂ \|J\| W, p̂ in the pixel that the reservoir is for | |
+| choice | path l with probability w_l / Σ w | |
+| weight of the chosen path | W = Σ w / p̂ | E[Σ over choices of value · W] = Σ m · value \|J\| W |
+| MIS weights of one path in all pixels that could have found it | ``merge``, ``pairwise`` | they sum to 1 |
+
+[Lin et al. 2022, "Generalized Resampled Importance Sampling", equations 15 to 23 and 38; Bitterli 2022 for the
+defensive pairwise weights]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.samplers.restir.record import Record, select
+
+
+@dataclass
+class Reservoir:
+    record: Record
+    side: mi.UInt32  # of a pair: 0 if the path is one of the first pixel, 1 of the second; else 0
+    value: mi.Spectrum
+    W: mi.Float
+    M: mi.Float
+
+    def estimate(self) -> mi.Spectrum:
+        return dr.select(self.W > 0, self.value * self.W, 0)
+
+
+@dataclass
+class Seen:
+    """A reservoir's path as one of another pixel or pair: its value there, and the Jacobian of the shift."""
+
+    value: mi.Spectrum
+    J: mi.Float
+
+    @property
+    def density(self) -> mi.Float:
+        """p̂ |J|, to be compared with p̂ where the path comes from."""
+        return mi.luminance(self.value) * self.J
+
+
+def share(own: mi.Float, others: mi.Float) -> mi.Float:
+    """The balance heuristic: the part of a density in the sum of that and others; 0 of nothing."""
+    return dr.select(own > 0, own / (own + others), 0)
+
+
+def weight_of(total: mi.Float, value: mi.Spectrum) -> mi.Float:
+    """W of the chosen path, whose value is given, from the sum of all resampling weights."""
+    target = mi.luminance(value)
+    return dr.select((target > 0) & dr.isfinite(total), total / target, 0)
+
+
+def merge(current: Reservoir, previous: Reservoir, there: Seen, here: Seen, u: mi.Float, cap: float) -> Reservoir:
+    """One reservoir of two, where ``current`` is at home: resampling with the generalised balance heuristic.
+
+    ``there`` is the current path where the previous reservoir is from, and ``here`` the previous path in the current
+    pixel. The previous record must have been moved here already (``Record.moved``); its ``value`` and ``W`` must not.
+    ``u`` is a random number in [0, 1). ``M`` of the result is at most ``cap``.
+    """
+    target, old = mi.luminance(current.value), mi.luminance(previous.value)
+    m = share(current.M * target, previous.M * there.density)
+    m_old = share(previous.M * old, current.M * here.density)
+    w = _finite(m * target * current.W)
+    total = w + _finite(m_old * here.density * previous.W)
+    first = u * total < w
+    value = dr.select(first, current.value, here.value)
+    return Reservoir(
+        record=select(first, current.record, previous.record),
+        side=dr.select(first, current.side, previous.side),
+        value=value,
+        W=weight_of(total, value),
+        M=dr.fmin(current.M + previous.M, cap),
+    )
+
+
+def pairwise(M: mi.Float, target: mi.Float, others: list[tuple[mi.Float, mi.Float]]) -> mi.Float:
+    """Defensive pairwise MIS weight of a reservoir's own path against those of ``others``.
+
+    ``M``, ``target``  the reservoir's confidence, and p̂ of its path
+    ``others``         for each other reservoir its confidence, and p̂ |J| of the path there
+
+    Each of the others has ``pairwise_other``. The weights of a path in all places sum to 1.
+    """
+    rest = sum((c for c, _ in others), start=mi.Float(0))
+    weight = M + sum((c * share(M * target, rest * there) for c, there in others), start=mi.Float(0))
+    return weight / (M + rest)
+
+
+def pairwise_other(c: mi.Float, target: mi.Float, M: mi.Float, here: mi.Float, rest: mi.Float) -> mi.Float:
+    """The same of the path of another reservoir.
+
+    ``c``, ``target``  the other's confidence, and p̂ of its path where it comes from
+    ``M``, ``here``    confidence of the reservoir for which paths are chosen, and p̂ |J| of the path there
+    ``rest``           the sum of confidences of all others
+    """
+    return c / (M + rest) * share(rest * target, M * here)
+
+
+def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
+    """What a path of a pair of pixels adds to "second pixel - first pixel", weighted against its mirror image.
+
+    ``first`` and ``second`` are f of the path in either pixel, in the measure of the pixel (``side``) that sampled it:
+    one is f itself, the other f |J| of the shift. A pair of paths can be sampled from both sides: the weight is p̂'s
+    share, since after resampling no density is known. [Gradient-domain ReSTIR 2025, equations 13 to 16]
+    """
+    a, b = mi.luminance(first), mi.luminance(second)
+    own, other = dr.select(side == 0, a, b), dr.select(side == 0, b, a)
+    return share(own, other) * (second - first)
+
+
+def part(value: mi.Spectrum, sign: int) -> mi.Spectrum:
+    """The positive or the negative part of a difference, each not negative: it is their difference."""
+    return dr.maximum(sign * value, 0)
+
+
+def _finite(weight: mi.Float) -> mi.Float:
+    return dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
