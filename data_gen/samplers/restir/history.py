@@ -62,7 +62,7 @@ class History:
         with recording():
             camera = CameraSamples(self.sensor, self.seed, self.chains, first)
             lane = dr.arange(mi.UInt32, dr.width(camera.pixel))
-            sample = first + lane % dr.opaque(mi.UInt32, self.chains)
+            sample = dr.opaque(mi.UInt32, first) + lane % dr.opaque(mi.UInt32, self.chains)
             choice = choices(self.seed, camera, sample)
             found = walk(self.scene, self.plan, camera, sample, choice)
             dr.eval(found, choice.random)
