@@ -24,7 +24,7 @@ Kinds of paths, by what ends them:
     STUCK       it leaves rc by a Dirac delta or a hole: a path that comes from elsewhere cannot follow, so no other
                 pixel has it, and ``evaluate`` gives 0
 
-[Lin et al. 2022, "Generalized Resampled Importance Sampling", sections 7.1 to 7.3: hybrid shifts]
+[Lin et al. 2022, "Generalized Resampled Importance Sampling": hybrid shifts]
 """
 
 from __future__ import annotations

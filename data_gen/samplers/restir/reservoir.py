@@ -13,8 +13,8 @@ All values are light, or one sign of a difference: never negative. What paths ar
 | weight of the chosen path | W = Σ w / p̂ | E[Σ over choices of value · W] = Σ m · value \|J\| W |
 | MIS weights of one path in all pixels that could have found it | ``merge``, ``pairwise`` | they sum to 1 |
 
-[Lin et al. 2022, "Generalized Resampled Importance Sampling", equations 15 to 23 and 38; Bitterli 2022 for the
-defensive pairwise weights]
+[Lin et al. 2022, "Generalized Resampled Importance Sampling"; Bitterli 2022 for the defensive pairwise
+weights]
 """
 
 from __future__ import annotations

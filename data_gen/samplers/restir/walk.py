@@ -3,7 +3,7 @@ r"""Candidates: one random walk, and of all its paths the one that a reservoir k
 A walk is Mitsuba's ``path``: emitter sampling and BSDF sampling at each vertex. Each emitter found is a path. One of
 them is chosen as the walk goes on, with probability in proportion to the luminance of its contribution C = f W, and
 its W becomes the sum of all these luminances over the luminance of its own f: C's mean over the choices is the walk's
-radiance. [Lin et al. 2022, section 7.4; Chao 1982 for the choice in one go]
+radiance. [Lin et al. 2022; Chao 1982 for the choice in one go]
 
     F       integrand of the walk up to vertex x, in the measures of ``data_gen.samplers.restir.record``
     W       1 / density of the same, Russian roulette included
