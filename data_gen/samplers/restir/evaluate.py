@@ -40,11 +40,11 @@ class Shifted:
 
 
 def evaluate_record(
-    scene: mi.Scene, plan: Plan, sensor: mi.Sensor, seed: int, record: Record, move: mi.Vector2f, active: mi.Bool
+    scene: mi.Scene, plan: Plan, sensor: mi.Sensor, seed: int, record: Record, place: mi.Point2f, active: mi.Bool
 ) -> Shifted:
-    """The paths of the records, displaced on the film by ``move`` pixels from where they live."""
-    camera = CameraSamples(sensor, seed, 1, record.sample, some=record.pixel)
-    ray, importance, inside = camera.rays(record.shift + move)
+    """E(record, place): the paths of the records, as those of the ``place`` on the film; J is that of the way there."""
+    camera = CameraSamples.replayed(sensor, seed, record.pixel, record.sample, place)
+    ray, importance, inside = camera.rays()
     y = scene.ray_intersect(mi.Ray3f(ray), active & inside)
     kind = record.kind
     good = y.is_valid() & (kind != STUCK)
@@ -61,27 +61,6 @@ def evaluate_record(
     f = importance * dr.select(good, replayed, 0)
     f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(J) & (J > 0), f, 0)
     return Shifted(f, J, geometry)
-
-
-def evaluate_at(
-    scene: mi.Scene,
-    plan: Plan,
-    sensor: mi.Sensor,
-    seed: int,
-    record: Record,
-    home: mi.UInt32,
-    pixel: mi.UInt32,
-    active: mi.Bool,
-) -> Shifted:
-    """E(record, pixel): the same for records that live in the pixels ``home``, as paths of other ``pixel`` s."""
-    return evaluate_record(scene, plan, sensor, seed, record, displacement(sensor, home, pixel), active)
-
-
-def displacement(sensor: mi.Sensor, home: mi.UInt32, pixel: mi.UInt32) -> mi.Vector2f:
-    """From one pixel to another."""
-    width = dr.opaque(mi.UInt32, int(sensor.film().crop_size()[0]))
-    columns = mi.Float(mi.Int32(pixel % width) - mi.Int32(home % width))
-    return mi.Vector2f(columns, mi.Float(mi.Int32(pixel // width) - mi.Int32(home // width)))
 
 
 @dr.syntax

@@ -43,11 +43,11 @@ MOST_REPLAYED = (1 << 32 - _KIND_BITS) - 1
 
 @dataclass
 class Record:
-    """A path that lives in a pixel, which whoever stores the record knows. 20 words of 4 bytes, RGB variants only."""
+    """A path that lives in the pixel of its ``place``. 20 words of 4 bytes, RGB variants only."""
 
     pixel: mi.UInt32  # whose numbers the path was sampled with; ``sample`` counts on over the frames of a sequence
     sample: mi.UInt32
-    shift: mi.Vector2f  # pixels on the film, from where the camera sample fell to where the path lives now
+    place: mi.Point2f  # on the film, in pixels: where the path lives now, at first where its camera sample fell
     word: mi.UInt32  # kind, and how many vertices are left by replay
     P: mi.Point3f  # rc, if it is on a surface
     shape: mi.ShapePtr  # there; none where rc is in the environment, and for paths without rc
@@ -82,9 +82,9 @@ class Record:
         """Whether there is no surface at rc."""
         return self.shape == None  # noqa: E711 - a comparison of arrays of pointers
 
-    def moved(self, move: mi.Vector2f, geometry: mi.Float) -> Record:
-        """The same path in another pixel, of which ``evaluate`` has found the ``geometry``."""
-        return replace(self, shift=self.shift + move, geometry=geometry)
+    def moved(self, place: mi.Point2f, geometry: mi.Float) -> Record:
+        """The same path elsewhere on the film, where ``evaluate`` has found its ``geometry``."""
+        return replace(self, place=place, geometry=geometry)
 
 
 def word_of(kind: mi.UInt32, replayed: mi.UInt32) -> mi.UInt32:
@@ -111,7 +111,7 @@ def gather(record: Record, lanes: mi.UInt32, active: bool | mi.Bool = True) -> R
 def empty(lanes: int) -> Record:
     """Records of no path."""
     types = (
-        *(mi.UInt32, mi.UInt32, mi.Vector2f, mi.UInt32, mi.Point3f, mi.ShapePtr),
+        *(mi.UInt32, mi.UInt32, mi.Point2f, mi.UInt32, mi.Point3f, mi.ShapePtr),
         *(mi.UInt32, mi.Point2f, mi.Vector3f, mi.Spectrum, mi.Float, mi.Float),
     )
     return Record(*(dr.zeros(kind, lanes) for kind in types))

@@ -1,8 +1,8 @@
 r"""Reservoirs: of many paths one, with a weight that makes up for the others. Pure functions on arrays.
 
 A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is unbiased for the integral over
-all paths, for whatever path it holds: W is an estimate of 1 / density. ``M``, the confidence, says how many candidates
-have been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget.
+all paths, for whatever path it holds: W is an estimate of 1 / density. M, the confidence, says how many candidates have
+been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget.
 
 All values are light, or one sign of a difference: never negative. What paths are chosen by, p̂, is their luminance.
 
@@ -11,7 +11,7 @@ All values are light, or one sign of a difference: never negative. What paths ar
 | resampling weight of path l | w = m p̂ \|J\| W, p̂ in the pixel that the reservoir is for | |
 | choice | path l with probability w_l / Σ w | |
 | weight of the chosen path | W = Σ w / p̂ | E[Σ over choices of value · W] = Σ m · value \|J\| W |
-| MIS weights of one path in all pixels that could have found it | ``merge``, ``pairwise`` | they sum to 1 |
+| MIS weights of one path in all pixels that could have found it | ``weigh``, ``pairwise`` | they sum to 1 |
 
 [Lin et al. 2022, "Generalized Resampled Importance Sampling"; Bitterli 2022 for the defensive pairwise
 weights]
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.samplers.restir.record import Record, select
+from data_gen.samplers.restir.record import Record
 
 
 @dataclass
@@ -33,23 +33,9 @@ class Reservoir:
     side: mi.UInt32  # of a pair: 0 if the path is one of the first pixel, 1 of the second; else 0
     value: mi.Spectrum
     W: mi.Float
-    M: mi.Float
 
     def estimate(self) -> mi.Spectrum:
         return dr.select(self.W > 0, self.value * self.W, 0)
-
-
-@dataclass
-class Seen:
-    """A reservoir's path as one of another pixel or pair: its value there, and the Jacobian of the shift."""
-
-    value: mi.Spectrum
-    J: mi.Float
-
-    @property
-    def density(self) -> mi.Float:
-        """p̂ |J|, to be compared with p̂ where the path comes from."""
-        return mi.luminance(self.value) * self.J
 
 
 def share(own: mi.Float, others: mi.Float) -> mi.Float:
@@ -63,27 +49,31 @@ def weight_of(total: mi.Float, value: mi.Spectrum) -> mi.Float:
     return dr.select((target > 0) & dr.isfinite(total), total / target, 0)
 
 
-def merge(current: Reservoir, previous: Reservoir, there: Seen, here: Seen, u: mi.Float, cap: float) -> Reservoir:
-    """One reservoir of two, where ``current`` is at home: resampling with the generalised balance heuristic.
+def weigh(
+    M: mi.Float, own: mi.Float, rest: mi.Float, other: mi.Float, target: mi.Float, W: mi.Float
+) -> tuple[mi.Float, mi.Float]:
+    """The MIS weight of a path by the generalised balance heuristic, and its resampling weight; 0 of what is not.
 
-    ``there`` is the current path where the previous reservoir is from, and ``here`` the previous path in the current
-    pixel. The previous record must have been moved here already (``Record.moved``); its ``value`` and ``W`` must not.
-    ``u`` is a random number in [0, 1). ``M`` of the result is at most ``cap``.
+    ``M``, ``own``      confidence of the reservoir that the path is from, and p̂ of the path there
+    ``rest``, ``other`` the same of the one other place where it could be from, p̂ |J|
+    ``target``, ``W``   p̂ |J| in the pixel that the reservoir is for, and the path's W
     """
-    target, old = mi.luminance(current.value), mi.luminance(previous.value)
-    m = share(current.M * target, previous.M * there.density)
-    m_old = share(previous.M * old, current.M * here.density)
-    w = _finite(m * target * current.W)
-    total = w + _finite(m_old * here.density * previous.W)
-    first = u * total < w
-    value = dr.select(first, current.value, here.value)
-    return Reservoir(
-        record=select(first, current.record, previous.record),
-        side=dr.select(first, current.side, previous.side),
-        value=value,
-        W=weight_of(total, value),
-        M=dr.fmin(current.M + previous.M, cap),
-    )
+    m = share(M * own, rest * other)
+    w = m * target * W
+    return m, dr.select(dr.isfinite(w) & (w > 0), w, 0)
+
+
+def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
+    """The number of the path that is kept, by a random number in [0, 1), and the sum of all resampling weights.
+
+    It is one whose weight is not 0, wherever there is one.
+    """
+    total = sum(weights, start=mi.Float(0))
+    chosen, below, place = mi.UInt32(0), mi.Float(0), u * total
+    for k, weight in enumerate(weights):
+        chosen = dr.select((weight > 0) & (place >= below), k, chosen)
+        below += weight
+    return chosen, total
 
 
 def pairwise(M: mi.Float, target: mi.Float, others: list[tuple[mi.Float, mi.Float]]) -> mi.Float:
@@ -124,7 +114,3 @@ def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.S
 def part(value: mi.Spectrum, sign: int) -> mi.Spectrum:
     """The positive or the negative part of a difference, each not negative: it is their difference."""
     return dr.maximum(sign * value, 0)
-
-
-def _finite(weight: mi.Float) -> mi.Float:
-    return dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)

@@ -81,11 +81,11 @@ def walk(scene: mi.Scene, plan: Plan, camera: CameraSamples, sample: mi.UInt32, 
     """A candidate for each camera sample, which has number ``sample``; ``choice`` draws what chooses among paths."""
     ray, importance, _ = camera.rays()
     x = scene.ray_intersect(mi.Ray3f(ray))
-    return _walk(scene, plan, camera.random.clone(), choice, camera.pixel, sample, x, importance)
+    return _walk(scene, plan, camera.random.clone(), choice, camera.pixel, sample, camera.position, x, importance)
 
 
 @dr.syntax
-def _walk(scene, plan, random, choice, pixel, sample, x, importance):
+def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
     lanes = dr.width(pixel)
     record = empty(lanes)
     chosen = _Choice(record.word, record.L, record.w, record.L, record.p_light)
@@ -180,7 +180,7 @@ def _walk(scene, plan, random, choice, pixel, sample, x, importance):
     record = Record(
         pixel=pixel,
         sample=sample,
-        shift=dr.zeros(mi.Vector2f, lanes),
+        place=place,
         word=chosen.word,
         P=P,
         shape=shape,
