@@ -56,20 +56,20 @@ class Paths:
         self.kind = np.array(self.found.record.kind)
         self.replayed = np.array(self.found.record.replayed)
 
-    def vector(self, move):
-        """Opaque, lest each be compiled into a kernel of its own."""
+    def place(self, record, move):
+        """Opaque, lest each move be compiled into a kernel of its own."""
         import drjit as dr
 
-        return self.mi.Vector2f(*(dr.opaque(self.mi.Float, m) for m in move))
+        return self.mi.Point2f(record.place + self.mi.Vector2f(*(dr.opaque(self.mi.Float, m) for m in move)))
 
     def at(self, record, move):
-        """(f, J, geometry) of the records in pixels ``move`` from theirs."""
+        """(f, J, geometry) of the records, ``move`` pixels from where they are."""
         import drjit as dr
 
         from data_gen.samplers.restir.evaluate import evaluate_record
 
-        move = self.vector(move)
-        shifted = evaluate_record(self.scene, self.plan, self.sensor, SEED, record, move, self.mi.Bool(True))
+        place = self.place(record, move)
+        shifted = evaluate_record(self.scene, self.plan, self.sensor, SEED, record, place, self.mi.Bool(True))
         dr.eval(shifted)
         return np.array(shifted.f), np.array(shifted.J), shifted.geometry
 
@@ -125,7 +125,7 @@ def test_there_and_back_is_where_it_was(paths, move):
     f, J, geometry = paths.at(record, move)
     exists = (paths.W > 0) & f.any(axis=0)
     assert exists.sum() > 500
-    moved = record.moved(paths.vector(move), geometry)
+    moved = record.moved(paths.place(record, move), geometry)
     there, unit, _ = paths.at(moved, (0, 0))
     assert close(there[:, exists], f[:, exists]) > 0.999
     assert np.abs(unit[exists] - 1).max() < 1e-3
@@ -159,6 +159,7 @@ class Displaced:
 
     def __init__(self, camera, move):
         self.pixel, self.random, self._rays = camera.pixel, camera.random, lambda: camera.rays(move)
+        self.position = camera.position
 
     def rays(self):
         return self._rays()

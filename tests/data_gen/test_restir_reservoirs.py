@@ -1,7 +1,5 @@
 """Reservoirs: weights sum to one, and W is unbiased, in NumPy over paths that can be counted."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -17,93 +15,83 @@ def gray(mi, values):
     return mi.Spectrum(mi.Float(np.asarray(values, np.float32)))
 
 
-def reservoir(mi, value, W, M, name):
-    """A reservoir whose path is known by its number, as the pixel of the record."""
-    from data_gen.samplers.restir.record import empty
-    from data_gen.samplers.restir.reservoir import Reservoir
+def all_outcomes(mi, M, both=False):
+    """Every candidate of the first pixel with every one of the second, of all random numbers: what is kept.
 
-    lanes = len(value)
-    record = replace(empty(lanes), pixel=mi.UInt32(np.asarray(name, np.uint32)))
-    M = mi.Float(np.full(lanes, M, np.float32))
-    return Reservoir(record, mi.UInt32(np.zeros(lanes, np.uint32)), gray(mi, value), mi.Float(W), M)
-
-
-def all_outcomes(mi, M, cap=32.0):
-    """The merge of every candidate of the first pixel with every one of the second, of all random numbers.
-
-    Returns the reservoirs and the probability of each. The second pixel's path x is J(x) shorter than the first's: what
-    has density p there has p / |J|.
+    The paths of the second pixel are J(x) shorter than the first's: what has density p there has p / |J|. With
+    ``both``, there is a third reservoir, like the second. Returns the estimates, the number and p̂ of the path that was
+    kept, W, and the probability of each outcome.
     """
-    from data_gen.samplers.restir.reservoir import Seen, merge
+    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
 
-    a, b, u = (n.ravel() for n in np.meshgrid(np.arange(5), np.arange(4), (np.arange(DRAWS) + 0.5) / DRAWS))
-    # Two candidates lie in two measures, the second's stretched by J.
-    here, there = LIGHT[0], LIGHT[1]
-    current = reservoir(mi, here[a], 1 / FOUND[0][a], M[0], a)
-    previous = reservoir(mi, there[b], 1 / (FOUND[1][b] / JACOBIAN[b]), M[1], b)
-    merged = merge(
-        current,
-        previous,
-        Seen(gray(mi, there[a]), mi.Float(JACOBIAN[a])),
-        Seen(gray(mi, here[b]), mi.Float(1 / JACOBIAN[b])),
-        mi.Float(u),
-        cap,
+    a, b, c, u = (
+        n.ravel()
+        for n in np.meshgrid(
+            np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS
+        )
     )
-    return merged, FOUND[0][a] * FOUND[1][b] / DRAWS, a, b
+    here, there = LIGHT
+    probability = FOUND[0][a] * FOUND[1][b] * (FOUND[1][c] if both else 1) / DRAWS
+    floats = [
+        [M[0] * here[a], (1 + both) * M[1] * there[a] * JACOBIAN[a], here[a], 1 / FOUND[0][a]],
+        # In the measure of the second pixel, |J| of the way back is 1 / J.
+        *(
+            [M[1] * there[x], (M[0] * here[x] + both * M[1] * there[x] * JACOBIAN[x]) / JACOBIAN[x]]
+            + [here[x] / JACOBIAN[x], JACOBIAN[x] / FOUND[1][x]]
+            for x in ((b, c) if both else (b,))
+        ),
+    ]
+    weights = [weigh(*(mi.Float(np.asarray(v, np.float32)) for v in row))[1] for row in floats]
+    chosen, total = choose(weights, mi.Float(u))
+    kept = np.choose(np.array(chosen), [a, b, c])
+    W = np.array(weight_of(total, gray(mi, here[kept])))
+    return here[kept] * W, kept, W, probability
 
 
+@pytest.mark.parametrize("both", [False, True])
 @pytest.mark.parametrize("M", [(1, 1), (1, 7), (5, 0.5)])
-def test_a_merged_reservoir_is_unbiased(renderer, M):
+def test_what_is_kept_of_all_that_is_offered_is_unbiased(renderer, M, both):
     """E[value W] is the integral, here the sum over the first pixel's paths."""
-    merged, probability, _, _ = all_outcomes(renderer, M)
-    estimate = np.array(merged.estimate())[0].astype(float)
+    estimate, _, _, probability = all_outcomes(renderer, M, both)
     assert np.sum(probability) == pytest.approx(1)
-    assert np.sum(probability * estimate) == pytest.approx(LIGHT[0].sum(), rel=2e-3)
+    assert np.sum(probability * estimate) == pytest.approx(LIGHT[0].sum(), rel=3e-3)
 
 
-@pytest.mark.parametrize("wrong", ["J", "M", "value"])
-def test_a_wrong_merge_is_seen_by_that(renderer, monkeypatch, wrong):
+@pytest.mark.parametrize("wrong", ["share", "others", "value"])
+def test_a_wrong_weight_is_seen_by_that(renderer, monkeypatch, wrong):
     from data_gen.samplers.restir import reservoir as module
 
-    if wrong == "J":
-        monkeypatch.setattr(module.Seen, "density", property(lambda seen: renderer.luminance(seen.value)))
-    elif wrong == "M":
+    if wrong == "share":
         monkeypatch.setattr(module, "share", lambda own, others: renderer.Float(0.5))
+    elif wrong == "others":
+        right = module.share
+        monkeypatch.setattr(module, "share", lambda own, others: right(own, 0.5 * others))
     else:
         monkeypatch.setattr(module, "weight_of", lambda total, value: total)
-    merged, probability, _, _ = all_outcomes(renderer, (1, 7))
-    estimate = np.array(merged.estimate())[0].astype(float)
+    estimate, _, _, probability = all_outcomes(renderer, (1, 7))
     assert abs(np.sum(probability * estimate) / LIGHT[0].sum() - 1) > 0.02
 
 
-def test_the_path_that_is_kept_is_the_one_that_is_valued(renderer):
-    merged, _, a, b = all_outcomes(renderer, (1, 2))
-    name, value = np.array(merged.record.pixel), np.array(merged.value)[0]
-    kept = np.array(merged.W) > 0
-    assert ((name == a) | (name == b)).all()
-    assert np.allclose(value[kept], LIGHT[0][name[kept]])
+def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
+    from data_gen.samplers.restir.reservoir import choose
 
-
-@pytest.mark.parametrize(("cap", "expected"), [(32, 8), (5, 5), (1, 1)])
-def test_confidence_stays_below_its_cap(renderer, cap, expected):
-    merged, _, _, _ = all_outcomes(renderer, (1, 7), cap)
-    assert (np.array(merged.M) == expected).all()
+    mi, weights = renderer, [0.5, 0.0, 1.5, 2.0, 0.0]
+    u = (np.arange(1000) + 0.5) / 1000
+    chosen, total = choose([mi.Float(w) for w in weights], mi.Float(u))
+    assert np.allclose(np.array(total), 4)
+    assert np.allclose(np.bincount(np.array(chosen), minlength=5) / 1000, np.array(weights) / 4, atol=1e-3)
 
 
 def test_of_nothing_comes_nothing(renderer):
-    """Reservoirs without a path, or with weights that are not finite, add nothing."""
-    from data_gen.samplers.restir.reservoir import Seen, merge
+    """Paths without light, or with weights that are not finite, add nothing."""
+    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
 
     mi = renderer
     for W in (0.0, np.inf, np.nan):
-        empty, full = reservoir(mi, [0.0], [W], 9, [1]), reservoir(mi, [2.0], [3.0], 1, [2])
-        nothing, all_ = Seen(gray(mi, [0.0]), mi.Float(1)), Seen(gray(mi, [2.0]), mi.Float(1))
-        # The full one cannot be found where the empty one is from.
-        merged = merge(full, empty, nothing, nothing, mi.Float(0.99), 32)
-        assert np.allclose(np.array(merged.estimate()), 6)
-        # Nine candidates that have found nothing count as well, where they could have found the path.
-        merged = merge(empty, full, nothing, all_, mi.Float(0.0), 32)
-        assert np.allclose(np.array(merged.estimate()), 6 / 10)
+        nothing = weigh(mi.Float(9), mi.Float(0), mi.Float(2), mi.Float(W))[1]
+        chosen, total = choose([nothing, mi.Float(3)], mi.Float(0.0))
+        assert (np.array(chosen), np.array(total)) == (1, 3)
+    assert np.array(weight_of(mi.Float(1), gray(mi, [0.0]))) == 0
 
 
 @pytest.mark.parametrize("others", [1, 2, 5])

@@ -72,13 +72,55 @@ class _Requests:
     count: mi.UInt32
     shifted: Shifted
 
-    def at(self, lane: mi.UInt32, second: bool = False) -> Shifted:
+    def at(self, lane: mi.UInt32, active: bool | mi.Bool = True, end: int = 0) -> Shifted:
         """What is known of these lanes; 0 with a Jacobian of 1 where nothing was asked for."""
-        slot = dr.gather(mi.UInt32, self.slot, lane)
-        asked, slot = slot != _NONE, slot + (self.count if second else 0)
+        slot = dr.gather(mi.UInt32, self.slot, dr.select(active, lane, 0))
+        asked, slot = (slot != _NONE) & active, slot + (self.count if end else 0)
         f = dr.gather(mi.Spectrum, self.shifted.f, slot, asked)
         J, geometry = (dr.gather(mi.Float, v, slot, asked) for v in (self.shifted.J, self.shifted.geometry))
         return Shifted(f, dr.select(asked, J, 1), geometry)
+
+    def part(self, lane: mi.UInt32, active: bool | mi.Bool = True, end: int = 0) -> mi.Spectrum:
+        """f |J|."""
+        shifted = self.at(lane, active, end)
+        return shifted.f * shifted.J
+
+
+@dataclass
+class _Evaluated:
+    """E of all that a frame needs; None where it is not needed."""
+
+    partners: _Requests | None = None
+    here: _Requests | None = None
+    elsewhere: _Requests | None = None
+    there: _Requests | None = None
+
+
+@dataclass
+class _Kept:
+    """A path of the frame before, for a reservoir that looks for it."""
+
+    domain: mi.UInt32
+    side: mi.UInt32
+    before: mi.Point2i  # first pixel of the pair that it was kept for
+    source: mi.UInt32  # lane of that reservoir
+    place: mi.Point2f  # where the path is now
+    good: mi.Bool
+    other: mi.Point2i  # first pixel of the other pair that could have kept it,
+    elsewhere: mi.Point2f  # at this place,
+    twice: mi.Bool  # if there is one
+
+
+@dataclass
+class _Offer:
+    """A path for a reservoir: its value there, resampling weight, side; lane of the record, and how that has moved."""
+
+    value: mi.Spectrum
+    weight: mi.Float
+    side: mi.UInt32
+    source: mi.UInt32
+    place: mi.Point2f
+    geometry: mi.Float
 
 
 class History:
@@ -125,7 +167,7 @@ class History:
             sample = dr.opaque(mi.UInt32, self.frames * self.chains) + dr.arange(mi.UInt32, n) % self.chain_count
             choice = choices(self.seed, camera, sample)
             found = walk(self.scene, self.plan, camera, sample, choice)
-            u = [choice.next_1d() for _ in range(self.total // n)]
+            u = [choice.next_1d() for _ in range(self.reservoirs)]
             dr.eval(found, u)
             frame = self._resample(camera, found, dr.concat(u))
         self.confidence = confidence_after(self.confidence, motions, STEPS.values(), self.cap)
@@ -134,20 +176,21 @@ class History:
         return frame
 
     def _resample(self, camera: CameraSamples, found: Candidate, u: mi.Float) -> Frame:
-        here = there = None
+        e = _Evaluated()
         if self.kept is not None:
-            here = self._here(self.kept)
+            e.here = self._here(self.kept)
             with self.pose.of(self.sensor):
-                there = self._there(found)
-        partners = self._partners(found.record, found.W) if self.pairs else None
-        kept = self._merged(found, self.kept, partners, here, there, u)
+                e.elsewhere, e.there = self._elsewhere(self.kept), self._there(found)
+        if self.pairs:
+            e.partners = self._partners(found.record, found.W)
+        kept = self._merged(found, self.kept, e, u)
         dr.eval(kept)
         self.kept = kept
         values = kept.estimate()
         n = self.lanes
         primal, *signs = (
             dr.gather(mi.Spectrum, values, dr.arange(mi.UInt32, n) + dr.opaque(mi.UInt32, r * n))
-            for r in range(RESERVOIRS if self.pairs else 1)
+            for r in range(self.reservoirs)
         )
         if self.pairs:
             dx, dy = signs[0] - signs[1], signs[2] - signs[3]
@@ -161,7 +204,9 @@ class History:
     def _prepare(self, n: int, motions: np.ndarray) -> None:
         """What kernels read: opaque, since literals would be compiled into them, each anew."""
         self.lanes = n
-        self.total = n * (RESERVOIRS if self.pairs else 1)
+        self.reservoirs, self.ends = (RESERVOIRS, 2) if self.pairs else (1, 1)
+        self.total = n * self.reservoirs
+        self.opaque_total = dr.opaque(mi.UInt32, self.total)
         self.n, self.chain_count = dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, self.chains)
         self.width, self.height = (dr.opaque(mi.Int32, v) for v in self.size)
         self.area = dr.opaque(mi.UInt32, self.size[0] * self.size[1])
@@ -217,145 +262,157 @@ class History:
         """Each path of a pixel in its right, left, lower and upper neighbour: requests of lane, of 4 n."""
 
         def place(lane: mi.UInt32) -> tuple[mi.UInt32, mi.Point2f]:
-            i, which = lane % self.n, lane // self.n
-            back = dr.select(which % 2 == 0, mi.Float(1), -1)
-            move = mi.Vector2f(dr.select(which < 2, back, 0), dr.select(which < 2, 0, back))
-            return i, dr.gather(mi.Point2f, record.place, i) + move
+            i, pair = lane % self.n, lane // self.n
+            return i, mi.Point2f(dr.gather(mi.Point2f, record.place, i) + _across(pair // 2 + 1, pair % 2))
 
         lane = dr.arange(mi.UInt32, 4 * self.lanes)
         i, where = place(lane)
         active = (dr.gather(mi.Float, W, i) > 0) & self._on_film(mi.Point2i(dr.floor(where)))
         return self._evaluate(record, 4 * self.lanes, 1, active, lambda lane, end: (*place(lane), mi.Bool(True)))
 
-    def _corner(self, lane: mi.UInt32):
-        """Of request ``lane``, four for each reservoir: what it is about, and the reservoir of before at that corner."""
+    def _nearest(self, pair: mi.Point2i, motion: mi.Vector2f) -> mi.Point2i:
+        return mi.Point2i(dr.floor(mi.Point2f(pair) + motion + 0.5))
+
+    def _corner(self, lane: mi.UInt32, kept: Reservoir) -> _Kept:
+        """What reservoir ``lane`` // 4 finds at one of the corners of its area in the frame before."""
         job, corner = lane // len(CORNERS), lane % len(CORNERS)
         r, i = job // self.n, job % self.n
-        domain = (r + 1) // 2
-        pixel = self._pixel(i)
+        domain, pixel = (r + 1) // 2, self._pixel(i)
         motion = self._motion(domain, pixel, mi.Bool(True))
-        before = mi.Point2i(dr.floor(mi.Point2f(pixel) + motion)) + mi.Point2i(
-            *(mi.Int32(part_) for part_ in (corner % 2, corner // 2))
-        )
-        source = r * self.n + dr.select(self._on_film(before), self._lane(before, i % self.chain_count), 0)
-        return domain, pixel, motion, before, source
+        before = mi.Point2i(dr.floor(mi.Point2f(pixel) + motion))
+        before += mi.Point2i(mi.Int32(corner % 2), mi.Int32(corner // 2))
+        on_film, nearest = self._on_film(before), self._nearest(pixel, motion)
+        source = r * self.n + dr.select(on_film, self._lane(before, i % self.chain_count), 0)
+        side = dr.gather(mi.UInt32, kept.side, source)
+        was = dr.gather(mi.Point2f, kept.record.place, source)
+        step = _step(domain) * mi.Int32(side)
+        at, straight = pixel + step, mi.Point2f(was - motion)
+        stays = _same(mi.Point2i(dr.floor(straight)), at)
+        place = dr.select(stays, straight, mi.Point2f(mi.Point2f(at) + _fraction(straight)))
+        # Where else the path that it is now could have been
+        far = mi.Point2f(place + motion)
+        other = dr.select(stays, nearest, mi.Point2i(dr.floor(far)) - step)
+        elsewhere = dr.select(stays, mi.Point2f(mi.Point2f(nearest + step) + _fraction(was)), far)
+        good = on_film & (stays | _same(before, nearest)) & (dr.gather(mi.Float, kept.W, source) > 0)
+        return _Kept(domain, side, before, source, place, good, other, elsewhere, good & ~_same(other, before))
 
     def _here(self, kept: Reservoir) -> _Requests:
         """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir."""
 
-        def where(lane: mi.UInt32):
-            domain, pixel, motion, before, source = self._corner(lane)
-            place = dr.gather(mi.Point2f, kept.record.place, source) - motion
-            side = dr.gather(mi.UInt32, kept.side, source)
-            at = pixel + _step(domain) * mi.Int32(side)
-            found = mi.Point2i(dr.floor(place))
-            good = self._on_film(before) & (found.x == at.x) & (found.y == at.y)
-            return domain, source, place, side, good
-
         def request(lane: mi.UInt32, end: mi.UInt32):
-            domain, source, place, side, _ = where(lane)
-            return source, place + mi.Float(end) * _across(domain, side), (end == 0) | (domain > 0)
+            it = self._corner(lane, kept)
+            return it.source, it.place + mi.Float(end) * _across(it.domain, it.side), (end == 0) | (it.domain > 0)
 
         lanes = self.total * len(CORNERS)
-        _, source, _, _, good = where(dr.arange(mi.UInt32, lanes))
-        good &= dr.gather(mi.Float, kept.W, source) > 0
-        return self._evaluate(kept.record, lanes, 2 if self.pairs else 1, good, request)
+        good = self._corner(dr.arange(mi.UInt32, lanes), kept).good
+        return self._evaluate(kept.record, lanes, self.ends, good, request)
+
+    def _elsewhere(self, kept: Reservoir) -> _Requests:
+        """The same in the frame before, where else the path could have been."""
+
+        def request(lane: mi.UInt32, end: mi.UInt32):
+            it = self._corner(lane, kept)
+            return it.source, it.elsewhere + mi.Float(end) * _across(it.domain, it.side), (end == 0) | (it.domain > 0)
+
+        lanes = self.total * len(CORNERS)
+        it = self._corner(dr.arange(mi.UInt32, lanes), kept)
+        known = it.twice & (self._confidence(it.domain, it.other) > 0)
+        return self._evaluate(kept.record, lanes, self.ends, known, request)
+
+    def _before(self, domain: mi.UInt32, pair: mi.Point2i, side: mi.UInt32, place: mi.Point2f, wrapped: mi.Bool):
+        """Where a path of this frame's ``pair`` could have been in the frame before: place, pair, and whether at all.
+
+        Not ``wrapped``: straight along the motion. Else within the nearest pair, unless that is the same.
+        """
+        exists = self._on_film(pair)
+        motion = self._motion(domain, pair, exists)
+        step, nearest = _step(domain) * mi.Int32(side), self._nearest(pair, motion)
+        far = mi.Point2f(place + motion)
+        straight = mi.Point2i(dr.floor(far)) - step
+        there = dr.select(wrapped, mi.Point2f(mi.Point2f(nearest + step) + _fraction(far)), far)
+        before = dr.select(wrapped, nearest, straight)
+        return there, before, exists & ~(wrapped & _same(nearest, straight))
 
     def _there(self, found: Candidate) -> _Requests:
-        """Each candidate in the frame before: requests of lane, of primal, dx and dy as side 0 and 1, 5 n."""
+        """Each candidate in the frame before: requests of lane, of primal, dx and dy as side 0 and 1; all that twice,
+        straight and wrapped."""
 
         def where(lane: mi.UInt32):
-            e, i = lane // self.n, lane % self.n
+            wrapped, e, i = lane >= self.opaque_total, (lane // self.n) % self.reservoirs, lane % self.n
             domain, side = (e + 1) // 2, dr.select(e == 0, 0, (e + 1) % 2)
             place = dr.gather(mi.Point2f, found.record.place, i)
             pair = self._pixel(i) - _step(domain) * mi.Int32(side)
-            exists = self._on_film(pair)
-            place = place + self._motion(domain, pair, exists)
-            before = mi.Point2i(dr.floor(place)) - _step(domain) * mi.Int32(side)
-            return domain, side, i, place, exists & (self._confidence(domain, before) > 0)
+            there, before, exists = self._before(domain, pair, side, place, wrapped)
+            return domain, side, i, there, exists & (self._confidence(domain, before) > 0)
 
         def request(lane: mi.UInt32, end: mi.UInt32):
             domain, side, i, place, _ = where(lane)
             return i, place + mi.Float(end) * _across(domain, side), (end == 0) | (domain > 0)
 
-        _, _, i, _, good = where(dr.arange(mi.UInt32, self.total))
+        _, _, i, _, good = where(dr.arange(mi.UInt32, 2 * self.total))
         good &= dr.gather(mi.Float, found.W, i) > 0
-        return self._evaluate(found.record, self.total, 2 if self.pairs else 1, good, request)
+        return self._evaluate(found.record, 2 * self.total, self.ends, good, request)
 
     # ------------------------------ What is kept ------------------------------
 
-    def _merged(
-        self,
-        found: Candidate,
-        kept: Reservoir | None,
-        partners: _Requests | None,
-        here: _Requests | None,
-        there: _Requests | None,
-        u: mi.Float,
-    ) -> Reservoir:
+    def _merged(self, found: Candidate, kept: Reservoir | None, e: _Evaluated, u: mi.Float) -> Reservoir:
         """Of each reservoir the path that is kept, of this frame or of the one before."""
         lane = dr.arange(mi.UInt32, self.total)
         r, i = lane // self.n, lane % self.n
-        domain, pixel, chain = (r + 1) // 2, self._pixel(i), i % self.chain_count
-        step, one = _step(domain), mi.Float(1)
-        exists = self._on_film(pixel + step)
-        motion = self._motion(domain, pixel, mi.Bool(True))
-        values, weights, sides = [], [], []
-        new, old, slot = mi.UInt32(0), mi.UInt32(0), mi.UInt32(0)
-        lanes = []
-        for side in (0, 1) if self.pairs else (0,):
-            active = exists & (domain > 0) if side else exists
-            at = dr.select(active, self._lane(pixel + step, chain), 0) if side else i
-            f, W = dr.gather(mi.Spectrum, found.f, at, active), dr.gather(mi.Float, found.W, at, active)
-            other = mi.Spectrum(0)
-            if partners is not None:
-                shifted = partners.at(dr.select(domain > 0, (2 * domain - 2 + side) * self.n + at, 0))
-                other = shifted.f * shifted.J
-            value = dr.select(active, _value(r, f, other, mi.UInt32(side)), 0)
-            target, rest, density = mi.luminance(value), mi.Float(0), mi.Float(0)
-            if there is not None:
-                place = dr.gather(mi.Point2f, found.record.place, at) + motion
-                rest = self._confidence(domain, mi.Point2i(dr.floor(place)) - step * side)
-                entry = dr.select(domain > 0, 2 * domain - 1 + side, 0) * self.n + at
-                own, far = there.at(entry), there.at(entry, True) if self.pairs else None
-                density = mi.luminance(_value(r, own.f * own.J, far.f * far.J if far else 0, mi.UInt32(side)))
-            weights.append(weigh(one, target, rest, density, target, W)[1])
-            values.append(value)
-            sides.append(mi.UInt32(side))
-            lanes.append(at)
-        candidates = len(values)
-        sources, entries = [], []
-        for corner in range(len(CORNERS)) if kept is not None else ():
-            entry = lane * len(CORNERS) + corner
-            _, _, _, before, source = self._corner(entry)
-            side = dr.gather(mi.UInt32, kept.side, source)
-            own, far = here.at(entry), here.at(entry, True) if self.pairs else None
-            # In the measure of the pixel that the path is in
-            value = _value(r, own.f, far.f * (far.J / own.J) if far else 0, side)
-            value = dr.select(exists & dr.all(dr.isfinite(value)), value, 0)
-            target = mi.luminance(value) * own.J
-            was = mi.luminance(dr.gather(mi.Spectrum, kept.value, source))
-            W = dr.gather(mi.Float, kept.W, source)
-            weights.append(weigh(self._confidence(domain, before), was, one, target, target, W)[1])
-            values.append(value)
-            sides.append(side)
-            sources.append(source)
-            entries.append(entry)
-        chosen, total = choose(weights, u)
-        value, side = values[0], sides[0]
-        for k in range(1, len(values)):
-            value, side = dr.select(chosen == k, values[k], value), dr.select(chosen == k, sides[k], side)
-        new = lanes[0]
-        for k, at in enumerate(lanes):
-            new = dr.select(chosen == k, at, new)
-        record = gather(found.record, new)
+        domain, pixel = (r + 1) // 2, self._pixel(i)
+        exists = self._on_film(pixel + _step(domain))
+        offers = [self._candidate(found, e, r, i, mi.UInt32(side)) for side in range(self.ends)]
+        candidates = len(offers)
         if kept is not None:
-            for k, (source, entry) in enumerate(zip(sources, entries, strict=True)):
-                old, slot = (dr.select(chosen == candidates + k, a, b) for a, b in ((source, old), (entry, slot)))
-            history = gather(kept.record, old)
-            history = history.moved(mi.Point2f(history.place - motion), here.at(slot).geometry)
-            record = select(chosen < candidates, record, history)
-        return Reservoir(record, side, value, weight_of(total, value))
+            offers += [self._history(kept, e, r, lane * len(CORNERS) + k) for k in range(len(CORNERS))]
+        chosen, total = choose([dr.select(exists, offer.weight, 0) for offer in offers], u)
+        best = offers[0]
+        for k, offer in enumerate(offers[1:], 1):
+            best = dr.select(chosen == k, offer, best)
+        record = gather(found.record, dr.select(chosen < candidates, best.source, 0))
+        if kept is not None:
+            old = chosen >= candidates
+            history = gather(kept.record, best.source, old).moved(best.place, best.geometry)
+            record = select(old, history, record)
+        return Reservoir(record, best.side, best.value, weight_of(total, best.value))
+
+    def _candidate(self, found: Candidate, e: _Evaluated, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:
+        """What a pixel's candidate offers: of a pair that of either side."""
+        domain, pixel = (r + 1) // 2, self._pixel(i)
+        at = pixel + _step(domain) * mi.Int32(side)
+        active = self._on_film(at) & ((side == 0) | (domain > 0))
+        source = dr.select(active, self._lane(at, i % self.chain_count), 0)
+        f, W = dr.gather(mi.Spectrum, found.f, source, active), dr.gather(mi.Float, found.W, source, active)
+        other = mi.Spectrum(0)
+        if e.partners is not None:
+            other = e.partners.part((2 * domain - 2 + side) * self.n + source, domain > 0)
+        value = _value(r, f, other, side)
+        target, others = mi.luminance(value), mi.Float(0)
+        if e.there is not None:
+            entry = dr.select(domain > 0, 2 * domain - 1 + side, 0) * self.n + source
+            place = dr.gather(mi.Point2f, found.record.place, source)
+            for wrapped in (False, True):
+                _, before, there = self._before(domain, pixel, side, place, mi.Bool(wrapped))
+                lane = entry + (self.opaque_total if wrapped else 0)
+                density = mi.luminance(_value(r, e.there.part(lane), e.there.part(lane, domain > 0, 1), side))
+                others += dr.select(there, self._confidence(domain, before), 0) * density
+        weight = dr.select(active, weigh(target, others, target, W)[1], 0)
+        return _Offer(value, weight, side, source, dr.gather(mi.Point2f, found.record.place, source), mi.Float(0))
+
+    def _history(self, kept: Reservoir, e: _Evaluated, r: mi.UInt32, lane: mi.UInt32) -> _Offer:
+        """What a reservoir of the frame before offers."""
+        it = self._corner(lane, kept)
+        own, partner = e.here.at(lane), e.here.part(lane, it.domain > 0, 1)
+        # In the measure of the pixel that the path is in
+        value = _value(r, own.f, partner / own.J, it.side)
+        value = dr.select(dr.all(dr.isfinite(value)), value, 0)
+        target = mi.luminance(value) * own.J
+        was = mi.luminance(dr.gather(mi.Spectrum, kept.value, it.source))
+        other = mi.luminance(_value(r, e.elsewhere.part(lane), e.elsewhere.part(lane, it.domain > 0, 1), it.side))
+        others = target + dr.select(it.twice, self._confidence(it.domain, it.other), 0) * other
+        W = dr.gather(mi.Float, kept.W, it.source)
+        _, weight = weigh(self._confidence(it.domain, it.before) * was, others, target, W)
+        return _Offer(value, dr.select(it.good, weight, 0), it.side, it.source, it.place, own.geometry)
 
     def _differences(self, kept: Reservoir) -> tuple[mi.Spectrum, mi.Spectrum]:
         """dx and dy of the paths that pixels have kept, each weighted against its mirror image."""
@@ -370,8 +427,8 @@ class History:
             for side in (0, 1):
                 at = dr.select(exists, self._lane(pixel + step, chain), 0) if side else i
                 f, W = dr.gather(mi.Spectrum, kept.value, at, exists), dr.gather(mi.Float, kept.W, at, exists)
-                shifted = partners.at(dr.opaque(mi.UInt32, (2 * domain + side) * self.lanes) + at)
-                total += dr.select(exists & (W > 0), _pair(f, shifted.f * shifted.J, mi.UInt32(side)) * W, 0)
+                other = partners.part(dr.opaque(mi.UInt32, (2 * domain + side) * self.lanes) + at)
+                total += dr.select(exists & (W > 0), _pair(f, other, mi.UInt32(side)) * W, 0)
             found.append(total)
         return found[0], found[1]
 
@@ -379,6 +436,15 @@ class History:
 def _step(domain: mi.UInt32) -> mi.Point2i:
     """From the first pixel of a pair to the second."""
     return mi.Point2i(dr.select(domain == 1, mi.Int32(1), 0), dr.select(domain == 2, mi.Int32(1), 0))
+
+
+def _same(a: mi.Point2i, b: mi.Point2i) -> mi.Bool:
+    return (a.x == b.x) & (a.y == b.y)
+
+
+def _fraction(place: mi.Point2f) -> mi.Vector2f:
+    """Of a place on the film, that within its pixel."""
+    return mi.Vector2f(place - dr.floor(place))
 
 
 def _across(domain: mi.UInt32, side: mi.UInt32) -> mi.Vector2f:

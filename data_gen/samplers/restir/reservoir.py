@@ -49,16 +49,14 @@ def weight_of(total: mi.Float, value: mi.Spectrum) -> mi.Float:
     return dr.select((target > 0) & dr.isfinite(total), total / target, 0)
 
 
-def weigh(
-    M: mi.Float, own: mi.Float, rest: mi.Float, other: mi.Float, target: mi.Float, W: mi.Float
-) -> tuple[mi.Float, mi.Float]:
+def weigh(own: mi.Float, others: mi.Float, target: mi.Float, W: mi.Float) -> tuple[mi.Float, mi.Float]:
     """The MIS weight of a path by the generalised balance heuristic, and its resampling weight; 0 of what is not.
 
-    ``M``, ``own``      confidence of the reservoir that the path is from, and p̂ of the path there
-    ``rest``, ``other`` the same of the one other place where it could be from, p̂ |J|
-    ``target``, ``W``   p̂ |J| in the pixel that the reservoir is for, and the path's W
+    ``own``         M p̂ of the path in the reservoir that it is from
+    ``others``      the sum of M p̂ |J| of all others that could have found it
+    ``target``, W   p̂ |J| in the pixel that the reservoir is for, and the path's W
     """
-    m = share(M * own, rest * other)
+    m = share(own, others)
     w = m * target * W
     return m, dr.select(dr.isfinite(w) & (w > 0), w, 0)
 
