@@ -26,9 +26,7 @@ def all_outcomes(mi, M, both=False):
 
     a, b, c, u = (
         n.ravel()
-        for n in np.meshgrid(
-            np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS
-        )
+        for n in np.meshgrid(np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS)
     )
     here, there = LIGHT
     probability = FOUND[0][a] * FOUND[1][b] * (FOUND[1][c] if both else 1) / DRAWS
@@ -36,8 +34,12 @@ def all_outcomes(mi, M, both=False):
         [M[0] * here[a], (1 + both) * M[1] * there[a] * JACOBIAN[a], here[a], 1 / FOUND[0][a]],
         # In the measure of the second pixel, |J| of the way back is 1 / J.
         *(
-            [M[1] * there[x], (M[0] * here[x] + both * M[1] * there[x] * JACOBIAN[x]) / JACOBIAN[x]]
-            + [here[x] / JACOBIAN[x], JACOBIAN[x] / FOUND[1][x]]
+            [
+                M[1] * there[x],
+                (M[0] * here[x] + both * M[1] * there[x] * JACOBIAN[x]) / JACOBIAN[x],
+                here[x] / JACOBIAN[x],
+                JACOBIAN[x] / FOUND[1][x],
+            ]
             for x in ((b, c) if both else (b,))
         ),
     ]

@@ -210,7 +210,9 @@ class History:
         self.n, self.chain_count = dr.opaque(mi.UInt32, n), dr.opaque(mi.UInt32, self.chains)
         self.width, self.height = (dr.opaque(mi.Int32, v) for v in self.size)
         self.area = dr.opaque(mi.UInt32, self.size[0] * self.size[1])
-        self.motions = mi.Vector2f(*(mi.Float(np.ascontiguousarray(motions[..., a], np.float32).ravel()) for a in (0, 1)))
+        self.motions = mi.Vector2f(
+            *(mi.Float(np.ascontiguousarray(motions[..., a], np.float32).ravel()) for a in (0, 1))
+        )
         self.confidences = mi.Float(self.confidence.ravel())
 
     def _pixel(self, lane: mi.UInt32) -> mi.Point2i:
@@ -458,6 +460,6 @@ def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
 
 
 def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """What reservoir number ``r`` is of: light, or one sign of a difference; of a path in its pixel and in the other."""
+    """What reservoir number ``r`` is of, light or one sign of a difference: of a path in its pixel and in the other."""
     sign = dr.select(r % 2 == 1, mi.Float(1), -1)
     return dr.select(r == 0, own, part(_pair(own, other, side), sign))
