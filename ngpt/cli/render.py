@@ -8,7 +8,7 @@ from concurrent.futures import as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
-from data_gen.samplers import summaries
+from data_gen.samplers import FRAME_SAMPLERS, summaries
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.cli.frames import filled, frames, targets, varies
 from ngpt.errors import NgptError
@@ -262,7 +262,10 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
 
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)
     memory = args.memory or DEFAULT_MEMORY
-    check_options(spp, args.seed, args.sampler, args.time, memory)
+    sampler = args.sampler
+    if args.sampler in FRAME_SAMPLERS:
+        spp, sampler = args.spp or FRAME_SAMPLERS[args.sampler].spp, "auto"
+    check_options(spp, args.seed, sampler, args.time, memory)
     camera = None
     if args.camera:
         animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")
