@@ -19,6 +19,7 @@ emission that the camera path meets on its way counts as it is. So each path of 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -26,8 +27,10 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
+from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
@@ -35,6 +38,7 @@ from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.photons.copies import faces, light, photon_of
+from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, trace
@@ -51,14 +55,15 @@ class Gathering:
 
     def __init__(self, photons, radius: float, paths: int, max_depth: int):
         self.photons = photons
-        self.grid = Grid(photons.p, photons.depth > 0, radius)
+        on_surfaces = (photons.depth > 0) & (dr.squared_norm(photons.n) > 0)
+        self.grid = Grid(photons.p, on_surfaces, radius)
         # Not within the loops that call light().
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
-    def light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """L(x) at the vertex ``si``, behind ``depth`` edges, of paths that are not too long."""
+    def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
         photons, longest = self.photons, self.max_depth - depth
 
         def one(i, near):
@@ -87,11 +92,11 @@ class Passes:
     @property
     def lane_bytes(self) -> int:
         """Of a camera sample, with all that its light paths may leave in a map."""
-        return self.integrator.camera_bytes + self.integrator.photons * MAP_BYTES
+        return self.integrator.camera_bytes + self.integrator.photons * self.integrator.map_bytes
 
     def instead(self, lane_bytes: int) -> str:
         """What else than a smaller image would fit into so many bytes for each camera sample."""
-        fits = (lane_bytes - self.integrator.camera_bytes) // MAP_BYTES
+        fits = (lane_bytes - self.integrator.camera_bytes) // self.integrator.map_bytes
         return f", or no more than --option photons={fits}" if fits > 0 else ""
 
 
@@ -115,7 +120,8 @@ class PPM(GradientIntegrator):
     """
 
     name = "ppm"
-    camera_bytes = CAMERA_BYTES
+    camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
+    fog: Fog | None = None
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -139,7 +145,6 @@ class PPM(GradientIntegrator):
         ray, importance, _ = camera.rays()
         random = camera.random.clone()
         keys = random.next_key(), random.next_key()
-        radius = self.radius * width * shrunk(camera.first)
         values = features(scene, camera.sensor, camera.random.clone(), ray)
         L, Le = self.camera_path(scene, materials, random.clone(), ray, importance)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
@@ -148,11 +153,16 @@ class PPM(GradientIntegrator):
         if lights.emitters is not None and self.max_depth > 1:
             _, maps = self.photon_maps(scene, lights, materials, keys)
             for photons in maps:
-                near = Gathering(photons, radius, self.photons * dr.width(random.random.state), self.max_depth)
-                L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, near.light)
+                scattered = self.gathering(photons, width, camera.first, self.photons * dr.width(random.random.state))
+                L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, scattered)
                 values["primal"] += to_rgb(L, ray.wavelengths)
                 dr.eval(values["primal"])
         film.put_all(values)
+
+    def gathering(self, photons, width: float, number: int, paths: int):
+        """What is called for the light from the ``photons`` of pass ``number``: see ``camera_path``."""
+        near = Gathering(photons, self.radius * width * shrunk(number), paths, self.max_depth)
+        return near.light
 
     def photon_maps(self, scene, lights, materials, keys):
         """The light's ends and the maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
@@ -161,28 +171,36 @@ class PPM(GradientIntegrator):
         sample = lane // dr.opaque(mi.UInt32, self.photons)
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth)
+        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth, self.fog)
 
     @dr.syntax
     def camera_path(self, scene, materials, random, ray, importance, scattered=None):
         """L of camera paths where light is ``scattered``, or that of emission met if it is None; and Le, seen directly.
 
-        ``scattered`` is called with (vertex, its material, depth, where).
+        ``scattered`` is called with (vertex, its place, its material, depth, where).
         """
-        ray = mi.Ray3f(ray)
-        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
+        ray, fog = mi.Ray3f(ray), self.fog
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
         sky_seen = mi.Bool(not self.hide_emitters)
         shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
-        Le = importance * si.emitter(scene).eval(si, shown)
-        L = dr.zeros(mi.Spectrum, dr.width(ray))
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+        if dr.hint(fog is not None, mode="scalar"):
+            channel, first = media.choose_channel(random.next_1d()), partial(self.first_surface, scene)
+            si, place, weight = fog.ahead(first, ray, fog.within, channel, random, mi.Bool(True))
+            Le = importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
+            β *= weight
+        else:
+            si, place, channel = self.first_hit(scene, ray).compute_surface_interaction(ray), None, None
+            Le = importance * si.emitter(scene).eval(si, shown)
+        L = dr.zeros(mi.Spectrum, dr.width(ray))
         active = si.is_valid() & (depth < self.max_depth)
         while dr.hint(active, label="camera path"):
             bsdf = si.bsdf()
             receives = active & materials.connectable(bsdf)
+            if dr.hint(fog is not None, mode="scalar"):
+                receives |= active & place.scatters
             if dr.hint(scattered is not None, mode="scalar"):
-                L += β * scattered(si, bsdf, depth, receives)
+                L += β * scattered(si, place, bsdf, depth, receives)
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
             kind = event_kind(sample.sampled_type)
@@ -195,7 +213,13 @@ class PPM(GradientIntegrator):
             active = found & (dr.max(β) > 0) & (u_survival < survival)
             β /= survival
             depth += 1
-            si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
+            onward = si.spawn_ray(si.to_world(sample.wo))
+            if dr.hint(fog is not None, mode="scalar"):
+                medium = place.toward(si, onward.d)
+                si, place, weight = fog.ahead(next_surface(scene), onward, medium, channel, random, active)
+                β *= weight
+            else:
+                si = scene.ray_intersect(onward, active)
             if dr.hint(scattered is None, mode="scalar"):
                 met = active & (si.is_valid() | sky_seen)
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)

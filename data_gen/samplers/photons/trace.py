@@ -2,6 +2,9 @@
 
 Paths that are left are moved together after each bounce, in their order. So vertices lie in the map by bounce, then by
 path: the same seed gives the same map. (Slots handed out by a counter would come in the order of threads.)
+
+In media, vertices are where light scatters, too. Their normal is 0, and their power that which is scattered there: the
+sum of it over a volume is σs times the light that goes through, so a camera path brings its transmittance alone.
 """
 
 from __future__ import annotations
@@ -9,14 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, replace
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths import media
+from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
+
+if TYPE_CHECKING:
+    from data_gen.samplers.photons.fog import Fog
 
 # Vertices of a map, for each light path of it. Paths that have more of them go on in another map.
 VERTICES_PER_PATH = 8
@@ -56,6 +64,19 @@ def vertices_class(variant: str) -> type:
     return Vertices
 
 
+@cache
+def vertices_in_media_class(variant: str) -> type:
+    """The same of a scene with media."""
+
+    @dataclass
+    class VerticesInMedia(vertices_class(variant)):  # type: ignore[misc]
+        """23 words a vertex."""
+
+        medium: mi.MediumPtr  # around it
+
+    return VerticesInMedia
+
+
 def trace(
     scene: mi.Scene,
     lights: LightEnds,
@@ -63,19 +84,21 @@ def trace(
     receives: Callable[[mi.BSDFPtr], mi.Bool],
     max_depth: int,
     rr_depth: int,
+    fog: Fog | None = None,
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
-    Light is gathered at materials that it ``receives``. A map has at most VERTICES_PER_PATH vertices for each path, and
+    Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has at most VERTICES_PER_PATH vertices for each path, and
     those of the bounce before its first one once more, as parents. Returns the light's end of all paths, and the maps.
     """
     start = lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
-    dr.eval(start)
+    within = (media.choose_channel(random.next_1d()), fog.around(scene, start.ray.o)) if fog else ()
+    dr.eval(start, within)
     random.schedule_state()
-    return start, _maps(scene, start, random, receives, max_depth, rr_depth)
+    return start, _maps(scene, start, random, receives, max_depth, rr_depth, fog, within)
 
 
-def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: int) -> Iterator[Any]:
+def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: int, fog, within) -> Iterator[Any]:
     paths = dr.width(start.ray.d)
     room = paths * VERTICES_PER_PATH
     ray, β, brightest = start.ray, start.β, dr.rcp(dr.max(start.β))
@@ -89,18 +112,28 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
             dr.gather(type(x), x, lanes) for x in (β, brightest, density, survival, parent)
         )
         random = random.at(lanes)
-        hit = scene.ray_intersect_preliminary(ray)
-        si = hit.compute_surface_interaction(ray)
-        bsdf, exists = si.bsdf(), si.is_valid()
-        depth = dr.select(receives(bsdf), dr.opaque(mi.UInt32, bounce), 0)
-        place = dr.prefix_sum(dr.select(exists, mi.UInt32(1), 0))
-        level = vertices_class(mi.variant())(
+        if fog:
+            channel, medium = (dr.gather(type(x), x, lanes) for x in within)
+            segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, mi.Bool(True))
+            hit, place, β = segment.hit, segment.place, β * segment.weight
+            exists, scatters, around = si.is_valid() & (dr.max(β) > 0), place.scatters, (place.medium,)
+        else:
+            hit = scene.ray_intersect_preliminary(ray)
+            si = hit.compute_surface_interaction(ray)
+            exists, scatters, around = si.is_valid(), mi.Bool(False), ()
+        bsdf = si.bsdf()
+        depth = dr.select(receives(bsdf) | scatters, dr.opaque(mi.UInt32, bounce), 0)
+        row = dr.prefix_sum(dr.select(exists, mi.UInt32(1), 0))
+        level = (vertices_in_media_class if fog else vertices_class)(mi.variant())(
             *(si.p, si.n, ray.d, β, density, survival, depth, parent, hit.t, hit.prim_uv, hit.prim_index),
-            *(hit.shape, hit.instance),
+            *(hit.shape, hit.instance, *around),
         )
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-        sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists)
-        β = β * light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))[0]
+        sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists & ~scatters)
+        f_p, _ = light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))
+        if fog:
+            sample, f_p = media.scattered(si, place, u_lobe, u_direction, sample, f_p)
+        β = β * f_p
         # By what is left of the light that the path began with
         survival = dr.ones(mi.Float, dr.width(lanes))
         if bounce >= rr_depth:
@@ -108,8 +141,10 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
         goes_on = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
         β, density = β / survival, dr.select(event_kind(sample.sampled_type) == SMOOTH, sample.pdf, dr.inf)
         ray = si.spawn_ray(si.to_world(sample.wo))
+        if fog:
+            within = channel, place.toward(si, ray.d)
         random.schedule_state()
-        dr.eval(level, exists, goes_on, place, β, density, survival, ray)
+        dr.eval(level, exists, goes_on, row, β, density, survival, ray, within)
         level = _at(level, dr.compress(exists))
         if not len(level):
             break  # all that was left has escaped
@@ -121,7 +156,7 @@ def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: in
             level.parent = level.parent - dr.opaque(mi.UInt32, size - len(parents))
             levels, size = [parents], len(parents)
         levels.append(level)
-        parent = place + dr.opaque(mi.UInt32, size)
+        parent = row + dr.opaque(mi.UInt32, size)
         size += len(level)
         lanes = dr.compress(goes_on)
         bounce += 1
