@@ -1,4 +1,4 @@
-"""How photons and camera paths go through media, for ``vpm``: where they scatter next, and in what medium they begin."""
+"""How photons and camera paths go through media: where they scatter next, and in what medium they begin."""
 
 from __future__ import annotations
 

@@ -88,8 +88,9 @@ def trace(
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
-    Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has at most VERTICES_PER_PATH vertices for each path, and
-    those of the bounce before its first one once more, as parents. Returns the light's end of all paths, and the maps.
+    Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has at most
+    VERTICES_PER_PATH vertices for each path, and those of the bounce before its first one once more, as parents.
+    Returns the light's end of all paths, and the maps.
     """
     start = lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
     within = (media.choose_channel(random.next_1d()), fog.around(scene, start.ray.o)) if fog else ()

@@ -25,7 +25,7 @@ from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.grid import Grid
-from data_gen.samplers.photons.ppm import PPM, Gathering, Passes, refuse
+from data_gen.samplers.photons.ppm import PPM, Passes, refuse
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, VERTICES_PER_PATH
 from data_gen.scenes.facts import media_of
