@@ -6,7 +6,7 @@ That it repeats its bits, says how noisy it is and stays within its memory is am
 import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import fog
+from data_gen_scenes import _scale, fog
 from test_photons import assert_alike
 from unbiased import light_of_gradients, load, render_ours
 
@@ -32,6 +32,17 @@ def test_small_radii_have_the_image_of_volpath(renderer, name):
 def test_media_within_each_other(renderer):
     """Behind boundaries that bend nothing, along which it is too dark by a share that falls like the radius."""
     alike(renderer, media_scenes.nested, radius=0.2, photons=256, block=16)
+
+
+def test_boundaries_within_one_medium_change_nothing(renderer):
+    """Photons on the other side are of the same medium, and are gathered."""
+
+    def crossed():
+        air = {"type": "ref", "id": "air"}
+        cube = {"type": "cube", "to_world": _scale(0.7), "bsdf": {"type": "null"}, "interior": air, "exterior": air}
+        return media_scenes.haze() | {"cube": cube}
+
+    alike(renderer, crossed, radius=1.0, photons=64)
 
 
 @pytest.mark.parametrize("max_depth", [2, 3])
