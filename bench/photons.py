@@ -19,9 +19,11 @@ from pathlib import Path
 
 import numpy as np
 
+import ngpt
 from bench import panels
 from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
+from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import denoise
 from ngpt.report.display import auto_exposure, to_srgb8
@@ -59,13 +61,15 @@ def main() -> None:
     result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
     rows = []
     for scene in args.scenes:
-        file = args.cache / f"{scene_name(scene)}.npz"
-        if not file.exists():
+        folder = args.cache / scene_name(scene)
+        if not (folder / "row.json").exists():
             row, images = bench_scene(scene, args)
-            args.cache.mkdir(parents=True, exist_ok=True)
-            np.savez(file, json.dumps(row), *images)
-        row, *images = np.load(file).values()
-        row = json.loads(str(row))
+            folder.mkdir(parents=True, exist_ok=True)
+            for i, image in enumerate(images):
+                ngpt.write(folder / f"{i}.exr", np.float32(image), overwrite=True)
+            save(folder / "row.json", row)
+        row = json.loads((folder / "row.json").read_text())
+        images = [read_image(path) for path in sorted(folder.glob("*.exr"))]
         result["scenes"][scene_name(scene)] = row
         rows.append(images)
         save(args.output, result)

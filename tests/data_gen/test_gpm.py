@@ -3,6 +3,7 @@
 That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers.
 """
 
+from itertools import product
 from types import SimpleNamespace
 
 import numpy as np
@@ -231,8 +232,10 @@ def without_glass():
     return scene
 
 
-@pytest.mark.parametrize("pixels", [1, 4])
-@pytest.mark.parametrize("name", ["areas", "sky", "points", "glass"])
+QUICK, SLOW = [("areas", 4), ("glass", 4)], [("areas", 1), ("glass", 1), *product(["sky", "points"], [1, 4])]
+
+
+@pytest.mark.parametrize(("name", "pixels"), QUICK + [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW])
 def test_differences_are_those_of_the_image(renderer, name, pixels):
     """In one pass after another: with the same photons, so that the noise of both falls out in part."""
     scene = load(renderer, without_glass if name == "sky" else SCENES[name], (12, 12))

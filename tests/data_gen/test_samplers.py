@@ -181,7 +181,11 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
     assert not any(np.greater(found, FLOORS).any() for found in gains(renderer, "gpt"))
 
 
-@pytest.mark.parametrize("name", NAMES)
+# 64 renders of it take minutes. Its film is that of ppm.
+SLOW = [pytest.param(name, marks=pytest.mark.slow) if name == "gpm" else name for name in NAMES]
+
+
+@pytest.mark.parametrize("name", SLOW)
 def test_variances_are_those_over_seeds(renderer, name):
     """The law that every weight of a reconstruction rests on."""
     # Where a sample is a pass, few of them: passes of one sample take long to start.
