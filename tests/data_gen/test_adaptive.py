@@ -1,5 +1,7 @@
 """Samples shared out by the error of the result."""
 
+from itertools import count
+
 import numpy as np
 import pytest
 from unbiased import load
@@ -106,10 +108,13 @@ def test_what_a_choice_takes_is_known_ahead(renderer, monkeypatch):
     monkeypatch.setattr(adaptive, "assess", slow)
     monkeypatch.setattr(adaptive, "_PART", 40)
     scene = load(renderer, "diffuse", (100, 80))
+    # A clock on which all takes long: nothing is begun when time is over.
+    clock = count()
+    monkeypatch.setattr(adaptive.time, "perf_counter", lambda: float(next(clock)))
     stack = render(renderer, None, 0, scene, "primal", method="primal", seconds=0.1)
-    assert not calls and stack.attributes["ngpt:spp"] == 16  # nothing is begun when time is over
+    assert not calls and stack.attributes["ngpt:spp"] == 16
     stack = GradientStack({"primal": np.ones((80, 100, 3), np.float32)})
-    # A clock on which the method takes 20 us a pixel.
+    # And one on which the method takes 20 us a pixel.
     monkeypatch.setattr(adaptive.time, "perf_counter", lambda: 2e-5 * sum(calls))
     assert adaptive.seconds_to_assess(stack, "primal") == pytest.approx(0.16) and calls == [100, 1600]
     assert adaptive.seconds_to_assess(GradientStack({"primal": stack["primal"][:79, :80]}), "primal") == 0.0
