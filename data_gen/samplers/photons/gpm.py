@@ -80,19 +80,22 @@ class GPM(PPM):
         # The primal, the four Δ, and how many photons were gathered and had no copy
         sums = [dr.zeros(mi.Spectrum, n) for _ in range(1 + len(SHIFTS))] + [dr.zeros(mi.Point2f, n)]
         Le = mi.Spectrum(0)
-        for level in walk():
-            if level.depth > 1:
-                add_to(sums, level.lanes, emitted(scene, level))
-            elif self.max_depth > 0:
-                Le = level.base.emission(scene)
+        starts, maps = None, iter(())
         if lights.emitters is not None and self.max_depth > 1:
             starts, maps = self.photon_maps(scene, lights, materials, keys)
-            for photons in maps:
-                gathering = WithCopies(scene, lights, materials, starts, photons, radius, self.photons * n)
-                for level in walk():
-                    if level.depth < self.max_depth:
-                        for part in gathering.differences(level, self.max_depth - level.depth, PAIRS * n):
-                            add_to(sums, level.lanes, part)
+        # Emission that camera paths meet is counted with the first map, or without any.
+        photons, emission = next(maps, None), True
+        while photons is not None or emission:
+            near = photons and WithCopies(scene, lights, materials, starts, photons, radius, self.photons * n)
+            for level in walk():
+                if emission and level.depth > 1:
+                    add_to(sums, level.lanes, emitted(scene, level))
+                elif emission and self.max_depth > 0:
+                    Le = level.base.emission(scene)
+                if near and level.depth < self.max_depth:
+                    for part in near.differences(level, self.max_depth - level.depth, PAIRS * n):
+                        add_to(sums, level.lanes, part)
+            photons, emission = next(maps, None), False
         L, *Δ, counts = sums
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         if self.diagnostics:

@@ -146,18 +146,26 @@ class PPM(GradientIntegrator):
         random = camera.random.clone()
         keys = random.next_key(), random.next_key()
         values = features(scene, camera.sensor, camera.random.clone(), ray)
-        L, Le = self.camera_path(scene, materials, random.clone(), ray, importance)
+        random.schedule_state()
+        dr.eval(values)
+        near = self.gatherings(scene, lights, materials, keys, width, camera.first)
+        # Emission that camera paths meet is counted with the first map, or without any.
+        scattered = next(near, None)
+        L, Le = self.camera_path(scene, materials, random.clone(), ray, importance, scattered)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
-        random.schedule_state()
+        for scattered in near:
+            L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission=False)
+            values["primal"] += to_rgb(L, ray.wavelengths)
+            dr.eval(values["primal"])
+        film.put_all(values)
+
+    def gatherings(self, scene, lights, materials, keys, width: float, number: int):
+        """What is called for the light from each of the photon maps of pass ``number``."""
         if lights.emitters is not None and self.max_depth > 1:
             _, maps = self.photon_maps(scene, lights, materials, keys)
             for photons in maps:
-                scattered = self.gathering(photons, width, camera.first, self.photons * dr.width(random.random.state))
-                L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, scattered)
-                values["primal"] += to_rgb(L, ray.wavelengths)
-                dr.eval(values["primal"])
-        film.put_all(values)
+                yield self.gathering(photons, width, number, self.photons * dr.width(keys[0]))
 
     def gathering(self, photons, width: float, number: int, paths: int):
         """What is called for the light from the ``photons`` of pass ``number``: see ``camera_path``."""
@@ -174,10 +182,10 @@ class PPM(GradientIntegrator):
         return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth, self.fog)
 
     @dr.syntax
-    def camera_path(self, scene, materials, random, ray, importance, scattered=None):
-        """L of camera paths where light is ``scattered``, or that of emission met if it is None; and Le, seen directly.
+    def camera_path(self, scene, materials, random, ray, importance, scattered, emission=True):
+        """L of camera paths: where light is ``scattered``, and ``emission`` that they meet; and Le, seen directly.
 
-        ``scattered`` is called with (vertex, its place, its material, depth, where).
+        ``scattered`` is called with (vertex, its place, its material, depth, where), unless it is None.
         """
         ray, fog = mi.Ray3f(ray), self.fog
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
@@ -220,7 +228,7 @@ class PPM(GradientIntegrator):
                 β *= weight
             else:
                 si = scene.ray_intersect(onward, active)
-            if dr.hint(scattered is None, mode="scalar"):
+            if dr.hint(emission, mode="scalar"):
                 met = active & (si.is_valid() | sky_seen)
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
             active &= si.is_valid() & (depth < self.max_depth)
