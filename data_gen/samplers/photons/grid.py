@@ -7,6 +7,8 @@ the photons of a point in the order of the list: sums have the same bits every t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,23 +18,35 @@ _CELLS_PER_PHOTON = 4
 _LEAST_CELLS = 1 << 12
 
 
+@dataclass(init=False)
 class Grid:
     """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
 
     ``points`` are all points, of which those that ``exist`` are entered; ``radius`` is the largest that is asked for.
     """
 
+    low: mi.Point3f
+    rate: mi.Float  # cells in a unit of length
+    n: mi.Vector3u
+    start: mi.UInt32
+    index: mi.UInt32
+    p: mi.Point3f
+
     def __init__(self, points: mi.Point3f, exist: mi.Bool, radius: float):
         index = dr.compress(exist)
-        p = dr.gather(mi.Point3f, points, index)
-        self.size = dr.width(index)
-        if not self.size:
+        if not dr.width(index):
+            # No point in any cell; and one in no cell, since arrays have something in them.
+            self.low, self.rate, self.n = dr.opaque(mi.Point3f, 0), dr.opaque(mi.Float, 1), dr.opaque(mi.Vector3u, 3)
+            self.start, self.index, self.p = dr.zeros(mi.UInt32, 28), dr.zeros(mi.UInt32, 1), dr.zeros(mi.Point3f, 1)
+            dr.eval(self.start, self.index, self.p)
             return
+        p = dr.gather(mi.Point3f, points, index)
         low, high = (np.array([f(axis)[0] for axis in p], np.float64) for f in (dr.min, dr.max))
-        self.edge, cells = self.cells(high - low, 2 * radius, max(_LEAST_CELLS, _CELLS_PER_PHOTON * self.size))
+        most = max(_LEAST_CELLS, _CELLS_PER_PHOTON * dr.width(index))
+        edge, cells = self.cells(high - low, 2 * radius, most)
         # Half a cell of room on all sides: the cells of a ball around any of the points are in the grid.
-        self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - self.edge))
-        self.rate = dr.opaque(mi.Float, 1 / self.edge)
+        self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - edge))
+        self.rate = dr.opaque(mi.Float, 1 / edge)
         self.n = mi.Vector3u(*(dr.opaque(mi.UInt32, int(n)) for n in cells))
         key = self.linear(*(mi.UInt32((q - o) * self.rate) for q, o in zip(p, self.low, strict=True)))
         counts = dr.zeros(mi.UInt32, int(np.prod(cells)) + 1)
@@ -69,9 +83,6 @@ class Grid:
 
         ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops.
         """
-        if not self.size:
-            return state
-
         def step(k, i, end, state):
             at = i < end
             near = at & (dr.squared_norm(dr.gather(mi.Point3f, self.p, i, at) - p) < radius2)

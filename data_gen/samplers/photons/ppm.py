@@ -18,8 +18,9 @@ emission that the camera path meets on its way counts as it is. So each path of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -39,6 +40,7 @@ from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.photons.copies import faces, light, photon_of
 from data_gen.samplers.photons.fog import Fog
+from data_gen.samplers.photons.frozen import Frozen
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, trace
@@ -50,14 +52,20 @@ CAMERA_BYTES = 256
 _LIGHT_PATHS = 0x9807
 
 
+@dataclass(init=False)
 class Gathering:
     """The photons of a map, where they are gathered within ``radius``; ``paths`` light paths have brought them."""
+
+    photons: Any
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float
+    max_depth: mi.UInt32
 
     def __init__(self, photons, radius: float, paths: int, max_depth: int):
         self.photons = photons
         on_surfaces = (photons.depth > 0) & (dr.squared_norm(photons.n) > 0)
         self.grid = Grid(photons.p, on_surfaces, radius)
-        # Not within the loops that call light().
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
@@ -85,9 +93,13 @@ class Passes:
     lights: LightEnds
     materials: Materials
     width: float  # of a pixel
+    frozen: Frozen = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        self.integrator.sample_pass(self.scene, self.lights, self.materials, self.width, camera, film)
+        self.integrator.sample_pass(self, camera, film)
 
     @property
     def lane_bytes(self) -> int:
@@ -140,49 +152,49 @@ class PPM(GradientIntegrator):
         lights, materials = LightEnds(scene, self.name), Materials(scene, self.threshold)
         return Passes(self, scene, lights, materials, pixel_width(scene))
 
-    def sample_pass(self, scene, lights, materials, width: float, camera: CameraSamples, film: GradientFilm) -> None:
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path for each camera sample, of which a pixel has one."""
-        ray, importance, _ = camera.rays()
-        random = camera.random.clone()
-        keys = random.next_key(), random.next_key()
-        values = features(scene, camera.sensor, camera.random.clone(), ray)
-        random.schedule_state()
-        dr.eval(values)
-        near = self.gatherings(scene, lights, materials, keys, width, camera.first)
+        ray, importance, random, keys, values = begin(passes, camera)
+        near = self.gatherings(passes, keys, camera.first)
         # Emission that camera paths meet is counted with the first map, or without any.
-        scattered = next(near, None)
-        L, Le = self.camera_path(scene, materials, random.clone(), ray, importance, scattered)
+        paths = passes.scene, passes.materials, random, ray, importance
+        L, Le = passes.frozen(self.light, *paths, next(near, None), True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
         for scattered in near:
-            L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission=False)
+            L, _ = passes.frozen(self.light, *paths, scattered, False)
             values["primal"] += to_rgb(L, ray.wavelengths)
             dr.eval(values["primal"])
         film.put_all(values)
 
-    def gatherings(self, scene, lights, materials, keys, width: float, number: int):
-        """What is called for the light from each of the photon maps of pass ``number``."""
-        if lights.emitters is not None and self.max_depth > 1:
-            _, maps = self.photon_maps(scene, lights, materials, keys)
+    def gatherings(self, passes: Passes, keys, number: int):
+        """What light is gathered from in each of the photon maps of pass ``number``."""
+        if passes.lights.emitters is not None and self.max_depth > 1:
+            _, maps = self.photon_maps(passes, keys)
             for photons in maps:
-                yield self.gathering(photons, width, number, self.photons * dr.width(keys[0]))
+                yield self.gathering(photons, passes.width, number, self.photons * dr.width(keys[0]))
 
     def gathering(self, photons, width: float, number: int, paths: int):
-        """What is called for the light from the ``photons`` of pass ``number``: see ``camera_path``."""
-        near = Gathering(photons, self.radius * width * shrunk(number), paths, self.max_depth)
-        return near.light
+        """The ``photons`` of pass ``number`` where they are gathered, of so many light paths."""
+        return Gathering(photons, self.radius * width * shrunk(number), paths, self.max_depth)
 
-    def photon_maps(self, scene, lights, materials, keys):
+    def photon_maps(self, passes: Passes, keys):
         """The light's ends and the maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
         n = dr.width(keys[0]) * self.photons
         lane = dr.arange(mi.UInt32, n)
         sample = lane // dr.opaque(mi.UInt32, self.photons)
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth, self.fog)
+        receives, depths = passes.materials.connectable, (self.max_depth - 1, self.rr_depth)
+        return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen)
+
+    def light(self, scene, materials, random, ray, importance, near, emission: bool):
+        """L and Le of camera paths, with what is gathered from the photons ``near``, and with ``emission`` or without."""
+        scattered = near.light if near is not None else None
+        return self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission)
 
     @dr.syntax
-    def camera_path(self, scene, materials, random, ray, importance, scattered, emission=True):
+    def camera_path(self, scene, materials, random, ray, importance, scattered, emission: bool):
         """L of camera paths: where light is ``scattered``, and ``emission`` that they meet; and Le, seen directly.
 
         ``scattered`` is called with (vertex, its place, its material, depth, where), unless it is None.
@@ -233,6 +245,17 @@ class PPM(GradientIntegrator):
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
             active &= si.is_valid() & (depth < self.max_depth)
         return L, Le
+
+
+def begin(passes: Passes, camera: CameraSamples) -> tuple:
+    """Rays and importance of camera samples, the random numbers of their paths, two keys, and the layers of features."""
+    ray, importance, _ = camera.rays()
+    random = camera.random.clone()
+    keys = random.next_key(), random.next_key()
+    random.schedule_state()
+    dr.eval(ray, importance, keys)
+    values = passes.frozen(features, passes.scene, camera.sensor, camera.random, ray)
+    return ray, importance, random, keys, values
 
 
 def refuse(scene, sampler: str) -> None:

@@ -100,17 +100,17 @@ def trace(
     max_depth: int,
     rr_depth: int,
     fog: Fog | None = None,
+    frozen: Callable = lambda f, *args: f(*args),
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
     Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has VERTICES_PER_PATH
     places for each path; further maps are of those paths alone that go on, and begin with their last vertex, as parent.
-    Returns the light's end of all paths, and the maps.
+    ``frozen`` calls the functions that make kernels. Returns the light's end of all paths, and the maps.
     """
-    start = lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
-    within = (media.choose_channel(random.next_1d()), fog.around(scene, start.ray.o)) if fog else ()
-    dr.eval(start, within)
-    random.schedule_state()
+    start, within, numbers = frozen(_start, scene, lights, random, fog)
+    dr.eval(start, within, numbers)
+    random = type(random)(numbers)
     n = dr.width(start.ray.d)
     paths = _Paths(
         *(mi.Ray3f(start.ray.o, start.ray.d), start.β, dr.rcp(dr.max(start.β))),
@@ -119,10 +119,18 @@ def trace(
     )
     depths = dr.opaque(mi.UInt32, min(max(max_depth, 0), 0xFFFFFFFF)), dr.opaque(mi.UInt32, rr_depth)
     paths.alive &= paths.bounce <= depths[0]
-    return start, _maps(scene, paths, random, receives, depths, fog)
+    return start, _maps(scene, paths, random, receives, depths, fog, frozen)
 
 
-def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog) -> Iterator[Any]:
+def _start(scene, lights: LightEnds, random, fog) -> tuple:
+    """Where light paths begin, what of media is known there, and their random numbers from then on."""
+    random = random.clone()
+    start = lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
+    within = (media.choose_channel(random.next_1d()), fog.around(scene, start.ray.o)) if fog else ()
+    return start, within, random.random
+
+
+def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen) -> Iterator[Any]:
     kind = (vertices_in_media_class if fog else vertices_class)(mi.variant())
     map_before = None
     while dr.width(lanes := dr.compress(paths.alive)):
@@ -140,16 +148,17 @@ def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog) -> Iterato
             vertex.depth = dr.zeros(mi.UInt32, len(vertex))
             _put(photons, vertex, place, True)
             paths.parent, place = place, place + 1
-        paths = _walk(scene, paths, random, receives, depths, fog, photons, place, end)
-        random.schedule_state()
-        dr.eval(paths, photons)
+        paths, numbers, photons = frozen(_walk, scene, paths, random, receives, depths, fog, photons, place, end)
+        dr.eval(paths, numbers, photons)
+        random = type(random)(numbers)
         map_before = photons
         yield photons
 
 
 @dr.syntax
-def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, place, end) -> _Paths:
+def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, place, end) -> tuple:
     """Enters vertices at each path's places, from ``place`` up to ``end``; paths still alive then have more of them."""
+    random = random.clone()
     ray, β, density, survival = mi.Ray3f(paths.ray), paths.β, paths.density, paths.survival
     parent, bounce, alive, within = mi.UInt32(paths.parent), mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.within
     brightest, (max_depth, rr_depth) = paths.brightest, depths
@@ -186,7 +195,7 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
             within = channel, where.toward(si, ray.d)
         bounce += 1
         alive &= bounce <= max_depth
-    return _Paths(ray, β, brightest, density, survival, parent, bounce, alive, within)
+    return _Paths(ray, β, brightest, density, survival, parent, bounce, alive, within), random.random, photons
 
 
 def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f:

@@ -14,6 +14,9 @@ Maps"; Knaus and Zwicker 2011, section 5]
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -25,14 +28,21 @@ from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.grid import Grid
-from data_gen.samplers.photons.ppm import PPM, Passes, refuse
+from data_gen.samplers.photons.ppm import PPM, Gathering, Passes, refuse
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, VERTICES_PER_PATH
 from data_gen.scenes.facts import media_of
 
 
+@dataclass(init=False)
 class GatheringInMedia:
     """The photons of a map in media, gathered within ``radius``; ``paths`` light paths have brought them."""
+
+    photons: Any
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float
+    max_depth: mi.UInt32
 
     def __init__(self, photons, radius: float, paths: int, max_depth: int):
         self.photons = photons
@@ -57,6 +67,19 @@ class GatheringInMedia:
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         return self.K * self.grid.gather(x.p, self.radius2, active, one, zero)
+
+
+@dataclass
+class Both:
+    """Photons on surfaces, and photons in media."""
+
+    on_surfaces: Gathering
+    in_media: GatheringInMedia
+
+    def light(self, x, place: media.Place, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        scatters = active & place.scatters
+        L = self.in_media.light(x, place, depth, scatters)
+        return L + self.on_surfaces.light(x, place, bsdf, depth, active & ~place.scatters)
 
 
 class VPM(PPM):
@@ -87,14 +110,7 @@ class VPM(PPM):
         if self.fog is None:
             return on_surfaces
         radius = self.radius * width * shrunk(number, 3)
-        within = GatheringInMedia(photons, radius, paths, self.max_depth)
-
-        def light(x, place: media.Place, bsdf, depth, active) -> mi.Spectrum:
-            scatters = active & place.scatters
-            L = within.light(x, place, depth, scatters)
-            return L + on_surfaces(x, place, bsdf, depth, active & ~place.scatters)
-
-        return light
+        return Both(on_surfaces, GatheringInMedia(photons, radius, paths, self.max_depth))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:
