@@ -189,7 +189,7 @@ class PPM(GradientIntegrator):
         return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen)
 
     def light(self, scene, materials, random, ray, importance, near, emission: bool):
-        """L and Le of camera paths, with what is gathered from the photons ``near``, and with ``emission`` or without."""
+        """L and Le of camera paths, with what is gathered from photons ``near``, and with ``emission`` or without."""
         scattered = near.light if near is not None else None
         return self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission)
 
@@ -248,7 +248,7 @@ class PPM(GradientIntegrator):
 
 
 def begin(passes: Passes, camera: CameraSamples) -> tuple:
-    """Rays and importance of camera samples, the random numbers of their paths, two keys, and the layers of features."""
+    """Rays and importance of camera samples, random numbers of their paths, two keys, and the layers of features."""
     ray, importance, _ = camera.rays()
     random = camera.random.clone()
     keys = random.next_key(), random.next_key()

@@ -22,6 +22,7 @@ from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
+from data_gen.samplers.photons.frozen import call
 
 if TYPE_CHECKING:
     from data_gen.samplers.photons.fog import Fog
@@ -100,7 +101,7 @@ def trace(
     max_depth: int,
     rr_depth: int,
     fog: Fog | None = None,
-    frozen: Callable = lambda f, *args: f(*args),
+    frozen: Callable = call,
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
