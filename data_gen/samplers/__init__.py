@@ -128,11 +128,11 @@ def _refused_but_for_surfaces(facts: Facts, name: str) -> str:
     return ""
 
 
-def _refused_by_vpm(facts: Facts) -> str:
+def _refused_but_for_media(facts: Facts, name: str) -> str:
     if facts.polarised:
-        return f"variant '{facts.polarised}' is polarised, which 'vpm' does not follow"
+        return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow"
     if facts.integrator not in VOLUMETRIC:
-        return f"the integrator is '{facts.integrator}', and 'vpm' knows only 'volpath' and 'volpathmis'"
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'volpath' and 'volpathmis'"
     if not facts.media:
         return "there are no media, and 'ppm' has the same image"
     return ""
@@ -182,7 +182,7 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _BRE, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -193,6 +193,7 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _PRIMAL = (
         "photons.ppm",
         "photons.gpm",
         "photons.vpm",
+        "photons.bre",
         "primal",
     )
 )
@@ -293,7 +294,7 @@ for _sampler in (
         "vpm",
         "photons in media and on surfaces, without gradients (caustics in fog, beams of lamps in haze)",
         _from_module(_VPM),
-        _refused_by_vpm,
+        lambda facts: _refused_but_for_media(facts, "vpm"),
         _notes_on_photons,
         _PHOTON_OPTIONS,
         gradients=False,
@@ -301,6 +302,19 @@ for _sampler in (
         batch=1,
         biased=True,
         module=_VPM,
+    ),
+    Sampler(
+        "bre",
+        "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
+        _from_module(_BRE),
+        lambda facts: _refused_but_for_media(facts, "bre"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS,
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_BRE,
     ),
     Sampler(
         "primal",
