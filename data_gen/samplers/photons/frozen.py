@@ -25,10 +25,16 @@ class Frozen:
         self.functions: dict[Callable, Callable] = {}
 
     def __call__(self, f: Callable, *args: Any) -> Any:
-        if f not in self.functions:
-            # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-            self.functions[f] = dr.freeze(f, state_fn=lambda *_: self.state, warn_after=1 << 30)
-        return self.functions[f](*args)
+        if f in self.functions:
+            return self.functions[f](*args)
+        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+        self.functions[f] = dr.freeze(f, state_fn=lambda *_: self.state, warn_after=1 << 30)
+        try:
+            return self.functions[f](*args)
+        except RuntimeError:
+            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does.
+            self.functions[f] = f
+            return f(*args)
 
 
 def call(f: Callable, *args: Any) -> Any:
@@ -40,7 +46,7 @@ def arrays(owner: Any) -> list:
     """The arrays in the attributes of an object, and of objects there."""
     found: list = []
     for value in vars(owner).values() if hasattr(owner, "__dict__") else ():
-        if dr.is_jit_v(value):
+        if value is not None and dr.is_jit_v(value):
             found.append(value)
         elif type(value).__module__.startswith("data_gen."):
             found += arrays(value)
