@@ -116,6 +116,35 @@ def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
         assert np.abs(p[parent[some]] + (d * t[:, None] - p)[some]).max(initial=0) < 1e-3
 
 
+def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch):
+    """As if they were recorded in each pass."""
+    from data_gen.film import GradientFilm
+    from data_gen.passes import recording
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.samplers import find
+    from data_gen.samplers.photons.frozen import Frozen
+
+    scene = load(renderer, "diffuse", (16, 12))
+    sensor = scene.sensors()[0]
+
+    def rendered():
+        passes, film = find("gpm").make(scene), GradientFilm(16, 12, batches=True)
+        with recording():
+            for i in range(3):
+                passes(CameraSamples(sensor, 3, 1, i), film)
+                film.end_pass(1)
+        return passes.frozen.functions, film.develop()
+
+    functions, layers = rendered()
+    # A function is recorded again where two arrays happen to be of one size, or of size 1.
+    assert len(functions) > 8 and sum(f.n_recordings for f in functions.values()) <= len(functions) + 2
+    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args: f(*args))
+    functions, others = rendered()
+    assert not functions and layers.keys() == others.keys()
+    for name in layers:
+        assert np.array_equal(layers[name], others[name]), name
+
+
 def test_radii_shrink_as_told():
     from data_gen.samplers.photons.radius import ALPHA, shrunk
 
