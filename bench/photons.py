@@ -9,8 +9,9 @@ photons, in two halves with their own seeds, of --reference-spp passes each with
 within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
 on the photons' side. Errors are the trimmed relMSE.
 
-Scenes with media have `bre` for `ppm`, and `vpm`. With --by-paths the reference is of path tracing, which is right where
-paths find the light. The picture has a row for each scene of surfaces alone. Scenes that are in the cache are not rendered again.
+Scenes with media have `bre` for `ppm`, and `vpm`. With --by-paths the reference is of path tracing, which is right
+where paths find the light. The picture has a row for each scene of surfaces alone. Scenes that are in the cache are not
+rendered again.
 """
 
 import argparse

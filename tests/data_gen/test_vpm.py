@@ -23,12 +23,16 @@ def alike(renderer, scene, radius=0.4, photons=128, block=4):
     assert_alike(images, references, block)
 
 
-@pytest.mark.parametrize("name", ["haze", "forward", "colours", "milk"])
+SLOW = (pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "colours"))
+
+
+@pytest.mark.parametrize("name", ["haze", "milk", *SLOW])
 def test_small_radii_have_the_image_of_volpath(renderer, name):
     """One phase function or another, colours apart, liquids in clear and in frosted glass."""
     alike(renderer, getattr(media_scenes, name))
 
 
+@pytest.mark.slow
 def test_media_within_each_other(renderer):
     """Behind boundaries that bend nothing, along which it is too dark by a share that falls like the radius."""
     alike(renderer, media_scenes.nested, radius=0.2, photons=256, block=16)
@@ -45,7 +49,7 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
     alike(renderer, crossed, radius=1.0, photons=64)
 
 
-@pytest.mark.parametrize("max_depth", [2, 3])
+@pytest.mark.parametrize("max_depth", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_paths_in_media_are_no_longer_than_the_scene_says(renderer, max_depth):
     def short():
         scene = media_scenes.haze()
