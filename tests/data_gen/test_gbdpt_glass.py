@@ -235,9 +235,9 @@ def test_what_is_bent_is_shifted_by_the_second_kernel(renderer, monkeypatch):
     import drjit as dr
 
     from data_gen.render import render_stack
-    from data_gen.samplers.gbdpt import integrator
+    from data_gen.samplers.gbdpt import light_shift
 
-    found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, integrator.differences
+    found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, light_shift.differences
 
     def counted(scene, plan, camera, path, first_hit, lit, bent=False):
         # A light path without a vertex of its own to come from is the light's.
@@ -245,7 +245,7 @@ def test_what_is_bent_is_shifted_by_the_second_kernel(renderer, monkeypatch):
         dr.scatter_add(found[bent], 1, 0, (dr.max(path.C) > 0) & (path.events != 0) & path.allowed & there)
         return differences(scene, plan, camera, path, first_hit, lit, bent)
 
-    monkeypatch.setattr(integrator, "differences", counted)
+    monkeypatch.setattr(light_shift, "differences", counted)
     stack = render_stack(load(renderer, by_a_wall, (32, 32)), 64, 3, "gbdpt")
     first, again = (int(np.array(found[bent])[0]) for bent in (False, True))
     # 293 and 39 of 1120 where the vertex before was another's.
