@@ -9,7 +9,9 @@ photons, in two halves with their own seeds, of --reference-spp passes each with
 within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
 on the photons' side. Errors are the trimmed relMSE.
 
-The picture has a row for each scene. Scenes that are in the cache are not rendered again.
+Scenes with media have `bre` for `ppm`, and `vpm`. With --by-paths the reference is of path tracing, which is right
+where paths find the light. The picture has a row for each scene of surfaces alone. Scenes that are in the cache are not
+rendered again.
 """
 
 import argparse
@@ -35,6 +37,13 @@ METHODS = {
     "gpt": ("l1", "wcv"),
     "primal": ("oidn",),
 }
+METHODS_IN_MEDIA = {
+    "bre": ("primal", "oidn"),
+    "vpm": ("primal", "oidn"),
+    "gpt": ("l1", "wcv"),
+    "primal": ("primal", "oidn"),
+}
+PHOTONS = ("ppm", "gpm", "vpm", "bre")
 SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
 REFERENCE = {"radius": 1.0, "photons": 16}
@@ -47,6 +56,7 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
+    parser.add_argument("--by-paths", action="store_true", help="the reference by path tracing")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
     parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
@@ -71,34 +81,39 @@ def main() -> None:
         row = json.loads((folder / "row.json").read_text())
         images = [read_image(path) for path in sorted(folder.glob("*.exr"))]
         result["scenes"][scene_name(scene)] = row
-        rows.append(images)
+        if len(images) > len(SHOWN):
+            rows.append(images)
         save(args.output, result)
         print(scene_name(scene), row, flush=True)
-        if args.picture:
+        if args.picture and rows:
             panels.save(args.picture, picture(rows, result["scenes"]))
 
 
 def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndarray]]:
     """Sampler -> samples and errors by method; and what the picture shows."""
     from data_gen.render import render_stack
+    from data_gen.scenes.facts import media_of
     from data_gen.scenes.load import load_scene
 
     scene = load_scene(path, tuple(args.size))
+    foggy = bool(media_of(scene))
+    by = "primal" if args.by_paths else "bre" if foggy else "ppm"
+    options = REFERENCE if by != "primal" else {}
     halves = [
-        render_stack(scene, args.reference_spp, 1 << 20 | i, "ppm", **REFERENCE)["primal"].astype(np.float64)
+        render_stack(scene, args.reference_spp, 1 << 20 | i, by, **options)["primal"].astype(np.float64)
         for i in range(2)
     ]
     row: dict = {"error of half a reference": relmse_trimmed(halves[0], halves[1])}
     shown = {}
-    for sampler, methods in METHODS.items():
-        options = {"radius": args.radius, "photons": args.photons} if sampler in ("ppm", "gpm") else {}
+    for sampler, methods in (METHODS_IN_MEDIA if foggy else METHODS).items():
+        options = {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
         spp = samples_within(scene, sampler, args.seconds, options)
         stack = render_stack(scene, spp, 0, sampler, **options)
         row[sampler] = {"spp": spp}
         for method in methods:
             image = shown[sampler, method] = denoise(stack, method)
             row[sampler][method] = float(f"{relmse_trimmed(image, *halves):.4g}")
-    return row, [shown[which] for which in SHOWN] + [(halves[0] + halves[1]) / 2]
+    return row, [shown[which] for which in SHOWN if which in shown] + [(halves[0] + halves[1]) / 2]
 
 
 def samples_within(scene, sampler: str, seconds: float, options: dict) -> int:
@@ -110,7 +125,7 @@ def samples_within(scene, sampler: str, seconds: float, options: dict) -> int:
         render_stack(scene, spp, 1, sampler, **options)
         return time.process_time() - start
 
-    few, many = (2, 8) if sampler in ("ppm", "gpm") else (16, 64)
+    few, many = (2, 8) if sampler in PHOTONS else (16, 64)
     cost(few)  # compiles the kernels
     fixed = cost(few)
     each = max(cost(many) - fixed, 1e-3) / (many - few)

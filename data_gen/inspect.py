@@ -16,6 +16,10 @@ from ngpt.errors import NgptError
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
 _MIRRORS = ("conductor", "dielectric", "thindielectric")
 _POINTS = ("point", "spot", "directional", "projector")
+# What light goes through and is focussed by, so that no connection finds it behind
+_LENSES = ("dielectric", "roughdielectric")
+# Samplers by photons, first the ones without gradients
+_PHOTONS = ("ppm", "gpm", "bre")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
@@ -81,6 +85,15 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         )
     if facts.mirrors:
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
+    if any(name in plugins["BSDF"] for name in _LENSES):
+        points = any(name in _POINTS for name in plugins["Emitter"])
+        able = [f"`--sampler {name}`" for name in _PHOTONS if not SAMPLERS[name].refuses(facts)]
+        if able:
+            lines.append(
+                "glass: the light behind it, where that is seen in mirrors or through glass, "
+                + ("is found by photons alone for lights without size: " if points else "is found best by photons: ")
+                + ", ".join(able)
+            )
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
         lines.append("holes: features are those of what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):

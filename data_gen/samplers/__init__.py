@@ -155,6 +155,16 @@ def _refused_but_for_surfaces(facts: Facts, name: str) -> str:
     return ""
 
 
+def _refused_but_for_media(facts: Facts, name: str) -> str:
+    if facts.polarised:
+        return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow"
+    if facts.integrator not in VOLUMETRIC:
+        return f"the integrator is '{facts.integrator}', and '{name}' knows only 'volpath' and 'volpathmis'"
+    if not facts.media:
+        return "there are no media, and 'ppm' has the same image"
+    return ""
+
+
 def _refused_by_gpt_simple(facts: Facts) -> str:
     mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
     return _refused_but_for_surfaces(facts, "gpt-simple") or mirrors
@@ -199,7 +209,7 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _BRE, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -209,6 +219,8 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _PRIMAL = (
         "gbdpt.integrator",
         "photons.ppm",
         "photons.gpm",
+        "photons.vpm",
+        "photons.bre",
         "primal",
     )
 )
@@ -288,7 +300,6 @@ for _sampler in (
         _notes_on_photons,
         _PHOTON_OPTIONS,
         gradients=False,
-        tried=False,
         batch=1,
         biased=True,
         module=_PPM,
@@ -300,10 +311,35 @@ for _sampler in (
         lambda facts: _refused_but_for_surfaces(facts, "gpm"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
-        tried=False,
         batch=1,
         biased=True,
         module=_GPM,
+    ),
+    Sampler(
+        "vpm",
+        "photons in media and on surfaces, without gradients (caustics in fog, beams of lamps in haze)",
+        _from_module(_VPM),
+        lambda facts: _refused_but_for_media(facts, "vpm"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS,
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_VPM,
+    ),
+    Sampler(
+        "bre",
+        "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
+        _from_module(_BRE),
+        lambda facts: _refused_but_for_media(facts, "bre"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS,
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_BRE,
     ),
     Sampler(
         "primal",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -10,6 +11,8 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
+from data_gen.paths import segments
+from data_gen.paths.media import Media
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
@@ -71,6 +74,23 @@ class GradientIntegrator(mi.SamplingIntegrator):
             si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
             hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
         return hit
+
+    def first_surface(self, scene, ray, medium, active) -> mi.PreliminaryIntersection3f:
+        """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
+        hit = self.first_hit(scene, ray, active)
+        if self.hide_emitters:
+            found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
+        return hit
+
+    def lamps_in_fog(self, scene, media: Media, ray, within, channel) -> mi.Spectrum:
+        """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
+        if self.hide_emitters or self.max_depth < 1:
+            return mi.Spectrum(0)
+        trace = partial(self.first_surface, scene)
+        T, hit, ray = segments.clear_view(media, trace, ray, within, channel, mi.Bool(True))
+        si = hit.compute_surface_interaction(ray)
+        return T * si.emitter(scene).eval(si, hit.is_valid() if media.grids else mi.Bool(True))
 
 
 def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:

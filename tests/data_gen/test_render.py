@@ -178,6 +178,9 @@ def test_inspection_names_what_matters(scene_file):
     assert report["size"] == (50, 30)
     assert report["plugins"]["bsdf"] == {"dielectric": 1} and report["plugins"]["emitter"] == {"constant": 1}
     assert any("clear glass" in line for line in report["plan"])
+    # Its light is a sky: photons are better, not the only way.
+    assert any("found best by photons: `--sampler ppm`, `--sampler gpm`" in line for line in report["plan"])
+    assert not any("photons" in line for line in inspect_scene("diffuse")["plan"] if "refuses" not in line)
     assert "thinlens" in inspect_scene("lens")["plugins"]["sensor"]
     with pytest.raises(NgptError, match="not a scene Mitsuba can read"):
         inspect_scene(scene_file(text="<scene"))

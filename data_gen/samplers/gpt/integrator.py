@@ -179,7 +179,7 @@ class GPT(GradientIntegrator):
             first, β = fly(ray, importance)
             hit, place = first.hit, first.place
             x = media.vertex(first.ray, hit, place)
-            Le = importance * self.lamps_in_fog(scene, plan, ray, within, channel)
+            Le = importance * self.lamps_in_fog(scene, plan.media, ray, within, channel)
             L_first = β * self.behind_grids(scene, plan, first)
             offsets = []
             for offset_ray, offset_importance, inside in shifted:
@@ -243,24 +243,6 @@ class GPT(GradientIntegrator):
             depth += 1
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         return L, L_caustic, offsets, chain
-
-    def first_surface(self, scene, ray, medium, active) -> mi.PreliminaryIntersection3f:
-        """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
-        hit = self.first_hit(scene, ray, active)
-        if self.hide_emitters:
-            found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
-            hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
-        return hit
-
-    def lamps_in_fog(self, scene, plan: Plan, ray, within, channel) -> mi.Spectrum:
-        """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
-        if self.hide_emitters:
-            return mi.Spectrum(0)
-        trace = partial(self.first_surface, scene)
-        T, hit, ray = segments.clear_view(plan.media, trace, ray, within, channel, mi.Bool(True))
-        si = hit.compute_surface_interaction(ray)
-        seen = hit.is_valid() if plan.media.grids else mi.Bool(True)
-        return T * si.emitter(scene).eval(si, seen & (plan.max_depth > 0))
 
     def behind_grids(self, scene, plan: Plan, segment) -> mi.Spectrum:
         """Le where the first ``segment`` of a path has come through grids, or to the environment of a scene with grids.

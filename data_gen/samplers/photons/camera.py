@@ -16,6 +16,7 @@ import mitsuba as mi
 
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
+from data_gen.samplers.photons.frozen import call
 
 
 @dataclass
@@ -57,11 +58,32 @@ def levels(
     hide_emitters: bool,
     max_depth: int,
     rr_depth: int,
+    frozen: Callable = call,
 ) -> Iterator[Level]:
     """Level after level of the paths that begin with ``rays``: (ray, importance, whether it is on the film) of each.
 
-    The first one is the base path's. Each level is evaluated.
+    The first one is the base path's. Each level is evaluated. ``frozen`` calls the functions that make kernels.
     """
+    n = dr.width(rays[0][0].o)
+    lanes, η, depth, numbers = dr.arange(mi.UInt32, n), dr.full(mi.Float, 1, n), 1, random.random
+    paths = frozen(begun, scene, rays, first_hit, hide_emitters)
+    while True:
+        dr.eval(paths, lanes, η)
+        yield Level(depth, lanes, paths[0], paths[1:])
+        if depth >= max_depth:
+            return
+        paths, η, numbers = frozen(onward, materials, paths, η, type(random)(numbers), depth >= rr_depth)
+        dr.eval(paths, η, numbers)
+        go_on = dr.compress(paths[0].alive)
+        if not dr.width(go_on):
+            return
+        paths, lanes, η, numbers = frozen(further, scene, paths, lanes, η, numbers, go_on)
+        dr.eval(paths, lanes, η, numbers)
+        depth += 1
+
+
+def begun(scene, rays: list, first_hit: Callable, hide_emitters: bool) -> list[Path]:
+    """The paths of these rays up to what they hit."""
     paths = []
     for ray, importance, inside in rays:
         ray = mi.Ray3f(ray.o, ray.d, ray.time, ray.wavelengths)
@@ -70,34 +92,25 @@ def levels(
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, dr.width(ray))
         alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, dr.width(ray)))
         paths.append(Path(ray, first_hit(scene, ray), β, alive, sky_seen))
-    lanes, η, depth = dr.arange(mi.UInt32, dr.width(paths[0].ray)), mi.Float(1), 1
-    η += dr.zeros(mi.Float, dr.width(lanes))
-    while True:
-        dr.eval(paths, lanes, η)
-        yield Level(depth, lanes, paths[0], paths[1:])
-        if depth >= max_depth:
-            return
-        u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-        paths, etas = zip(*(scattered(path, materials, u_lobe, u_direction) for path in paths), strict=True)
-        base, η = paths[0], dr.select(paths[0].alive, η * etas[0], η)
-        if depth >= rr_depth:
-            # All five survive together. As in ``path``: η² undoes what refraction does to radiance.
-            brightest = mi.Float(0)
-            for path in paths:
-                brightest = dr.fmax(brightest, dr.select(path.alive, dr.max(path.β), 0))
-            survival = dr.fmin(brightest * dr.square(η), 0.95)
-            base.alive &= u_survival < survival
-            for path in paths:
-                path.β /= survival
-        random.schedule_state()
-        dr.eval(paths, η)
-        go_on = dr.compress(base.alive)
-        if not dr.width(go_on):
-            return
-        random = random.at(go_on)
-        lanes, η = dr.gather(mi.UInt32, lanes, go_on), dr.gather(mi.Float, η, go_on)
-        paths = [further(scene, path, go_on) for path in paths]
-        depth += 1
+    return paths
+
+
+def onward(materials: Materials, paths: list[Path], η, random, roulette: bool) -> tuple:
+    """The paths behind their next event; with Russian ``roulette`` or without."""
+    random = random.clone()
+    u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+    paths, etas = zip(*(scattered(path, materials, u_lobe, u_direction) for path in paths), strict=True)
+    base, η = paths[0], dr.select(paths[0].alive, η * etas[0], η)
+    if roulette:
+        # All five survive together. As in ``path``: η² undoes what refraction does to radiance.
+        brightest = mi.Float(0)
+        for path in paths:
+            brightest = dr.fmax(brightest, dr.select(path.alive, dr.max(path.β), 0))
+        survival = dr.fmin(brightest * dr.square(η), 0.95)
+        base.alive &= u_survival < survival
+        for path in paths:
+            path.β /= survival
+    return list(paths), η, random.random
 
 
 def scattered(path: Path, materials: Materials, u_lobe, u_direction) -> tuple[Path, mi.Float]:
@@ -114,16 +127,21 @@ def scattered(path: Path, materials: Materials, u_lobe, u_direction) -> tuple[Pa
     return Path(ray, path.hit, β, alive, path.sky_seen | (alive & (kind != NULL))), sample.eta
 
 
-def further(scene, path: Path, lanes: mi.UInt32) -> Path:
-    """The path of these ``lanes`` alone, up to what its ray hits."""
+def further(scene, paths: list[Path], known, η, numbers, lanes: mi.UInt32) -> tuple:
+    """What belongs to these ``lanes`` alone; and the paths up to what their rays hit."""
 
     def taken(value: Any):
         return dr.gather(type(value), value, lanes)
 
-    old = path.ray
-    time = taken(old.time) if dr.width(old.time) > 1 else old.time
-    wavelengths = taken(old.wavelengths) if dr.width(old.wavelengths) > 1 else old.wavelengths
-    ray = mi.Ray3f(taken(old.o), taken(old.d), time, wavelengths)
-    alive = taken(path.alive)
-    hit = scene.ray_intersect_preliminary(ray, active=alive)
-    return Path(ray, hit, taken(path.β), alive, taken(path.sky_seen))
+    found = []
+    for path in paths:
+        old = path.ray
+        time = taken(old.time) if dr.width(old.time) > 1 else old.time
+        wavelengths = taken(old.wavelengths) if dr.width(old.wavelengths) > 1 else old.wavelengths
+        ray = mi.Ray3f(taken(old.o), taken(old.d), time, wavelengths)
+        alive = taken(path.alive)
+        hit = scene.ray_intersect_preliminary(ray, active=alive)
+        found.append(Path(ray, hit, taken(path.β), alive, taken(path.sky_seen)))
+    random = mi.PCG32()
+    random.state, random.inc = taken(numbers.state), taken(numbers.inc)
+    return found, taken(known), taken(η), random

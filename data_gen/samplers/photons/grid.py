@@ -7,6 +7,8 @@ the photons of a point in the order of the list: sums have the same bits every t
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -16,23 +18,37 @@ _CELLS_PER_PHOTON = 4
 _LEAST_CELLS = 1 << 12
 
 
+@dataclass(init=False)
 class Grid:
     """Points of index ``index[i]`` at ``p[i]``, sorted by cell; cell c has those from ``start[c]`` to ``start[c + 1]``.
 
     ``points`` are all points, of which those that ``exist`` are entered; ``radius`` is the largest that is asked for.
     """
 
+    low: mi.Point3f
+    edge: mi.Float  # of a cell
+    rate: mi.Float  # cells in a unit of length
+    n: mi.Vector3u
+    start: mi.UInt32
+    index: mi.UInt32
+    p: mi.Point3f
+
     def __init__(self, points: mi.Point3f, exist: mi.Bool, radius: float):
         index = dr.compress(exist)
-        p = dr.gather(mi.Point3f, points, index)
-        self.size = dr.width(index)
-        if not self.size:
+        if not dr.width(index):
+            # No point in any cell; and one in no cell, since arrays have something in them.
+            self.low, self.n = dr.opaque(mi.Point3f, 0), dr.opaque(mi.Vector3u, 3)
+            self.edge, self.rate = (dr.opaque(mi.Float, value) for value in (2 * radius, 1 / (2 * radius)))
+            self.start, self.index, self.p = dr.zeros(mi.UInt32, 28), dr.zeros(mi.UInt32, 1), dr.zeros(mi.Point3f, 1)
+            dr.eval(self.start, self.index, self.p)
             return
+        p = dr.gather(mi.Point3f, points, index)
         low, high = (np.array([f(axis)[0] for axis in p], np.float64) for f in (dr.min, dr.max))
-        self.edge, cells = self.cells(high - low, 2 * radius, max(_LEAST_CELLS, _CELLS_PER_PHOTON * self.size))
+        most = max(_LEAST_CELLS, _CELLS_PER_PHOTON * dr.width(index))
+        edge, cells = self.cells(high - low, 2 * radius, most)
         # Half a cell of room on all sides: the cells of a ball around any of the points are in the grid.
-        self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - self.edge))
-        self.rate = dr.opaque(mi.Float, 1 / self.edge)
+        self.low = mi.Point3f(*(dr.opaque(mi.Float, float(c)) for c in low - edge))
+        self.edge, self.rate = (dr.opaque(mi.Float, value) for value in (edge, 1 / edge))
         self.n = mi.Vector3u(*(dr.opaque(mi.UInt32, int(n)) for n in cells))
         key = self.linear(*(mi.UInt32((q - o) * self.rate) for q, o in zip(p, self.low, strict=True)))
         counts = dr.zeros(mi.UInt32, int(np.prod(cells)) + 1)
@@ -69,28 +85,68 @@ class Grid:
 
         ``near`` says which are, and ``visit`` changes nothing for others. May be called within symbolic loops.
         """
-        if not self.size:
-            return state
+
+        def nearer(q, k):
+            return dr.squared_norm(q - p) < radius2
+
+        none = dr.zeros(mi.UInt32, dr.width(p))
+        return self.rows(none, none + 4, lambda k: p, nearer, active, visit, state)
+
+    def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
+        """The same for the points nearer than that to a piece of a ray, each where it is beside the ray, not its ends.
+
+        The piece is cut into parts so short that two cells along each axis hold what is near to one. Each point is
+        beside one part alone.
+        """
+        # What is near to the part is in the ball about its middle with half an edge for a radius; half of that length:
+        half = dr.sqrt(dr.maximum(0.25 * dr.square(self.edge) - radius2, 0))
+        rate = dr.rcp(2 * half)
+        # From where to where the ray is in the grid, and beside points
+        begin, end = mi.Float(0), mi.Float(length)
+        for o, d, low, n in zip(ray.o, ray.d, self.low, self.n, strict=True):
+            first, last = (low - o) / d, (low + self.edge * n - o) / d
+            begin = dr.maximum(begin, dr.select(first < last, first, last))
+            end = dr.minimum(end, dr.select(first < last, last, first))
+        crosses = active & (begin < end)
+        first = mi.UInt32(dr.select(crosses, begin * rate, 0))
+        last = mi.UInt32(dr.select(crosses, end * rate, 0)) + 1
+
+        def middle(k):
+            return ray(mi.Float(2 * (k >> 2) + 1) * half)
+
+        def beside(q, k):
+            to = q - ray.o
+            t = dr.dot(to, ray.d)
+            here = (t > 0) & (t < length) & (mi.UInt32(dr.maximum(t, 0) * rate) == (k >> 2))
+            return here & (dr.squared_norm(to - ray.d * t) < radius2)
+
+        return self.rows(4 * first, 4 * last, middle, beside, crosses, visit, state)
+
+    def rows(self, first: mi.UInt32, last: mi.UInt32, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
+        """``state`` after visits to all points in the rows from ``first`` to ``last``: number k has row k % 4.
+
+        ``center`` (k) is what the row is near to, and ``is_near`` (point, k) whether a point of it is.
+        """
 
         def step(k, i, end, state):
             at = i < end
-            near = at & (dr.squared_norm(dr.gather(mi.Point3f, self.p, i, at) - p) < radius2)
+            near = at & is_near(dr.gather(mi.Point3f, self.p, i, at), k - 1)
             state = visit(state, i, near)
             i = i + 1
-            next_row = ~(i < end) & (k < 4)
-            first, last = self.row(p, k, next_row)
+            next_row = ~(i < end) & (k < last)
+            begin, stop = self.row(center(k), k & 3, next_row)
             return (
                 dr.select(next_row, k + 1, k),
-                dr.select(next_row, first, i),
-                dr.select(next_row, last, end),
+                dr.select(next_row, begin, i),
+                dr.select(next_row, stop, end),
                 state,
             )
 
-        # A first step without a point: i = end, and so row 0 is next.
-        none = dr.zeros(mi.UInt32, dr.width(p))
+        # A first step without a point: i = end, and so the first row is next.
+        none = dr.zeros(mi.UInt32, dr.width(first))
         return dr.while_loop(
-            (mi.UInt32(none), mi.UInt32(none), mi.UInt32(none), state),
-            lambda k, i, end, state: active & ((k < 4) | (i < end)),
+            (mi.UInt32(first), mi.UInt32(none), mi.UInt32(none), state),
+            lambda k, i, end, state: active & ((k < last) | (i < end)),
             step,
             label="gather",
         )[3]

@@ -7,12 +7,13 @@ pairs give the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.samplers.photons.frozen import call
 from data_gen.samplers.photons.grid import Grid
 
 
@@ -36,24 +37,37 @@ class Pairs:
         return dr.while_loop(state, lambda i, sums: i < self.end, add, label="sums of pairs")[1]
 
 
-def pieces(grid: Grid, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, most: int) -> Iterator[Pairs]:
+def pieces(
+    grid: Grid, p: mi.Point3f, radius2: mi.Float, active: mi.Bool, most: int, frozen: Callable = call
+) -> Iterator[Pairs]:
     """All pairs of ``active`` points ``p`` and what the ``grid`` has nearer to them, at most so many at a time."""
-    none = dr.zeros(mi.UInt32, dr.width(p))
-    (count,) = grid.each(
-        p, radius2, active, lambda state, i, near: (state[0] + dr.select(near, mi.UInt32(1), 0),), (none,)
-    )
+    count = frozen(counts, grid, p, radius2, active)
     first = dr.prefix_sum(count)
     dr.eval(count, first, active)
     total = int(dr.sum(count)[0])
     for low in range(0, total, most):
-        yield piece(grid, p, radius2, active, first, count, low, min(most, total - low))
+        size = min(most, total - low)
+        part = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+        pairs = dr.empty(mi.UInt32, size), dr.empty(mi.UInt32, size)
+        dr.make_opaque(pairs)
+        pairs = frozen(piece, grid, p, radius2, active, first, count, part, pairs)
+        dr.eval(pairs)
+        yield pairs
 
 
-def piece(grid: Grid, p, radius2, active, first: mi.UInt32, count: mi.UInt32, low: int, size: int) -> Pairs:
-    """The ``size`` pairs from number ``low`` on; those of a point begin at ``first`` and are ``count``."""
-    begin, length = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+def counts(grid: Grid, p, radius2, active) -> mi.UInt32:
+    """How many pairs each point has."""
+
+    def one_more(state, i, near):
+        return (state[0] + dr.select(near, mi.UInt32(1), 0),)
+
+    return grid.each(p, radius2, active, one_more, (dr.zeros(mi.UInt32, dr.width(p)),))[0]
+
+
+def piece(grid: Grid, p, radius2, active, first: mi.UInt32, count: mi.UInt32, part: tuple, pairs: tuple) -> Pairs:
+    """The ``part`` (low, size) of the list, in arrays of that size; those of a point begin at ``first``."""
+    (begin, length), (point, place) = part, pairs
     inside = active & (first < begin + length) & (first + count > begin)
-    point, place = dr.zeros(mi.UInt32, size), dr.zeros(mi.UInt32, size)
     lane = dr.arange(mi.UInt32, dr.width(p))
 
     def write(state, i, near):
@@ -64,8 +78,7 @@ def piece(grid: Grid, p, radius2, active, first: mi.UInt32, count: mi.UInt32, lo
         dr.scatter(place, i, at, known)
         return (dr.select(near, state[0] + 1, state[0]),)
 
-    end = grid.each(p, radius2, inside, write, (mi.UInt32(first),))
-    dr.eval(end, point, place)
+    grid.each(p, radius2, inside, write, (mi.UInt32(first),))
     last = dr.minimum(first + count, begin + length)
     start = dr.maximum(first, begin)
     return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))

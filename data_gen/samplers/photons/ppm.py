@@ -18,7 +18,9 @@ emission that the camera path meets on its way counts as it is. So each path of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -26,8 +28,10 @@ import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
+from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
@@ -35,6 +39,8 @@ from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.photons.copies import faces, light, photon_of
+from data_gen.samplers.photons.fog import Fog
+from data_gen.samplers.photons.frozen import Frozen
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.radius import pixel_width, shrunk
 from data_gen.samplers.photons.trace import MAP_BYTES, trace
@@ -46,19 +52,26 @@ CAMERA_BYTES = 256
 _LIGHT_PATHS = 0x9807
 
 
+@dataclass(init=False)
 class Gathering:
     """The photons of a map, where they are gathered within ``radius``; ``paths`` light paths have brought them."""
 
+    photons: Any
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float
+    max_depth: mi.UInt32
+
     def __init__(self, photons, radius: float, paths: int, max_depth: int):
         self.photons = photons
-        self.grid = Grid(photons.p, photons.depth > 0, radius)
-        # Not within the loops that call light().
+        on_surfaces = (photons.depth > 0) & (dr.squared_norm(photons.n) > 0)
+        self.grid = Grid(photons.p, on_surfaces, radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
-    def light(self, si: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
-        """L(x) at the vertex ``si``, behind ``depth`` edges, of paths that are not too long."""
+    def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
         photons, longest = self.photons, self.max_depth - depth
 
         def one(i, near):
@@ -80,18 +93,22 @@ class Passes:
     lights: LightEnds
     materials: Materials
     width: float  # of a pixel
+    frozen: Frozen = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        self.integrator.sample_pass(self.scene, self.lights, self.materials, self.width, camera, film)
+        self.integrator.sample_pass(self, camera, film)
 
     @property
     def lane_bytes(self) -> int:
         """Of a camera sample, with all that its light paths may leave in a map."""
-        return self.integrator.camera_bytes + self.integrator.photons * MAP_BYTES
+        return self.integrator.camera_bytes + self.integrator.photons * self.integrator.map_bytes
 
     def instead(self, lane_bytes: int) -> str:
         """What else than a smaller image would fit into so many bytes for each camera sample."""
-        fits = (lane_bytes - self.integrator.camera_bytes) // MAP_BYTES
+        fits = (lane_bytes - self.integrator.camera_bytes) // self.integrator.map_bytes
         return f", or no more than --option photons={fits}" if fits > 0 else ""
 
 
@@ -115,7 +132,8 @@ class PPM(GradientIntegrator):
     """
 
     name = "ppm"
-    camera_bytes = CAMERA_BYTES
+    camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
+    fog: Fog | None = None
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -134,55 +152,75 @@ class PPM(GradientIntegrator):
         lights, materials = LightEnds(scene, self.name), Materials(scene, self.threshold)
         return Passes(self, scene, lights, materials, pixel_width(scene))
 
-    def sample_pass(self, scene, lights, materials, width: float, camera: CameraSamples, film: GradientFilm) -> None:
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path for each camera sample, of which a pixel has one."""
-        ray, importance, _ = camera.rays()
-        random = camera.random.clone()
-        keys = random.next_key(), random.next_key()
-        radius = self.radius * width * shrunk(camera.first)
-        values = features(scene, camera.sensor, camera.random.clone(), ray)
-        L, Le = self.camera_path(scene, materials, random.clone(), ray, importance)
+        ray, importance, random, keys, values = begin(passes, camera)
+        near = self.gatherings(passes, keys, camera.first)
+        # Emission that camera paths meet is counted with the first map, or without any.
+        paths = passes.scene, passes.materials, random, ray, importance
+        L, Le = passes.frozen(self.light, *paths, next(near, None), True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
-        random.schedule_state()
-        if lights.emitters is not None and self.max_depth > 1:
-            _, maps = self.photon_maps(scene, lights, materials, keys)
-            for photons in maps:
-                near = Gathering(photons, radius, self.photons * dr.width(random.random.state), self.max_depth)
-                L, _ = self.camera_path(scene, materials, random.clone(), ray, importance, near.light)
-                values["primal"] += to_rgb(L, ray.wavelengths)
-                dr.eval(values["primal"])
+        for scattered in near:
+            L, _ = passes.frozen(self.light, *paths, scattered, False)
+            values["primal"] += to_rgb(L, ray.wavelengths)
+            dr.eval(values["primal"])
         film.put_all(values)
 
-    def photon_maps(self, scene, lights, materials, keys):
+    def gatherings(self, passes: Passes, keys, number: int):
+        """What light is gathered from in each of the photon maps of pass ``number``."""
+        if passes.lights.emitters is not None and self.max_depth > 1:
+            _, maps = self.photon_maps(passes, keys)
+            for photons in maps:
+                yield self.gathering(photons, passes.width, number, self.photons * dr.width(keys[0]))
+
+    def gathering(self, photons, width: float, number: int, paths: int):
+        """The ``photons`` of pass ``number`` where they are gathered, of so many light paths."""
+        return Gathering(photons, self.radius * width * shrunk(number), paths, self.max_depth)
+
+    def photon_maps(self, passes: Passes, keys):
         """The light's ends and the maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
         n = dr.width(keys[0]) * self.photons
         lane = dr.arange(mi.UInt32, n)
         sample = lane // dr.opaque(mi.UInt32, self.photons)
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        return trace(scene, lights, random, materials.connectable, self.max_depth - 1, self.rr_depth)
+        receives, depths = passes.materials.connectable, (self.max_depth - 1, self.rr_depth)
+        return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen)
+
+    def light(self, scene, materials, random, ray, importance, near, emission: bool):
+        """L and Le of camera paths, with what is gathered from photons ``near``, and with ``emission`` or without."""
+        scattered = near.light if near is not None else None
+        return self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission)
 
     @dr.syntax
-    def camera_path(self, scene, materials, random, ray, importance, scattered=None):
-        """L of camera paths where light is ``scattered``, or that of emission met if it is None; and Le, seen directly.
+    def camera_path(self, scene, materials, random, ray, importance, scattered, emission: bool):
+        """L of camera paths: where light is ``scattered``, and ``emission`` that they meet; and Le, seen directly.
 
-        ``scattered`` is called with (vertex, its material, depth, where).
+        ``scattered`` is called with (vertex, its place, its material, depth, where), unless it is None.
         """
-        ray = mi.Ray3f(ray)
-        si = self.first_hit(scene, ray).compute_surface_interaction(ray)
+        ray, fog = mi.Ray3f(ray), self.fog
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
         sky_seen = mi.Bool(not self.hide_emitters)
         shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
-        Le = importance * si.emitter(scene).eval(si, shown)
-        L = dr.zeros(mi.Spectrum, dr.width(ray))
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+        if dr.hint(fog is not None, mode="scalar"):
+            channel, first = media.choose_channel(random.next_1d()), partial(self.first_surface, scene)
+            si, place, weight = fog.ahead(first, ray, fog.within, channel, random, mi.Bool(True))
+            Le = importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
+            β *= weight
+        else:
+            si, place, channel = self.first_hit(scene, ray).compute_surface_interaction(ray), None, None
+            Le = importance * si.emitter(scene).eval(si, shown)
+        L = dr.zeros(mi.Spectrum, dr.width(ray))
         active = si.is_valid() & (depth < self.max_depth)
         while dr.hint(active, label="camera path"):
             bsdf = si.bsdf()
             receives = active & materials.connectable(bsdf)
+            if dr.hint(fog is not None, mode="scalar"):
+                receives |= active & place.scatters
             if dr.hint(scattered is not None, mode="scalar"):
-                L += β * scattered(si, bsdf, depth, receives)
+                L += β * scattered(si, place, bsdf, depth, receives)
             u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
             sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
             kind = event_kind(sample.sampled_type)
@@ -195,12 +233,29 @@ class PPM(GradientIntegrator):
             active = found & (dr.max(β) > 0) & (u_survival < survival)
             β /= survival
             depth += 1
-            si = scene.ray_intersect(si.spawn_ray(si.to_world(sample.wo)), active)
-            if dr.hint(scattered is None, mode="scalar"):
+            onward = si.spawn_ray(si.to_world(sample.wo))
+            if dr.hint(fog is not None, mode="scalar"):
+                medium = place.toward(si, onward.d)
+                si, place, weight = fog.ahead(next_surface(scene), onward, medium, channel, random, active)
+                β *= weight
+            else:
+                si = scene.ray_intersect(onward, active)
+            if dr.hint(emission, mode="scalar"):
                 met = active & (si.is_valid() | sky_seen)
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
             active &= si.is_valid() & (depth < self.max_depth)
         return L, Le
+
+
+def begin(passes: Passes, camera: CameraSamples) -> tuple:
+    """Rays and importance of camera samples, random numbers of their paths, two keys, and the layers of features."""
+    ray, importance, _ = camera.rays()
+    random = camera.random.clone()
+    keys = random.next_key(), random.next_key()
+    random.schedule_state()
+    dr.eval(ray, importance, keys)
+    values = passes.frozen(features, passes.scene, camera.sensor, camera.random, ray)
+    return ray, importance, random, keys, values
 
 
 def refuse(scene, sampler: str) -> None:

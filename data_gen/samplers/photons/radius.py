@@ -1,8 +1,9 @@
 """How far photons are gathered from: in pixels at first, and less and less.
 
-Pass i gathers within r_i, with r_(i+1)² = r_i² (i + α) / (i + 1). So r² falls like i^(α - 1): slowly enough that the
-noise of the mean over passes goes to zero like i^-α, and its bias like i^(α - 1). Every pass is on its own, no point
-keeps statistics (Knaus and Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15).
+Pass i gathers within r_i, with r_(i+1)^d = r_i^d (i + α) / (i + 1); d is 2 on surfaces and 3 in media, the dimension of
+what photons are counted in. So r^d falls like i^(α - 1): slowly enough that the noise of the mean over passes goes to
+zero like i^-α, and its bias like r², i^(2 (α - 1) / d). Every pass is on its own, no point keeps statistics (Knaus and
+Zwicker 2011, "Progressive Photon Mapping: A Probabilistic Approach", eq. 15 and 24).
 """
 
 from __future__ import annotations
@@ -19,11 +20,11 @@ from data_gen.paths.features import features
 ALPHA = 2 / 3
 
 
-def shrunk(i: int) -> float:
-    """r_i / r_0, i from 0."""
+def shrunk(i: int, dimension: int = 2) -> float:
+    """r_i / r_0, i from 0, where photons are counted in a disk, or in a ball (``dimension`` 3)."""
     # The product of (k + α) / (k + 1) over k = 1 .. i, by the Gamma function
     log_ratio = math.lgamma(i + 1 + ALPHA) - math.lgamma(1 + ALPHA) - math.lgamma(i + 2)
-    return math.exp(log_ratio / 2)
+    return math.exp(log_ratio / dimension)
 
 
 def pixel_width(scene: mi.Scene) -> float:

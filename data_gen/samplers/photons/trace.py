@@ -1,26 +1,35 @@
-"""Light paths as a map of vertices: traced bounce by bounce, one kernel each, all paths side by side.
+"""Light paths as a map of vertices: all paths side by side, in one kernel, each with places of its own in the map.
 
-Paths that are left are moved together after each bounce, in their order. So vertices lie in the map by bounce, then by
-path: the same seed gives the same map. (Slots handed out by a counter would come in the order of threads.)
+So vertices lie in the map by path, then by bounce: the same seed gives the same map. (Places handed out by a counter
+would come in the order of threads.) Places that a path does not need stay empty, their edges have the length 0.
+
+In media, vertices are where light scatters, too. Their normal is 0, and their power that which is scattered there: the
+sum of it over a volume is σs times the light that goes through, so a camera path brings its transmittance alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths import media
+from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
+from data_gen.samplers.photons.frozen import call
 
-# Vertices of a map, for each light path of it. Paths that have more of them go on in another map.
+if TYPE_CHECKING:
+    from data_gen.samplers.photons.fog import Fog
+
+# Vertices of a map, for each light path of it; at least 2. Paths that have more of them go on in another map.
 VERTICES_PER_PATH = 8
-# Bytes of a vertex: 22 words of a record, as much again while levels are joined, and 9 words of a grid that is made.
+# Bytes of a vertex: 22 words of a record, as much again in the map before, and 9 words of a grid that is made.
 VERTEX_BYTES = (22 + 22 + 9) * 4
 # Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
@@ -56,6 +65,34 @@ def vertices_class(variant: str) -> type:
     return Vertices
 
 
+@cache
+def vertices_in_media_class(variant: str) -> type:
+    """The same of a scene with media."""
+
+    @dataclass
+    class VerticesInMedia(vertices_class(variant)):  # type: ignore[misc]
+        """23 words a vertex."""
+
+        medium: mi.MediumPtr  # around it
+
+    return VerticesInMedia
+
+
+@dataclass
+class _Paths:
+    """Light paths on their way, where their next edge begins."""
+
+    ray: mi.Ray3f
+    β: mi.Spectrum
+    brightest: mi.Float  # one over what they began with
+    density: mi.Float
+    survival: mi.Float
+    parent: mi.UInt32
+    bounce: mi.UInt32  # the number of the edge
+    alive: mi.Bool
+    within: tuple  # their colour and their medium, of scenes with media
+
+
 def trace(
     scene: mi.Scene,
     lights: LightEnds,
@@ -63,70 +100,103 @@ def trace(
     receives: Callable[[mi.BSDFPtr], mi.Bool],
     max_depth: int,
     rr_depth: int,
+    fog: Fog | None = None,
+    frozen: Callable = call,
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
-    Light is gathered at materials that it ``receives``. A map has at most VERTICES_PER_PATH vertices for each path, and
-    those of the bounce before its first one once more, as parents. Returns the light's end of all paths, and the maps.
+    Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has VERTICES_PER_PATH
+    places for each path; further maps are of those paths alone that go on, and begin with their last vertex, as parent.
+    ``frozen`` calls the functions that make kernels. Returns the light's end of all paths, and the maps.
     """
+    start, within, numbers = frozen(_start, scene, lights, random, fog)
+    dr.eval(start, within, numbers)
+    random = type(random)(numbers)
+    n = dr.width(start.ray.d)
+    paths = _Paths(
+        *(mi.Ray3f(start.ray.o, start.ray.d), start.β, dr.rcp(dr.max(start.β))),
+        *(dr.zeros(mi.Float, n), dr.ones(mi.Float, n), dr.arange(mi.UInt32, n)),
+        *(dr.ones(mi.UInt32, n), dr.max(start.β) > 0, within),
+    )
+    depths = dr.opaque(mi.UInt32, min(max(max_depth, 0), 0xFFFFFFFF)), dr.opaque(mi.UInt32, rr_depth)
+    paths.alive &= paths.bounce <= depths[0]
+    return start, _maps(scene, paths, random, receives, depths, fog, frozen)
+
+
+def _start(scene, lights: LightEnds, random, fog) -> tuple:
+    """Where light paths begin, what of media is known there, and their random numbers from then on."""
+    random = random.clone()
     start = lights.sample(scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
-    dr.eval(start)
-    random.schedule_state()
-    return start, _maps(scene, start, random, receives, max_depth, rr_depth)
+    within = (media.choose_channel(random.next_1d()), fog.around(scene, start.ray.o)) if fog else ()
+    return start, within, random.random
 
 
-def _maps(scene, start: LightRay, random, receives, max_depth: int, rr_depth: int) -> Iterator[Any]:
-    paths = dr.width(start.ray.d)
-    room = paths * VERTICES_PER_PATH
-    ray, β, brightest = start.ray, start.β, dr.rcp(dr.max(start.β))
-    density, survival, parent = dr.zeros(mi.Float, paths), dr.ones(mi.Float, paths), dr.arange(mi.UInt32, paths)
-    lanes = dr.compress(dr.max(β) > 0)
-    levels: list = []
-    size, bounce = 0, 1
-    while dr.width(lanes) and bounce <= max_depth:
-        ray = mi.Ray3f(dr.gather(mi.Point3f, ray.o, lanes), dr.gather(mi.Vector3f, ray.d, lanes))
-        β, brightest, density, survival, parent = (
-            dr.gather(type(x), x, lanes) for x in (β, brightest, density, survival, parent)
-        )
-        random = random.at(lanes)
-        hit = scene.ray_intersect_preliminary(ray)
-        si = hit.compute_surface_interaction(ray)
-        bsdf, exists = si.bsdf(), si.is_valid()
-        depth = dr.select(receives(bsdf), dr.opaque(mi.UInt32, bounce), 0)
-        place = dr.prefix_sum(dr.select(exists, mi.UInt32(1), 0))
-        level = vertices_class(mi.variant())(
+def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen) -> Iterator[Any]:
+    kind = (vertices_in_media_class if fog else vertices_class)(mi.variant())
+    map_before = None
+    while dr.width(lanes := dr.compress(paths.alive)):
+        paths, random = _at(paths, lanes), random.at(lanes)
+        dr.eval(paths)
+        random.schedule_state()
+        n = dr.width(lanes) * VERTICES_PER_PATH
+        photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
+        photons.t, photons.depth = dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+        place = dr.arange(mi.UInt32, dr.width(lanes)) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
+        end = place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
+        if map_before is not None:
+            # What has been gathered of it is not gathered again.
+            vertex = _at(map_before, paths.parent)
+            vertex.depth = dr.zeros(mi.UInt32, len(vertex))
+            _put(photons, vertex, place, True)
+            paths.parent, place = place, place + 1
+        paths, numbers, photons = frozen(_walk, scene, paths, random, receives, depths, fog, photons, place, end)
+        dr.eval(paths, numbers, photons)
+        random = type(random)(numbers)
+        map_before = photons
+        yield photons
+
+
+@dr.syntax
+def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, place, end) -> tuple:
+    """Enters vertices at each path's places, from ``place`` up to ``end``; paths still alive then have more of them."""
+    random = random.clone()
+    ray, β, density, survival = mi.Ray3f(paths.ray), paths.β, paths.density, paths.survival
+    parent, bounce, alive, within = mi.UInt32(paths.parent), mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.within
+    brightest, (max_depth, rr_depth) = paths.brightest, depths
+    while dr.hint(alive & (place < end), label="light paths"):
+        if dr.hint(fog is not None, mode="scalar"):
+            channel, medium = within
+            segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, alive)
+            hit, where, β = segment.hit, segment.place, β * segment.weight
+            exists, scatters, around = alive & si.is_valid() & (dr.max(β) > 0), where.scatters, (where.medium,)
+        else:
+            hit = scene.ray_intersect_preliminary(ray, active=alive)
+            si = hit.compute_surface_interaction(ray, active=alive)
+            exists, scatters, around = alive & si.is_valid(), mi.Bool(False), ()
+        bsdf = si.bsdf()
+        depth = dr.select(receives(bsdf) | scatters, bounce, 0)
+        vertex = type(photons)(
             *(si.p, si.n, ray.d, β, density, survival, depth, parent, hit.t, hit.prim_uv, hit.prim_index),
-            *(hit.shape, hit.instance),
+            *(hit.shape, hit.instance, *around),
         )
+        _put(photons, vertex, place, exists)
+        parent, place = dr.select(exists, place, parent), place + 1
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-        sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists)
-        β = β * light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))[0]
+        sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists & ~scatters)
+        f_p, _ = light_sampled(si, bsdf, sample, f_p, exists & (sample.pdf > 0))
+        if dr.hint(fog is not None, mode="scalar"):
+            sample, f_p = media.scattered(si, where, u_lobe, u_direction, sample, f_p)
+        β = β * f_p
         # By what is left of the light that the path began with
-        survival = dr.ones(mi.Float, dr.width(lanes))
-        if bounce >= rr_depth:
-            survival = dr.fmin(dr.max(β) * brightest, 0.95)
-        goes_on = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
+        survival = dr.select(bounce >= rr_depth, dr.fmin(dr.max(β) * brightest, 0.95), 1)
+        alive = exists & (sample.pdf > 0) & (dr.max(β) > 0) & dr.isfinite(dr.sum(β)) & (u_survival < survival)
         β, density = β / survival, dr.select(event_kind(sample.sampled_type) == SMOOTH, sample.pdf, dr.inf)
         ray = si.spawn_ray(si.to_world(sample.wo))
-        random.schedule_state()
-        dr.eval(level, exists, goes_on, place, β, density, survival, ray)
-        level = _at(level, dr.compress(exists))
-        if not len(level):
-            break  # all that was left has escaped
-        dr.eval(level)
-        if levels and size + len(level) > room:
-            yield _joined(levels)
-            # What has been gathered of it is not gathered again.
-            parents = replace(levels[-1], depth=dr.zeros(mi.UInt32, len(levels[-1])))
-            level.parent = level.parent - dr.opaque(mi.UInt32, size - len(parents))
-            levels, size = [parents], len(parents)
-        levels.append(level)
-        parent = place + dr.opaque(mi.UInt32, size)
-        size += len(level)
-        lanes = dr.compress(goes_on)
+        if dr.hint(fog is not None, mode="scalar"):
+            within = channel, where.toward(si, ray.d)
         bounce += 1
-    if levels:
-        yield _joined(levels)
+        alive &= bounce <= max_depth
+    return _Paths(ray, β, brightest, density, survival, parent, bounce, alive, within), random.random, photons
 
 
 def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f:
@@ -142,22 +212,16 @@ def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f
     return hit.compute_surface_interaction(mi.Ray3f(p - d * hit.t, d), active=active)
 
 
-def _at(vertices, index: mi.UInt32):
-    """The vertices of these places alone."""
-    values = (getattr(vertices, f.name) for f in fields(vertices))
-    return type(vertices)(*(dr.gather(type(value), value, index) for value in values))
+def _put(photons, vertex, place: mi.UInt32, active) -> None:
+    """Enters vertices at these places of a map."""
+    for f in fields(photons):
+        dr.scatter(getattr(photons, f.name), getattr(vertex, f.name), place, active)
 
 
-def _joined(levels: list):
-    """One map of all levels."""
-    if len(levels) == 1:
-        return levels[0]
-    kind, total, first = type(levels[0]), sum(map(len, levels)), 0
-    whole = kind(*(dr.zeros(type(getattr(levels[0], f.name)), total) for f in fields(kind)))
-    for level in levels:
-        place = dr.arange(mi.UInt32, len(level)) + dr.opaque(mi.UInt32, first)
-        for f in fields(kind):
-            dr.scatter(getattr(whole, f.name), getattr(level, f.name), place)
-        first += len(level)
-    dr.eval(whole)
-    return whole
+def _at(some, index: mi.UInt32):
+    """The vertices, or the paths, of these places alone."""
+    return type(some)(*(_gather(getattr(some, f.name), index) for f in fields(some)))
+
+
+def _gather(value, index: mi.UInt32):
+    return tuple(_gather(v, index) for v in value) if isinstance(value, tuple) else dr.gather(type(value), value, index)
