@@ -141,8 +141,8 @@ def all_kept(history):
     import drjit as dr
     import mitsuba as mi
 
-    lane = dr.arange(mi.UInt32, 4 * history.total)
-    it = history._corner(lane, history.kept)
+    lane = dr.arange(mi.UInt32, 4 * history.at.total)
+    it = history.at.corner(lane, history.kept)
     dr.eval(it)
     return lane, it
 
@@ -152,11 +152,11 @@ def test_each_path_is_looked_for_where_it_was_kept(rooms):
     *_, (history, _) = rooms["diffuse"].frames(chains=2, count=2)
     lane, it = all_kept(history)
     good, twice = np.array(it.good), np.array(it.twice)
-    pixel = history._pixel(lane // 4 % history.n)
+    pixel = history.at.pixel(lane // 4 % history.at.n)
 
     def found(wrapped):
         mode = rooms["diffuse"].mi.Bool(wrapped)
-        place, before, there = history._before(it.domain, pixel, it.side, it.place, mode)
+        place, before, there = history.at.before(it.domain, pixel, it.side, it.place, mode)
         return np.array(place), np.array(before), np.broadcast_to(np.array(there), good.shape)
 
     was = np.array(history.kept.record.place)[:, np.array(it.source)]
@@ -264,10 +264,12 @@ def test_a_pair_moves_as_its_nearer_pixel_does(rng):
 def far_differences(room, monkeypatch):
     """Differences of pixels far from each other: their shifts have Jacobians far from 1."""
     from data_gen.samplers.restir import history as module
+    from data_gen.samplers.restir import layout
 
-    right = module._step
+    right = module.step
     with monkeypatch.context() as patch:
-        patch.setattr(module, "_step", lambda domain: 8 * right(domain))
+        for where in (module, layout):
+            patch.setattr(where, "step", lambda domain: 8 * right(domain))
         found = [next(iter(room.frames(seed, count=1)))[1]["dx"] for seed in range(2)]
     return np.concatenate(found)[:, :, :-8]
 
@@ -322,16 +324,16 @@ def with_constant_weights(monkeypatch):
 
 def without_the_other_pixel(monkeypatch):
     """What wraps is taken for one of a kind."""
-    from data_gen.samplers.restir import history as module
+    from data_gen.samplers.restir.layout import Layout
 
-    right = module.History._corner
+    right = Layout.corner
 
     def wrong(self, lane, kept):
         it = right(self, lane, kept)
         it.twice = it.twice & False
         return it
 
-    monkeypatch.setattr(module.History, "_corner", wrong)
+    monkeypatch.setattr(Layout, "corner", wrong)
 
 
 @pytest.mark.parametrize(

@@ -96,28 +96,6 @@ def test_of_nothing_comes_nothing(renderer):
     assert np.array(weight_of(mi.Float(1), gray(mi, [0.0]))) == 0
 
 
-@pytest.mark.parametrize("others", [1, 2, 5])
-def test_pairwise_weights_of_a_path_sum_to_one(renderer, rng, others):
-    """p̂ of a path is given in each of the pixels, in the measure of the first; 0 where it cannot be."""
-    from data_gen.samplers.restir.reservoir import pairwise, pairwise_other
-
-    mi = renderer
-    p = rng.exponential(size=(others + 1, 50)).astype(np.float32)
-    p[1:][rng.random((others, 50)) < 0.3] = 0
-    M = rng.uniform(0.5, 20, size=(others + 1, 50)).astype(np.float32)
-    pairs = [(mi.Float(c), mi.Float(q)) for c, q in zip(M[1:], p[1:], strict=True)]
-    rest = mi.Float(M[1:].sum(axis=0))
-    total = np.array(pairwise(mi.Float(M[0]), mi.Float(p[0]), pairs))
-    expected = M[0] / M.sum(axis=0)
-    for (c, q), row, weight in zip(pairs, p[1:], M[1:], strict=True):
-        total = total + np.array(pairwise_other(c, q, mi.Float(M[0]), mi.Float(p[0]), rest))
-        others_sum = M[1:].sum(axis=0)
-        expected = expected + weight / M.sum(axis=0) * (M[0] * p[0] / (M[0] * p[0] + others_sum * row))
-    assert np.allclose(total, 1, atol=1e-5)
-    own = np.array(pairwise(mi.Float(M[0]), mi.Float(p[0]), pairs))
-    assert np.allclose(own, expected, rtol=1e-4)
-
-
 def test_a_difference_counts_each_path_once(renderer, rng):
     """From both sides of a pair, a path's weights add up to "second - first"."""
     from data_gen.samplers.restir.reservoir import difference

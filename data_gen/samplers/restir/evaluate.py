@@ -1,16 +1,14 @@
-r"""E(record, pixel): what the path of a record contributes as a path of another pixel. All reuse reduces to it.
+r"""E(record, place): what the path of a record contributes at another place on the film. All reuse reduces to it.
 
-The prefix is replayed from the record's random numbers through the other pixel, at the same place within the pixel;
-then the path goes straight to rc, and on as before. A path that was sampled there has to come back by the same rules:
-none of the vertices that are replayed may be joined, and the one before rc must be connectable. See
+The prefix is replayed from the record's random numbers through that place, by the camera as it is now; then the path
+goes straight to rc, and on as before. A path that was sampled there has to come back by the same rules: none of the
+vertices that are replayed may be joined, and the one before rc must be connectable. See
 ``data_gen.samplers.restir.record`` for measures and kinds.
 
-Wherever a difference to the pixel of the record is zero, E gives back the f that was recorded, to float32.
+At its own place, by its own camera, E gives back the f that was recorded, to float32.
 
-Open, for whoever goes on: occlusion is tested by a shadow ray, whose ends are kept off surfaces by epsilons, and a walk
-by what its ray meets. Of 90,000 paths in three scenes none differed. Shapes that move between frames
-need their previous scene: ``P`` and ``shape`` are those of the frame of the record. The time of a sample is replayed
-as well. Lanes without a path are evaluated too, where ``dr.compress`` would leave out about a third.
+Occlusion is tested by a shadow ray, whose ends are kept off surfaces by epsilons, and a walk by what its ray meets. Of
+90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record are those of a scene that does not move.
 """
 
 from __future__ import annotations

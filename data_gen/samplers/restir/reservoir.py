@@ -11,10 +11,9 @@ All values are light, or one sign of a difference: never negative. What paths ar
 | resampling weight of path l | w = m p̂ \|J\| W, p̂ in the pixel that the reservoir is for | |
 | choice | path l with probability w_l / Σ w | |
 | weight of the chosen path | W = Σ w / p̂ | E[Σ over choices of value · W] = Σ m · value \|J\| W |
-| MIS weights of one path in all pixels that could have found it | ``weigh``, ``pairwise`` | they sum to 1 |
+| MIS weights of one path in all pixels that could have found it | ``weigh`` | they sum to 1 |
 
-[Lin et al. 2022, "Generalized Resampled Importance Sampling"; Bitterli 2022 for the defensive pairwise
-weights]
+[Lin et al. 2022, "Generalized Resampled Importance Sampling"]
 """
 
 from __future__ import annotations
@@ -72,29 +71,6 @@ def choose(weights: list[mi.Float], u: mi.Float) -> tuple[mi.UInt32, mi.Float]:
         chosen = dr.select((weight > 0) & (place >= below), k, chosen)
         below += weight
     return chosen, total
-
-
-def pairwise(M: mi.Float, target: mi.Float, others: list[tuple[mi.Float, mi.Float]]) -> mi.Float:
-    """Defensive pairwise MIS weight of a reservoir's own path against those of ``others``.
-
-    ``M``, ``target``  the reservoir's confidence, and p̂ of its path
-    ``others``         for each other reservoir its confidence, and p̂ |J| of the path there
-
-    Each of the others has ``pairwise_other``. The weights of a path in all places sum to 1.
-    """
-    rest = sum((c for c, _ in others), start=mi.Float(0))
-    weight = M + sum((c * share(M * target, rest * there) for c, there in others), start=mi.Float(0))
-    return weight / (M + rest)
-
-
-def pairwise_other(c: mi.Float, target: mi.Float, M: mi.Float, here: mi.Float, rest: mi.Float) -> mi.Float:
-    """The same of the path of another reservoir.
-
-    ``c``, ``target``  the other's confidence, and p̂ of its path where it comes from
-    ``M``, ``here``    confidence of the reservoir for which paths are chosen, and p̂ |J| of the path there
-    ``rest``           the sum of confidences of all others
-    """
-    return c / (M + rest) * share(rest * target, M * here)
 
 
 def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:

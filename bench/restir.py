@@ -1,0 +1,176 @@
+"""Paths reused from frame to frame beside new ones: cost, noise, and what reconstructions make of it at equal time.
+
+    python -m bench.restir --folder SCENES --scenes diffuse glossy cornell-box --out OUT
+
+The camera goes sideways as in ``bench.sequences``. Rivals:
+
+    restir       reservoirs of pixels and of pairs
+    after        reservoirs of pixels, differences taken of what they have kept: the paper's baseline
+    gpt          samples of their own in each frame
+    primal       reservoirs of pixels alone, no differences; beside ``restir`` only in what a frame costs
+
+``cost`` is what a frame takes, by the clock and in processor time, over that of a sample of ``gpt``: the median of
+``--repeats`` frames of all rivals in turn, at ``--cost-size``, chains as many as samples. ``noise`` is the variance of
+primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample, and times the cost
+in processor time over that of ``gpt``: below 1 where a frame is worth more than it costs. Then all rivals render with
+the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed; + temporal: as
+`ngpt denoise --temporal`, from the first frame on. relMSE and flicker as in ``bench.sequences``.
+"""
+
+import argparse
+import statistics
+import time
+from pathlib import Path
+
+import numpy as np
+
+import ngpt
+from bench.common import metadata, save
+from bench.sequences import SPEEDS, measured, sideways
+from ngpt.temporal import Temporal
+
+RIVALS = {
+    "restir": {"sampler": "restir"},
+    "after": {"sampler": "restir", "gradients": "after"},
+    "gpt": {"sampler": "gpt"},
+}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--folder", type=Path, help="folder of scenes: NAME/scene.xml")
+    parser.add_argument("--scenes", nargs="*", default=["diffuse", "glossy"])
+    parser.add_argument("--shots", nargs="*", default=["slow"], choices=SPEEDS)
+    parser.add_argument("--methods", nargs="*", default=["wcv", "ngpt-fast", "oidn"])
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--skip", type=int, default=8)
+    parser.add_argument("--size", default="96x54")
+    parser.add_argument("--chains", type=int, default=4)
+    parser.add_argument("--cost-size", default="256x144")
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--reference-spp", type=int, default=2048)
+    parser.add_argument("--out", type=Path, required=True)
+    args = parser.parse_args()
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(DEFAULT_VARIANT)
+    result: dict = {"metadata": metadata("mitsuba-oidn"), "scenes": []}
+    for scene in args.scenes:
+        cost = costs(args, scene)
+        print(scene, {name: {k: round(v, 2) for k, v in row.items()} for name, row in cost.items()}, flush=True)
+        for shot in args.shots:
+            found = {"scene": scene, "shot": shot, "cost": cost} | compare(args, scene, shot, cost)
+            result["scenes"].append(found)
+            save(args.out / "restir.json", result)
+
+
+def shot_of(args: argparse.Namespace, scene: str, shot: str, size: str):
+    """The scene with the moving camera of that shot."""
+    from data_gen.frames.sequence import Shot
+
+    pixels = tuple(map(int, size.split("x")))
+    name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
+    path = sideways(Shot(lambda frame: (name, {}), pixels).at(0), SPEEDS[shot])
+    return Shot(lambda frame: (name, {}), pixels, path)
+
+
+def costs(args: argparse.Namespace, scene: str) -> dict[str, dict[str, float]]:
+    """Of a frame, by the clock and in processor time, in samples of gpt; and how many kernels it launches."""
+    import drjit as dr
+
+    from data_gen.passes import render_passes
+    from data_gen.samplers import SAMPLERS
+    from data_gen.samplers.restir.sampler import Restir
+
+    camera = shot_of(args, scene, "slow", args.cost_size)
+    loaded = camera.at(0)
+    rivals = {
+        name: Restir(loaded, 1, args.chains, 6144, gradients=gradients)._history
+        for name, gradients in (("restir", "pairs"), ("after", "after"), ("primal", "after"))
+    }
+    rivals["primal"].gradients = False
+    gpt = SAMPLERS["gpt"].make(loaded)
+    # What the slow shot moves by, everywhere: for the time that it takes.
+    width, height = rivals["restir"].size
+    motion = np.full((height, width, 2), (0.5, 0.0))
+    clock: dict[str, list[float]] = {}
+    processor: dict[str, list[float]] = {}
+    launches: dict[str, int] = {}
+    dr.set_flag(dr.JitFlag.KernelHistory, True)
+    for frame in range(args.repeats + 2):
+        camera.at(frame)
+        for name in (*rivals, "gpt"):
+            dr.kernel_history_clear()
+            start, work = time.perf_counter(), time.process_time()
+            if name == "gpt":
+                render_passes(gpt, loaded.sensors()[0], frame, args.chains)
+            else:
+                rivals[name].next_frame(motion)
+            dr.sync_thread()
+            seconds, work = time.perf_counter() - start, time.process_time() - work
+            history = dr.kernel_history()
+            if frame >= 2:
+                clock.setdefault(name, []).append(seconds)
+                processor.setdefault(name, []).append(work)
+                launches[name] = sum(entry["type"] == dr.KernelType.JIT for entry in history)
+    dr.set_flag(dr.JitFlag.KernelHistory, False)
+    clock_of, processor_of = ({n: statistics.median(v) for n, v in values.items()} for values in (clock, processor))
+    return {
+        name: {
+            "clock": clock_of[name] / clock_of["gpt"],
+            "processor": processor_of[name] / processor_of["gpt"],
+            "launches": launches[name],
+        }
+        for name in clock_of
+    }
+
+
+def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict:
+    """Noise of a frame, and errors of reconstructions at equal processor time."""
+    from data_gen.frames.sequence import render_sequence
+
+    camera = shot_of(args, scene, shot, args.size)
+    reference = {"sampler": "primal", "with_features": False}
+    wanted = range(args.skip, args.frames)
+    references = [
+        stack
+        for _, stack in render_sequence(
+            camera, range(args.frames), args.reference_spp, 2, skip=lambda frame: frame not in wanted, **reference
+        )
+    ]
+    stacks, noise = {}, {}
+    for name, options in RIVALS.items():
+        spp = max(2, round(args.chains * cost["restir"]["processor"] / cost[name]["processor"]))
+        stacks[name] = [stack for _, stack in render_sequence(camera, range(args.frames), spp, 1, **options)]
+        last = stacks[name][-1]
+        if name == "gpt":
+            # Elsewhere caustics are in the differences.
+            *_, (_, last) = render_sequence(
+                camera, range(args.frames), 64, 5, skip=lambda f: f != args.frames - 1, sampler="gpt", caustic=False
+            )
+        noise[name] = {"spp": spp} | {n: spread(last, n) * last.attributes["ngpt:spp"] for n in ("primal", "dx", "dy")}
+    for name, row in noise.items():
+        ratio = cost[name]["processor"]
+        row["at equal time"] = {n: row[n] * ratio / noise["gpt"][n] for n in ("primal", "dx", "dy")}
+        print(scene, shot, name, row["spp"], {n: round(v, 3) for n, v in row["at equal time"].items()}, flush=True)
+    rows = []
+    for name, frames in stacks.items():
+        for method in args.methods:
+            results = [ngpt.reconstruct(stack, method).image for stack in frames]
+            temporal = Temporal()
+            blended = [temporal.next(stack, image) for stack, image in zip(frames, results, strict=True)]
+            images = {method: results[args.skip :], f"{method} + temporal": blended[args.skip :]}
+            for row in measured(frames[args.skip :], references, images):
+                rows.append({"rival": name} | row)
+                print(f"| {scene} | {shot} | {name} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |")
+    return {"noise": noise, "rows": rows}
+
+
+def spread(stack, name: str) -> float:
+    """The variance of a layer, of the mean over all samples; without the worst 1 % of the pixels."""
+    values = np.sort(np.asarray(stack[f"{name}_var"], np.float64).mean(axis=-1).ravel())
+    return float(values[: -max(1, len(values) // 100)].mean())
+
+
+if __name__ == "__main__":
+    main()
