@@ -7,7 +7,7 @@ and that it repeats its bits, is among the laws of all samplers.
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
-from unbiased import FAR, gradient_tests, load, render_ours, render_references
+from unbiased import FAR, REFERENCES, gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
 
@@ -62,6 +62,23 @@ def test_unbiased_far_away(renderer, long_passes, name):
 @pytest.mark.parametrize("name", [name for name in SCENES if name not in ("points", "sky", "bumps", "diffuse")])
 def test_unbiased_far_away_on_more_scenes(renderer, long_passes, name):
     check(renderer, SCENES[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_spectral_and_monochromatic_variants(renderer, long_passes, variant):
+    """Through a thin lens."""
+    from data_gen.backend import use_variant
+
+    try:
+        use_variant(variant)
+        scene = load(renderer, "lens", (24, 24))
+        stacks = render_ours(scene, "gbdpt", 12, 64)
+        references = np.stack([s["primal"] for s in render_ours(scene, "primal", 12, 128, seed=REFERENCES)])
+        for layer, result in gradient_tests(stacks, references):
+            assert result.passed, f"{layer}: {result}"
+    finally:
+        use_variant()
 
 
 @pytest.mark.slow
