@@ -87,6 +87,15 @@ def test_the_first_tables_of_the_results_are_those_of_the_cells():
         assert table in text
 
 
+def test_the_tables_of_bidirectional_samplers_are_those_of_their_file():
+    """`python -m bench.bidirectional --docs` writes them."""
+    from bench.bidirectional import MARKS, table
+
+    result = json.loads((ROOT / "bench" / "results" / "bidirectional.json").read_text())
+    text = (ROOT / "docs" / "bidirectional.md").read_text()
+    assert f"{MARKS[0]}\n\n{table(result)}\n\n{MARKS[1]}" in text
+
+
 def test_the_numbers_of_the_readme_are_in_the_results():
     readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/RESULTS.md"))
     hero = json.loads((ROOT / "bench" / "results" / "hero.json").read_text())["results"]

@@ -7,7 +7,7 @@ and that it repeats its bits, is among the laws of all samplers.
 import numpy as np
 import pytest
 from bdpt_scenes import SCENES
-from unbiased import FAR, gradient_tests, load, render_ours, render_references
+from unbiased import FAR, REFERENCES, gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
 
@@ -62,6 +62,23 @@ def test_unbiased_far_away(renderer, long_passes, name):
 @pytest.mark.parametrize("name", [name for name in SCENES if name not in ("points", "sky", "bumps", "diffuse")])
 def test_unbiased_far_away_on_more_scenes(renderer, long_passes, name):
     check(renderer, SCENES[name])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("variant", ["llvm_ad_spectral", "llvm_ad_mono"])
+def test_spectral_and_monochromatic_variants(renderer, long_passes, variant):
+    """Through a thin lens."""
+    from data_gen.backend import use_variant
+
+    try:
+        use_variant(variant)
+        scene = load(renderer, "lens", (24, 24))
+        stacks = render_ours(scene, "gbdpt", 12, 64)
+        references = np.stack([s["primal"] for s in render_ours(scene, "primal", 12, 128, seed=REFERENCES)])
+        for layer, result in gradient_tests(stacks, references):
+            assert result.passed, f"{layer}: {result}"
+    finally:
+        use_variant()
 
 
 @pytest.mark.slow
@@ -306,8 +323,12 @@ def test_copies_of_paths_joined_to_light_paths(paths, t, s):
 @pytest.mark.parametrize("t", [2, 3])
 def test_planted_errors_are_found(paths, t):
     """Those of which no z-test is sure to tell: the first passes it over one pixel and over eight."""
-    with pytest.raises(AssertionError):
-        paths.compare(*joined(paths, t, 1, paths.steps[t - 1].z.end))
+    from data_gen.samplers.bdpt.mis import Partial
+
+    own = paths.offsets[t - 1].end
+    for end in (paths.steps[t - 1].z.end, Partial(own.vcm, own.vc * 0), Partial(own.vcm, own.vc * 5)):
+        with pytest.raises(AssertionError):
+            paths.compare(*joined(paths, t, 1, end))
     C, (shifted, r, others), base, copy, s, good = joined(paths, t, 1)
     J = (base[2] / copy[2]).astype(np.float32)
     without_J = paths.mi.Float(1 / J)
@@ -335,26 +356,46 @@ def splatted(paths, s):
     )
 
 
+def seen_elsewhere(paths, s):
+    """The copy of ``splatted`` through another pixel: path, copy's place and vertex, and arguments of ``compare``."""
+    from data_gen.samplers.gbdpt.light_shift import inside, shifted
+
+    mi, scene, camera = paths.mi, paths.scene, paths.camera
+    path = splatted(paths, s)
+    uv = path.uv + mi.Vector2f(*paths.SHIFT)
+    good = path.allowed & inside(camera, uv) & (paths.dr.max(path.C) > 0)
+    found = shifted(scene, paths.plan, camera, path, uv, good, paths.integrator.first_hit)
+    ray, _ = paths.sensor.sample_ray(camera.time, camera.wavelength, uv / mi.Vector2f(camera.size), paths.lens)
+    x = scene.ray_intersect(ray, good)
+    behind = [vertex.si for vertex, *_ in paths.from_light[: s - 1]][::-1]
+    lamp = (paths.first.end.p, paths.first.end.n)
+    base, copy = paths.brute([path.y.si, *behind], lamp), paths.brute([x, *behind], lamp)
+    return path, uv, x, (path.C, found, base, copy, s + 1, good)
+
+
+@pytest.mark.parametrize("s", [1, 2])
+def test_planted_errors_of_splats_are_found(paths, s):
+    """The vertex's own Jacobian left out of b' or of r, r of a copy that lies in the same place, weights."""
+    *_, (C, (shifted, r, others), base, copy, s, good) = seen_elsewhere(paths, s)
+    with np.errstate(invalid="ignore"):
+        without_J = paths.mi.Float((copy[2] / base[2]).astype(np.float32))
+    same = r * 0 + 1
+    for wrong in ((shifted * without_J, r, others), (shifted, r * without_J, others), (shifted, same, others)):
+        with pytest.raises(AssertionError):
+            paths.compare(C, wrong, base, copy, s, good)
+
+
 @pytest.mark.parametrize("s", [1, 2, 3])
 def test_copies_of_light_paths_to_the_camera(paths, s):
     """Against brute force; and the copy's copy is the path itself, with 1 / r."""
     from dataclasses import replace
 
     from data_gen.samplers.bdpt.vertex import Vertex
-    from data_gen.samplers.gbdpt.light_shift import inside, shifted
+    from data_gen.samplers.gbdpt.light_shift import shifted
 
     mi, dr, scene, camera = paths.mi, paths.dr, paths.scene, paths.camera
-    path = splatted(paths, s)
-    uv = path.uv + mi.Vector2f(*paths.SHIFT)
-    good = path.allowed & inside(camera, uv) & (dr.max(path.C) > 0)
-    args = scene, paths.plan, camera
-    found = shifted(*args, path, uv, good, paths.integrator.first_hit)
-    ray, _ = paths.sensor.sample_ray(camera.time, camera.wavelength, uv / mi.Vector2f(camera.size), paths.lens)
-    x = scene.ray_intersect(ray, good)
-    behind = [vertex.si for vertex, *_ in paths.from_light[: s - 1]][::-1]
-    lamp = (paths.first.end.p, paths.first.end.n)
-    base, copy = paths.brute([path.y.si, *behind], lamp), paths.brute([x, *behind], lamp)
-    paths.compare(path.C, found, base, copy, s + 1, good)
+    path, uv, x, (C, found, base, copy, _, good) = seen_elsewhere(paths, s)
+    paths.compare(C, found, base, copy, s + 1, good)
 
     # And back
     C, r, others = found
@@ -370,7 +411,7 @@ def test_copies_of_light_paths_to_the_camera(paths, s):
         p = before.bsdf().pdf(mi.BSDFContext(), before, before.to_local(d))
     y = Vertex(x, path.y.β, path.y.end, path.y.depth)
     back = replace(path, y=y, d=d, uv=uv, C=C, others=others, start=start, p=p)
-    C, r_back, others = shifted(*args, back, path.uv, good, paths.integrator.first_hit)
+    C, r_back, others = shifted(scene, paths.plan, camera, back, path.uv, good, paths.integrator.first_hit)
     good = np.array(good & (dr.max(C) > 0))
     assert good.sum() > 100
     error = np.abs(np.array(r, np.float64) * np.array(r_back, np.float64) - 1)[good]
@@ -405,6 +446,51 @@ def test_going_straight_to_a_vertex_and_back(paths):
     assert np.median(error) < 5e-4 and np.quantile(error, 0.98) < 1e-2
     ends = np.array(back.end.vcm, np.float64) / np.array(step.end1.vcm, np.float64)
     assert np.quantile(np.abs(ends - 1)[good], 0.98) < 1e-2
+
+
+def dark_pairs_weighted(difference):
+    """As if a copy that is black or occluded were one of a pair."""
+
+    def mutant(C, others, shifted, r, others_shifted):
+        import drjit as dr
+
+        W, rW = 1 + others, dr.select(dr.isfinite(r * others_shifted), r * (1 + others_shifted), 0)
+        lost = (dr.max(C) > 0) & (dr.max(shifted) <= 0)
+        return dr.select(lost, C * (-2 / (W + rW)), difference(C, others, shifted, r, others_shifted))
+
+    return mutant
+
+
+def splats_rejected(shifted):
+    """As if what light paths splat were never shifted."""
+
+    def mutant(*args):
+        C, r, others = shifted(*args)
+        return C * 0, r, others
+
+    return mutant
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("modules", "function", "mutate"),
+    [
+        (("offset_path", "light_shift"), "difference", dark_pairs_weighted),
+        (("light_shift",), "shifted", splats_rejected),
+    ],
+    ids=["dark pairs weighted", "splats rejected"],
+)
+def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, modules, function, mutate):
+    from importlib import import_module
+
+    for name in modules:
+        module = import_module(f"data_gen.samplers.gbdpt.{name}")
+        monkeypatch.setattr(module, function, mutate(getattr(module, function)))
+    scene = load(renderer, corner, (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    tests = gradient_tests(render_ours(scene, "gbdpt", 16, 64, FAR), references, pixels=FAR)
+    passed = {name: result.passed for name, result in tests}
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
 def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monkeypatch):
