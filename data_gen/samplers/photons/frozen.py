@@ -25,14 +25,16 @@ class Frozen:
         self.functions: dict[Callable, Callable] = {}
 
     def __call__(self, f: Callable, *args: Any) -> Any:
-        if f in self.functions:
-            return self.functions[f](*args)
-        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-        self.functions[f] = dr.freeze(f, state_fn=lambda *_: self.state, warn_after=1 << 30)
+        if f not in self.functions:
+            # Not bound to ``self``: what is in no circle goes when the render does.
+            state = self.state
+            # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+            self.functions[f] = dr.freeze(f, state_fn=lambda *_: state, warn_after=1 << 30)
         try:
             return self.functions[f](*args)
         except RuntimeError:
-            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does.
+            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does, be it of
+            # another scene. It records anew where scenes come and go, so this may be later than at the first call.
             self.functions[f] = f
             return f(*args)
 
