@@ -29,7 +29,7 @@ class Frozen:
             # Not bound to ``self``: what is in no circle goes when the render does.
             state = self.state
             # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-            self.functions[f] = dr.freeze(f, state_fn=lambda *_: state, warn_after=1 << 30)
+            self.functions[f] = dr.freeze(f, state_fn=lambda *_: state, warn_after=1 << 30, auto_opaque=False)
         try:
             return self.functions[f](*args)
         except RuntimeError:
