@@ -127,22 +127,48 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch)
     scene = load(renderer, "diffuse", (16, 12))
     sensor = scene.sensors()[0]
 
-    def rendered():
+    def rendered(others=()):
         passes, film = find("gpm").make(scene), GradientFilm(16, 12, batches=True)
-        with recording():
-            for i in range(3):
+        for i in range(3):
+            with recording():
                 passes(CameraSamples(sensor, 3, 1, i), film)
                 film.end_pass(1)
+            others = [load(renderer, other, (4, 4)) for other in others] if i == 0 else []
         return passes.frozen.functions, film.develop()
 
     functions, layers = rendered()
     # A function is recorded again where two arrays happen to be of one size, or of size 1.
     assert len(functions) > 8 and sum(f.n_recordings for f in functions.values()) <= len(functions) + 2
-    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args: f(*args))
-    functions, others = rendered()
-    assert not functions and layers.keys() == others.keys()
+    # Other scenes come and go, one with a lamp whose texture cannot be kept.
+    _, with_others = rendered([SCENES["areas"]])
+    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args, fixed=False: f(*args))
+    functions, anew = rendered()
+    assert not functions and layers.keys() == anew.keys()
     for name in layers:
-        assert np.array_equal(layers[name], others[name]), name
+        assert np.array_equal(layers[name], anew[name]) and np.array_equal(layers[name], with_others[name]), name
+
+
+def test_what_is_recorded_once_has_the_width_of_each_call(renderer):
+    """Constants too, such as the emission of a scene without lamps: Dr.Jit would keep the width of the first."""
+    import drjit as dr
+
+    from data_gen.samplers.photons.frozen import Frozen
+
+    mi = renderer
+    frozen, time = Frozen(load(mi, "diffuse", (4, 4))), dr.full(mi.Float, 0.5, 20)
+
+    def taken(time, lanes):
+        return dr.gather(mi.Float, time, lanes), lanes + 1
+
+    def constant(time, lanes):
+        return dr.full(mi.Float, 1, dr.width(lanes)), lanes + 1
+
+    for n in (5, 11, 8, 13):
+        lanes = dr.arange(mi.UInt32, n)
+        dr.eval(lanes)
+        for f in (taken, constant):
+            assert [dr.width(x) for x in frozen(f, time, lanes)] == [n, n]
+    assert frozen.functions[taken] != taken and frozen.functions[constant] == constant
 
 
 def test_radii_shrink_as_told():

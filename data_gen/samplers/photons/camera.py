@@ -66,7 +66,7 @@ def levels(
     """
     n = dr.width(rays[0][0].o)
     lanes, η, depth, numbers = dr.arange(mi.UInt32, n), dr.full(mi.Float, 1, n), 1, random.random
-    paths = frozen(begun, scene, rays, first_hit, hide_emitters)
+    paths = frozen(begun, scene, rays, first_hit, hide_emitters, fixed=True)
     while True:
         dr.eval(paths, lanes, η)
         yield Level(depth, lanes, paths[0], paths[1:])

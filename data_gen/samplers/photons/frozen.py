@@ -6,7 +6,7 @@ longer than to run them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import drjit as dr
@@ -24,20 +24,51 @@ class Frozen:
         self.state = [scene, *map(arrays, owners)]
         self.functions: dict[Callable, Callable] = {}
 
-    def __call__(self, f: Callable, *args: Any) -> Any:
-        if f in self.functions:
-            return self.functions[f](*args)
-        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-        self.functions[f] = dr.freeze(f, state_fn=lambda *_: self.state, warn_after=1 << 30)
+    def __call__(self, f: Callable, *args: Any, fixed: bool = False) -> Any:
+        """``fixed``: all calls of f have arrays of the same widths."""
+        if f not in self.functions:
+            # Not bound to ``self``: what is in no circle goes when the render does.
+            state = self.state
+            # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+            options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
+            self.functions[f] = dr.freeze(f if fixed else without_constants(f), **options)
         try:
             return self.functions[f](*args)
         except RuntimeError:
-            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does.
+            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does, be it of
+            # another scene. It records anew where scenes come and go, so this may be later than at the first call.
             self.functions[f] = f
             return f(*args)
 
 
-def call(f: Callable, *args: Any) -> Any:
+def without_constants(f: Callable) -> Callable:
+    """f, which must not return a constant for an array: Dr.Jit 1.5 keeps its width of the call that was recorded."""
+
+    def checked(*args: Any) -> Any:
+        result = f(*args)
+        if any(leaf.state == dr.VarState.Literal and dr.width(leaf) > 1 for leaf in leaves(result)):
+            raise RuntimeError("a constant among the results")
+        return result
+
+    return checked
+
+
+def leaves(value: Any) -> Iterator:
+    """The flat arrays of a tree."""
+    if isinstance(value, list | tuple):
+        parts = value
+    elif dr.is_array_v(value):
+        parts = value if dr.depth_v(value) > 1 else ()
+        if dr.is_jit_v(value) and dr.depth_v(value) == 1:
+            yield value
+    else:
+        names = getattr(type(value), "DRJIT_STRUCT", None) or getattr(value, "__dataclass_fields__", ())
+        parts = [getattr(value, name) for name in names]
+    for part in parts:
+        yield from leaves(part)
+
+
+def call(f: Callable, *args: Any, fixed: bool = False) -> Any:
     """The same, recorded each time."""
     return f(*args)
 

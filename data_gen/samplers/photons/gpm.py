@@ -98,7 +98,7 @@ class GPM(PPM):
                 if emission and level.depth > 1:
                     add_to(sums, level.lanes, frozen(emitted, scene, level.base, level.offsets))
                 elif emission and self.max_depth > 0:
-                    Le = frozen(CameraPath.emission, level.base, scene)
+                    Le = frozen(CameraPath.emission, level.base, scene, fixed=True)
                 if near is not None and level.depth < self.max_depth:
                     for part in differences(passes, near, level, self.max_depth - level.depth, PAIRS * n):
                         add_to(sums, level.lanes, part)

@@ -158,11 +158,11 @@ class PPM(GradientIntegrator):
         near = self.gatherings(passes, keys, camera.first)
         # Emission that camera paths meet is counted with the first map, or without any.
         paths = passes.scene, passes.materials, random, ray, importance
-        L, Le = passes.frozen(self.light, *paths, next(near, None), True)
+        L, Le = passes.frozen(self.light, *paths, next(near, None), True, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
         for scattered in near:
-            L, _ = passes.frozen(self.light, *paths, scattered, False)
+            L, _ = passes.frozen(self.light, *paths, scattered, False, fixed=True)
             values["primal"] += to_rgb(L, ray.wavelengths)
             dr.eval(values["primal"])
         film.put_all(values)
@@ -254,7 +254,7 @@ def begin(passes: Passes, camera: CameraSamples) -> tuple:
     keys = random.next_key(), random.next_key()
     random.schedule_state()
     dr.eval(ray, importance, keys)
-    values = passes.frozen(features, passes.scene, camera.sensor, camera.random, ray)
+    values = passes.frozen(features, passes.scene, camera.sensor, camera.random, ray, fixed=True)
     return ray, importance, random, keys, values
 
 

@@ -109,7 +109,7 @@ def trace(
     places for each path; further maps are of those paths alone that go on, and begin with their last vertex, as parent.
     ``frozen`` calls the functions that make kernels. Returns the light's end of all paths, and the maps.
     """
-    start, within, numbers = frozen(_start, scene, lights, random, fog)
+    start, within, numbers = frozen(_start, scene, lights, random, fog, fixed=True)
     dr.eval(start, within, numbers)
     random = type(random)(numbers)
     n = dr.width(start.ray.d)
@@ -196,7 +196,11 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
             within = channel, where.toward(si, ray.d)
         bounce += 1
         alive &= bounce <= max_depth
-    return _Paths(ray, β, brightest, density, survival, parent, bounce, alive, within), random.random, photons
+    return (
+        _Paths(mi.Ray3f(ray.o, ray.d), β, brightest, density, survival, parent, bounce, alive, within),
+        random.random,
+        photons,
+    )
 
 
 def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f:
