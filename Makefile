@@ -14,7 +14,7 @@ quick: setup-quick
 		tests/training/test_augment.py tests/training/test_losses.py tests/test_*.py
 
 test: setup-dev
-	$(PY) -m pytest -q -m "not slow"
+	$(PY) -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: setup-dev
 	$(PY) -m pytest -q -m slow

@@ -1,116 +1,198 @@
 """Bidirectional samplers at equal time: `path`, `bdpt`, `gpt` and `gbdpt`, with l1, wcv, the networks and OIDN.
 
-    python -m bench.bidirectional --scenes diffuse glossy SCENE.xml ... --out FOLDER
+    python -m bench.bidirectional --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--docs]
+    python -m bench.bidirectional --table                                # of what is in the file
 
-An evaluation (`ngpt evaluate`, docs/evaluation.md) whose clock is `gpt`: all samplers are given the time of --spp of
-its samples, but never less than two passes. What it makes is kept in FOLDER, where a run that was broken off goes on.
-References are two halves of --reference-spp samples by `bdpt`, since `path` has hardly any light where `bdpt` pays;
-where `bdpt` refuses a scene, by `path`. Written are errors (trimmed relMSE, median over seeds), samples and seconds of
-each column, losses included, and each error over the least of its scene.
+Every sampler gets the time of --spp samples of `gpt`, but never less than two passes. What a sample costs is measured
+in the same run, all samplers in turn, the least of --repeats, on images of --timed-size: a pass of `bdpt` has four
+samples a pixel and takes a time to start that a small image does not pay for. Errors are those of small images.
+
+    error      trimmed relMSE against two halves of a reference, mean over --seeds
+    reference  by the sampler with the least noise for its time, in --reference-seconds a half; the error of the mean of
+               both halves, which is taken off all errors, stands beside them
+    time       the seconds that its samples cost over those of `gpt`'s; 1 but for rounding, and where two passes cost
+               more
+
+Scenes in --apart are those that nothing was tuned on, and are marked so. A row is written when its scene is finished; a
+run that was broken off goes on. With another setup a file begins anew. --docs puts the tables into the page.
 """
 
 import argparse
+import json
+import math
 import statistics
+import time
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from unittest.mock import patch
+
+import numpy as np
 
 from bench.common import metadata, save
-from ngpt.errors import NgptError
-from ngpt.evaluation.config import Config, scene_name
-from ngpt.evaluation.references import HALVES
-from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.stacks import REFERENCE_SEED
-from ngpt.io.exr import write
-from ngpt.system.console import Console
+from ngpt.evaluation.config import scene_name
+from ngpt.measure.metrics import EPSILON, relmse_trimmed
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
 
-METHODS = ("path", "bdpt", "l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "oidn")
-# Images as they are, of which those by `bdpt` have features in any case.
-VARIANTS = {
-    "path": {"method": "primal", "stack": "path", "sampler": "primal"},
-    "bdpt": {"method": "primal", "stack": "features", "sampler": "bdpt"},
+RESULT = Path("bench/results/bidirectional.json")
+PAGE = Path("docs/bidirectional.md")
+MARKS = "<!-- python -m bench.bidirectional -->", "<!-- ends here -->"
+# sampler -> options of its renders, and what its stacks are given to; "primal" is the image as it is
+PIPELINES: dict[str, tuple[dict, tuple[str, ...]]] = {
+    "path": ({"sampler": "primal", "with_features": False}, ("primal",)),
+    "path, features": ({"sampler": "primal"}, ("oidn", "ngpt-primal")),
+    "bdpt": ({"sampler": "bdpt"}, ("primal", "oidn", "ngpt-primal")),
+    "gpt": ({"sampler": "gpt"}, ("l1", "wcv", "ngpt-fast", "ngpt-combine")),
+    "gbdpt": ({"sampler": "gbdpt"}, ("l1", "wcv", "ngpt-fast", "ngpt-combine")),
 }
+CLOCK = "gpt"
+_REFERENCE_SEED = 1 << 20
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", required=True)
-    parser.add_argument("--out", type=Path, required=True, metavar="FOLDER")
-    parser.add_argument("--size", type=int, nargs=2, default=(96, 64), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--scenes", nargs="+", default=[])
+    parser.add_argument("--apart", nargs="+", default=[], help="more scenes: those that nothing was tuned on")
+    parser.add_argument("--size", type=int, nargs=2, default=(96, 72), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--timed-size", type=int, nargs=2, default=(256, 192), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--spp", type=int, default=128, help="of gpt (default %(default)s)")
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--reference-spp", type=int, default=2048)
-    parser.add_argument("-o", "--output", default="bench/results/bidirectional.json")
+    parser.add_argument("--repeats", type=int, default=2, help="of timings")
+    parser.add_argument("--reference-seconds", type=float, default=15.0, help="of each half")
+    parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
+    parser.add_argument("--docs", action="store_true", help=f"write the tables into {PAGE}")
+    parser.add_argument("-o", "--output", type=Path, default=RESULT)
     args = parser.parse_args()
+    if args.scenes or args.apart:
+        measure_all(args)
+    result = json.loads(args.output.read_text())
+    if args.table:
+        print(table(result))
+    if args.docs:
+        write_page(PAGE, table(result))
 
+
+def measure_all(args: argparse.Namespace) -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    setup = {"size": list(args.size), "spp": args.spp, "seeds": args.seeds, "reference spp": args.reference_spp}
-    result: dict = {"benchmark": "bidirectional"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
-    for scene in args.scenes:
-        row = result["scenes"][scene_name(scene)] = bench_scene(scene, args)
+    names = ("size", "timed_size", "spp", "seeds", "repeats", "reference_seconds")
+    setup = json.loads(json.dumps({name: getattr(args, name) for name in names}))
+    result: dict = {"benchmark": "bidirectional", "setup": setup, "scenes": {}}
+    if args.output.exists():
+        before = json.loads(args.output.read_text())
+        result["scenes"] = before["scenes"] if before.get("setup") == setup else {}
+    result["metadata"] = metadata("mitsuba", "onnxruntime", "mitsuba-oidn")
+    for scene in (*args.scenes, *args.apart):
+        name, start = scene_name(scene), time.perf_counter()
+        if name in result["scenes"]:
+            continue
+        row = result["scenes"][name] = {"apart": scene in args.apart} | bench_scene(scene, args)
         save(args.output, result)
-        print(
-            scene_name(scene), *(f"{name} {cell['over least']:.3g}" for name, cell in row.items()), sep="  ", flush=True
-        )
+        errors = "  ".join(f"{column} {error:.3g}" for column, error in row["errors"].items())
+        print(f"{name}, {time.perf_counter() - start:.0f} s:  {errors}", flush=True)
 
 
-def bench_scene(scene: str, args: argparse.Namespace) -> dict[str, dict[str, float]]:
-    """Column -> its error, that over the least of the scene, samples for each pixel, and seconds of rendering."""
-    name, out = scene_name(scene), args.out / scene_name(scene)
-    halves = reference(scene, out, args)
-    config = Config(
-        title=f"Bidirectional samplers at equal time: {name}",
-        scenes=(scene,),
-        size=tuple(args.size),
-        spp=(args.spp,),
-        seeds=args.seeds,
-        methods=METHODS,
-        samplers=("gpt", "gbdpt"),
-        rivals=("primal", "bdpt"),
-        clock="gpt",
-        metrics=("relMSE trimmed", "FLIP"),
-        reference_spp=args.reference_spp,
-        references={name: halves} if halves else {},
-        variants=VARIANTS,
-    )
-    cells = evaluate(config, out, Console(quiet=True), "python -m bench.bidirectional")["cells"]
-    rows: dict[str, list[dict[str, Any]]] = {}
-    for cell in cells:
-        if not cell["absent"]:
-            rows.setdefault(cell["method"], []).append(cell)
-    errors = {name: statistics.median(c["metrics"]["relMSE trimmed"] for c in found) for name, found in rows.items()}
-    least = min(errors.values())
+def bench_scene(path: str, args: argparse.Namespace) -> dict:
+    """Sampler -> seconds per sample, samples and time; column -> error; and the reference."""
+    from data_gen.costs import measure
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
+    from data_gen.scenes.load import load_scene, set_film_size
+
+    scene = load_scene(path, tuple(args.timed_size))
+    renders = {name: options for name, (options, _) in PIPELINES.items()}
+    timings, _ = measure(scene, renders, 2 * max(entry.batch for entry in SAMPLERS.values()), args.repeats)
+    seconds = {name: min(values) for name, values in timings.items()}
+    batch = {name: max(1, SAMPLERS[options["sampler"]].batch) for name, options in renders.items()}
+    spp = {name: max(2 * batch[name], round(args.spp * seconds[CLOCK] / seconds[name])) for name in renders}
+
+    set_film_size(scene, tuple(args.size))
+    errors: dict[str, list[float]] = {}
+    halves: list[np.ndarray] = []
+    found: dict[str, GradientStack] = {}
+    for seed in range(args.seeds):
+        found = {name: render_stack(scene, spp[name], seed, **options) for name, options in renders.items()}
+        if not halves:
+            best = quieter(found)
+            halves = reference(scene, renders[best], args.reference_seconds)
+        for name, (_, methods) in PIPELINES.items():
+            for method in methods:
+                if not METHODS[method].missing():
+                    image = reconstruct(found[name], method).image
+                    errors.setdefault(column(name, method), []).append(relmse_trimmed(image, *halves))
     return {
-        name: {
-            "error": error,
-            "over least": error / least,
-            "FLIP": statistics.median(cell["metrics"]["FLIP"] for cell in rows[name]),
-            "spp": rows[name][0]["spp used"],
-            "seconds": statistics.median(cell["seconds"]["render"] for cell in rows[name]),
-        }
-        for name, error in errors.items()
+        "seconds per sample": seconds,
+        "spp": spp,
+        "time": {name: spp[name] * seconds[name] / (args.spp * seconds[CLOCK]) for name in renders},
+        "reference": {"sampler": best, "error": relmse_trimmed(halves[0], halves[1]) / 4},
+        # Above 0: where hardly any error is left, more may be taken off for the reference's.
+        "errors": {name: max(statistics.mean(values), 1e-9) for name, values in errors.items()},
     }
 
 
-def reference(scene: str, out: Path, args: argparse.Namespace) -> list[str]:
-    """The files of two halves by `bdpt`; none where it refuses the scene."""
-    from data_gen.render import render_stack
-    from data_gen.scenes.load import load_scene
+def quieter(stacks: dict[str, GradientStack]) -> str:
+    """Which of `path` and `bdpt` has less noise in equal time, relative to the light that either finds."""
+    light = sum(stacks[name]["primal"].astype(np.float64) for name in ("path", "bdpt")) / 2
+    return min(("path", "bdpt"), key=lambda name: np.mean(stacks[name]["primal_var"] / (light**2 + EPSILON)))
 
-    setup = f"{args.size[0]}x{args.size[1]}-{args.reference_spp}"
-    paths = [out / f"reference-{setup}{half}.exr" for half in HALVES]
-    out.mkdir(parents=True, exist_ok=True)
-    for i, path in enumerate(paths):
-        if not path.exists():
-            try:
-                stack = render_stack(
-                    load_scene(scene, tuple(args.size)), args.reference_spp // 2, REFERENCE_SEED + i, "bdpt"
-                )
-            except NgptError:
-                return []
-            write(path, stack)
-    return [str(path) for path in paths]
+
+def reference(scene, options: dict, seconds: float) -> list[np.ndarray]:
+    """Two independent images, in passes of many samples: nobody reads their variances."""
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
+
+    entry = SAMPLERS[options["sampler"]]
+    longer = {entry.name: replace(entry, batch=64 if entry.batch else 0)}
+    with patch.dict(SAMPLERS, longer):
+        stacks = [render_stack(scene, None, _REFERENCE_SEED + i, **options, seconds=seconds) for i in range(2)]
+    return [stack["primal"].astype(np.float64) for stack in stacks]
+
+
+def column(sampler: str, method: str) -> str:
+    sampler = sampler.removesuffix(", features")
+    return sampler if method == "primal" else f"{sampler}, {method}"
+
+
+def table(result: dict) -> str:
+    """Two tables in Markdown: errors over the least of each scene, with geometric means; costs and samples."""
+    scenes = result["scenes"]
+    columns = list(dict.fromkeys(name for row in scenes.values() for name in row["errors"]))
+    ratios = {
+        name: {c: error / min(row["errors"].values()) for c, error in row["errors"].items()}
+        for name, row in scenes.items()
+    }
+    lines = ["| pipeline | " + " | ".join(shown(name, row) for name, row in scenes.items()) + " | mean |"]
+    lines.append("|---|" + "--:|" * (len(scenes) + 1))
+    for c in columns:
+        cells = [f"**{r[c]:.3g}**" if r[c] == 1 else f"{r[c]:.3g}" if c in r else "" for r in ratios.values()]
+        mean = math.exp(statistics.mean(math.log(r[c]) for r in ratios.values() if c in r))
+        lines.append(f"| {c} | " + " | ".join(cells) + f" | {mean:.3g} |")
+    samplers = [name for name in PIPELINES if not name.endswith(", features")]
+    lines += ["", "| scene | least error | reference, by | cost over `path`: " + ", ".join(samplers[1:])]
+    lines[-1] += " | samples: " + ", ".join(samplers) + " | time |"
+    lines.append("|---|--:|--:|--:|--:|--:|")
+    for name, row in scenes.items():
+        each = row["seconds per sample"]
+        costs = ", ".join(f"{each[s] / each['path']:.1f}" for s in samplers[1:])
+        samples = ", ".join(str(row["spp"][s]) for s in samplers)
+        made = f"{row['reference']['error']:.2g}, `{row['reference']['sampler']}`"
+        most = f"{max(row['time'].values()):.2g}"
+        lines.append(
+            f"| {shown(name, row)} | {min(row['errors'].values()):.3g} | {made} | {costs} | {samples} | {most} |"
+        )
+    return "\n".join(lines)
+
+
+def shown(name: str, row: dict) -> str:
+    return f"{name} (apart)" if row["apart"] else name
+
+
+def write_page(page: Path, text: str) -> None:
+    """Puts the tables between the marks of the page."""
+    before, _, rest = page.read_text().partition(MARKS[0])
+    _, _, after = rest.partition(MARKS[1])
+    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{after}")
 
 
 if __name__ == "__main__":

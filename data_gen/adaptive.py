@@ -209,3 +209,10 @@ def share_out(need: np.ndarray, n: np.ndarray, samples: float) -> np.ndarray:
         low, high = (middle, high) if np.maximum(middle * shares - n, 0).sum() < samples else (low, middle)
     blocks = np.floor(np.maximum(low * shares - n, 0) / BLOCK + 0.5).astype(int)
     return blocks if blocks.any() else np.ones(len(n), int)
+
+
+def gain(need: np.ndarray) -> float:
+    """Squared error over that of even samples of the same number, where ``need`` (pixels) is right and counts exact."""
+    shares = np.clip(need / max(need.mean(), 1e-300), _FLOOR, _CAP)
+    squares = np.square(need)
+    return float((squares / (shares / shares.mean())).mean() / max(squares.mean(), 1e-300))

@@ -6,6 +6,11 @@ images by all other samplers together: their noise has no mean, as in ``ngpt.mea
 without gradients is its noise, half the mean squared difference of its two images. Errors fall as 1 / n with the number
 of samples, so error times time says how long a sampler takes to a given error.
 
+The image of a biased sampler (photons) is judged as a reconstruction is, and no biased sampler judges others. Its error
+falls as n^(-2/3) only, so it is the time to the error that the scene's own sampler has at the end that counts. Where it
+finds most of the light, those that judge it have much noise: twice the standard error is added to what they say. So it
+is chosen where it is better beyond doubt, and not in scenes whose light it alone can find.
+
 The difference of two reconstructions would not do: light that a sampler finds in one pixel of a thousand is an outlier,
 which ``wcv`` takes out of both. What a pilot cannot see is light that none of the samplers has found.
 """
@@ -35,18 +40,20 @@ from ngpt.methods import reconstruct
 # Samples per pixel of each of the two stacks; of a sampler with batches at least two of those
 SPP = 8
 # Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
-_PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
-# Of what the whole render may take
-SHARE = 0.05
+PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
+# Of what the whole render may take: after this share no trial is begun, and what each may take
+SHARE, DEAREST = 0.05, 0.1
 # Renders for which that is enough to compile the kernels of other samplers and to try them: by seconds, and by paths,
 # of which a core or two make a million a second
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
+# Of the standard error of what is said of a biased sampler, and the power by which its errors fall
+_DOUBT, _FALL = 2.0, 2 / 3
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.25
 # The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
 _TRIM = 0.001
 # Seeds far from those that users take
-_SEED = 0x9E3779B9
+SEED = 0x9E3779B9
 
 
 @dataclass(frozen=True)
@@ -72,15 +79,17 @@ class Choice:
     seconds: float = 0.0
 
 
-def candidates(scene: mi.Scene) -> list[str]:
-    """What could render the scene: the sampler that its description stands for, and then those to be compared with."""
+def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
+    """What could render the scene: the sampler that its description stands for, and then those to be compared with.
+
+    Those of them that are ``biased`` come last, if at all.
+    """
     facts = scene_facts(scene)
     first, _ = choose(facts)
     if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
         return [first]
-    return [first] + [
-        name for name, sampler in SAMPLERS.items() if name != first and sampler.tried and not sampler.refuses(facts)
-    ]
+    able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
+    return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
 
 
 def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, memory: int = DEFAULT_MEMORY) -> Choice:
@@ -93,45 +102,62 @@ def choose_by_pilot(scene: mi.Scene, spp: int | None, seconds: float | None, mem
     """
     start = time.perf_counter()
     sampler, reason = choose(scene_facts(scene))
-    names = candidates(scene)
-    if len(names) == 1:
+    able = candidates(scene, biased=True)
+    if len(able) == 1:
         return Choice(sampler, reason)
     paths = math.inf if spp is None else spp * math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
     if paths < _LEAST_PATHS or (seconds is not None and seconds < _LEAST_SECONDS):
         return Choice(sampler, f"{reason}; the render is too short to try others")
     entry = SAMPLERS[sampler]
     film_within(memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch)
-    with _at_most(scene, _PIXELS) as scale:
+    with at_most(scene, PIXELS) as scale:
         first = try_out(scene, sampler)
         if first is None:
             return Choice(sampler, reason, time.perf_counter() - start)
         by_samples = math.inf if spp is None else first.seconds * spp / SPP * scale
-        limit = start + SHARE * min(by_samples, math.inf if seconds is None else seconds)
-        trials = compare_with(scene, names, first, lambda: time.perf_counter() < limit)
-    best, why = judge(sampler, times_to_an_error(trials))
+        whole = min(by_samples, math.inf if seconds is None else seconds)
+        trials = compare_with(scene, able, first, lambda: time.perf_counter() < start + SHARE * whole, DEAREST * whole)
+    times, unsure = times_to_an_error(trials, whole / scale), doubtful(trials)
+    best, why = judge(sampler, times)
+    if best not in unsure:
+        best, why = judge(sampler, {name: t for name, t in times.items() if name not in unsure})
+        if unsure:
+            names = " and ".join(f"'{name}'" for name in unsure)
+            why += f"; the others find too little of the light to judge {names}"
     return Choice(best, why, time.perf_counter() - start)
 
 
 def compare_with(
-    scene: mi.Scene, names: list[str], first: Trial, goes_on: Callable[[], bool] = lambda: True
+    scene: mi.Scene,
+    names: list[str],
+    first: Trial,
+    goes_on: Callable[[], bool] = lambda: True,
+    limit: float = math.inf,
 ) -> dict[str, Trial]:
-    """The trials of samplers by name, the first of which is known, as far as there is time for them."""
+    """The trials of samplers by name, the first of which is known, as far as there is time for them; each may take
+    ``limit`` seconds."""
     trials = {names[0]: first}
     for i, name in enumerate(names[1:], 1):
         if not goes_on():
             break
-        if (trial := try_out(scene, name, _SEED + 2 * i)) is not None:
+        if (trial := try_out(scene, name, SEED + 2 * i, limit)) is not None:
             trials[name] = trial
     return trials
 
 
-def try_out(scene: mi.Scene, sampler: str, seed: int = _SEED) -> Trial | None:
-    """Two small stacks by a sampler; None where it finds, of this scene, that it cannot render it."""
+def try_out(scene: mi.Scene, sampler: str, seed: int = SEED, limit: float = math.inf) -> Trial | None:
+    """Two small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
+    expected to take longer than the ``limit``."""
+    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
     try:
         render_stack(scene, 1, seed, sampler)  # compiles
     except NgptError:
         return None
-    spp = max(SPP, 2 * SAMPLERS[sampler].batch)
+    if limit < math.inf:
+        start = time.perf_counter()
+        render_stack(scene, least, seed, sampler)
+        if 2 * spp / least * (time.perf_counter() - start) > limit:
+            return None
     stacks, seconds = [], []
     for i in range(2):
         start = time.perf_counter()
@@ -142,21 +168,54 @@ def try_out(scene: mi.Scene, sampler: str, seed: int = _SEED) -> Trial | None:
     return Trial((images[0], images[1]), (primals[0], primals[1]), min(seconds))
 
 
-def times_to_an_error(trials: dict[str, Trial]) -> dict[str, float]:
-    """Seconds that each sampler of a pilot takes to an error of 1; no more than their ratios are of use."""
-    middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
-    noise = {name: max(_noise(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
-    # Of all samplers, those with little noise count most: to what the errors are relative, and as witnesses.
-    scale = _mean({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
-    times = {}
+def times_to_an_error(trials: dict[str, Trial], seconds: float = math.inf) -> dict[str, float]:
+    """Seconds that each sampler of a pilot, the first of which is unbiased, takes to an error of 1; no more than their
+    ratios are of use. Those of biased samplers are of a render, as large as the pilot's, that takes so many ``seconds``
+    by the first."""
+    noise, scale = _noise_and_scale(trials)
+    times: dict[str, float] = {}
     for name, trial in trials.items():
-        error = _noise(*trial.primals, scale)
-        others = {other: noise[other] for other in trials if other != name}
-        if SAMPLERS[name].gradients and others:
-            witnesses = [_mean({other: trials[other].primals[i] for other in others}, others) for i in range(2)]
-            error = statistics.mean(_error(image, witnesses, scale) for image in trial.images)
+        error = noise_of(*trial.primals, scale)
+        if SAMPLERS[name].biased:
+            error, doubt = _judged(trials, name, noise, scale)
+            error += _DOUBT * doubt
+        elif SAMPLERS[name].gradients and len(_fair(trials, name)):
+            error, _ = _judged(trials, name, noise, scale)
         times[name] = max(error, 1e-9) * trial.seconds
+        if SAMPLERS[name].biased:
+            first, power = next(iter(times.values())), 1 / _FALL
+            times[name] = first * trial.seconds * (max(error, 1e-9) / first) ** power * seconds ** (power - 1)
     return times
+
+
+def doubtful(trials: dict[str, Trial]) -> list[str]:
+    """The biased samplers of whose error the others are not sure, since they find too little of the light."""
+    noise, scale = _noise_and_scale(trials)
+    judged = {name: _judged(trials, name, noise, scale) for name in trials if SAMPLERS[name].biased}
+    return [name for name, (error, doubt) in judged.items() if _DOUBT * doubt > error]
+
+
+def _noise_and_scale(trials: dict[str, Trial]) -> tuple[dict[str, float], np.ndarray]:
+    """The noise of each sampler's image, and what errors are relative to: of all samplers, those with little noise
+    count most, as they do as witnesses."""
+    middle = sum((a + b) / 2 for a, b in (trial.primals for trial in trials.values())) / len(trials)
+    noise = {name: max(noise_of(*trial.primals, middle), 1e-12) for name, trial in trials.items()}
+    return noise, mean_of({name: (trial.primals[0] + trial.primals[1]) / 2 for name, trial in trials.items()}, noise)
+
+
+def _fair(trials: dict[str, Trial], name: str) -> list[str]:
+    """Who may judge a sampler: all others that are unbiased."""
+    return [other for other in trials if other != name and not SAMPLERS[other].biased]
+
+
+def _judged(trials: dict[str, Trial], name: str, noise: dict[str, float], scale: np.ndarray) -> tuple[float, float]:
+    """The error of a sampler's images by the others, and the standard error of that."""
+    others = _fair(trials, name)
+    witnesses = [mean_of({o: trials[o].primals[i] for o in others}, noise) for i in range(2)]
+    error = statistics.mean(error_of(image, witnesses, scale) for image in trials[name].images)
+    # What its two images differ by is sure, where noise of the others hides the rest.
+    error = max(error, noise_of(*trials[name].images, scale))
+    return error, doubt_of(trials[name].images[0], witnesses, scale)
 
 
 def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
@@ -169,23 +228,30 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     return best, f"chosen by a pilot: {found}"
 
 
-def _mean(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
+def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
     """Of images by name, weighted by 1 / their noise."""
     weights = {name: 1 / noise[name] for name in images}
     return sum(weights[name] * image for name, image in images.items()) / sum(weights.values())
 
 
-def _noise(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
+def noise_of(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
     """The relMSE of each of two independent unbiased images, by their difference; trimmed as the metric is."""
     errors = np.square(a - b) / 2 / _denominator(scale)
     return trimmed_mean(errors, errors, _TRIM)
 
 
-def _error(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
+def error_of(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
     """The relMSE of an image by two independent unbiased ones; trimmed as the metric is."""
     a, b = witnesses
     under = _denominator(scale)
     return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
+
+
+def doubt_of(x: np.ndarray, witnesses: list[np.ndarray], scale: np.ndarray) -> float:
+    """The standard error of ``error_of``, by how much pixels differ."""
+    a, b = witnesses
+    values = ((x - a) * (x - b) / _denominator(scale)).mean(axis=-1)
+    return float(values.std()) / math.sqrt(values.size)
 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:
@@ -194,7 +260,7 @@ def _denominator(scale: np.ndarray) -> np.ndarray:
 
 
 @contextmanager
-def _at_most(scene: mi.Scene, pixels: int):
+def at_most(scene: mi.Scene, pixels: int):
     """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it.
 
     A cropped film stays as it is: its window could not be set again.

@@ -9,6 +9,7 @@ from typing import Any
 import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
+from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.scenes.facts import scene_facts
@@ -75,16 +76,25 @@ def render_stack(
         film, chosen = render_adaptive(
             sample, sensor, seed, adaptive, spp, progress, seconds, memory, stop, entry.lane_bytes
         )
+    if adaptive is not None:
+        chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
+    return stack_of(film, seed, sampler, start, diagnostics, chosen)
+
+
+def stack_of(
+    film: GradientFilm, seed: int, sampler: str, start: float, diagnostics: bool, more: dict[str, Any]
+) -> GradientStack:
+    """The stack of a film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes."""
     layers = film.develop()
     attributes = {
-        "ngpt:spp": film.samples if adaptive is None else round(float(film.samples_each.mean())),
+        "ngpt:spp": film.samples,
         "ngpt:seed": str(seed),
         "ngpt:sampler": sampler,
         "ngpt:seconds": time.perf_counter() - start,
         "ngpt:normalSpace": "camera",
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
-    } | chosen
+    } | more
     stack = GradientStack(layers, attributes=attributes)
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 

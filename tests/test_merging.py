@@ -149,6 +149,16 @@ def test_results_are_not_merged(rng, tmp_path):
         merge([ngpt.read(path) for path in paths])
 
 
+def test_files_of_samplers_without_gradients(rng, tmp_path):
+    """Their emission seen directly is that of the contract too: a sampler of ours is named in the file."""
+    paths = []
+    for seed in range(2):
+        stack = stack_of(rng.random((4, *SHAPE)), seed, gradients=False)
+        paths.append(ngpt.write(tmp_path / f"{seed}.exr", stack.replace(direct=0.5 * stack["primal"])))
+    merged = merge([ngpt.read(path) for path in paths])
+    assert np.allclose(merged["direct"], 0.5 * merged["primal"], atol=1e-6)
+
+
 def test_command(rng, tmp_path, capsys):
     paths = []
     for seed in range(3):

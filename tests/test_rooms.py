@@ -42,6 +42,7 @@ data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames
 data_gen.costs data_gen.pilot
+data_gen.pipelines
 data_gen.dataset
 ngpt.evaluation
 ngpt.cli

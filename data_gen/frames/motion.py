@@ -145,13 +145,19 @@ def seen(scene: mi.Scene) -> Seen:
     return Seen(points, straight, shape, np.array(hit.prim_index), np.array(hit.prim_uv, np.float64).T.reshape(-1, 2))
 
 
-def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot) -> np.ndarray:
+def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
+    """(H, W): how far along the camera's axis things seem to be, in units of its own; infinite where rays escape."""
+    width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+    return np.where(what.shape >= 0, what.points @ now.film[3], np.inf).reshape(height, width)
+
+
+def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
     """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
 
-    ``now`` is the snapshot of ``scene``. NaN where that is not known: behind the camera of before, or on a shape that
-    was not there. Raises NgptError for a camera without a projection.
+    ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where motion is not known:
+    behind the camera of before, or on a shape that was not there. Raises NgptError for a camera without a projection.
     """
-    what = seen(scene)
+    what = seen(scene) if what is None else what
     moved = what.points.copy()
     unknown = np.zeros(len(moved), bool)
     if now.shapes is not before.shapes:

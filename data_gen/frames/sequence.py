@@ -11,9 +11,11 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.frames.camera_path import CameraPath, horizontal
-from data_gen.frames.motion import Geometry, Snapshot, motion_vectors, snapshot
+from data_gen.frames.motion import Geometry, Snapshot, depth, motion_vectors, seen, snapshot
 from data_gen.frames.pairs import difference, light
+from data_gen.frames.remembering import Remembering
 from data_gen.render import render_stack
+from data_gen.samplers import FRAME_SAMPLERS
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
@@ -64,6 +66,10 @@ class Shot:
         self._shapes = taken.shapes
         return taken
 
+    def changes(self, frames: Sequence[int]) -> bool:
+        """Whether anything but the camera may change in these frames."""
+        return self.update is not None or any(self.describe(frame) != self.describe(frames[0]) for frame in frames)
+
     def _place_camera(self, sensor: mi.Sensor, frame: int) -> None:
         view, params = self.camera.at(frame), mi.traverse(sensor)
         params["to_world"] = type(params["to_world"])(mi.ScalarTransform4f(view.to_world).matrix)
@@ -90,6 +96,7 @@ def render_sequence(
     dt: int = 0,
     skip: Callable[[int], bool] = lambda frame: False,
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
+    sampler: str = "auto",
     **options: Any,
 ) -> Iterator[tuple[int, GradientStack]]:
     """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
@@ -99,6 +106,9 @@ def render_sequence(
     frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
     ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
 
+    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the frames before. Where frames are left out, up to its
+    ``warm_up`` of them are rendered nevertheless, and not given. Such a sampler has ``seed`` for all frames.
+
     With ``dt`` pairs of samples a pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of samples of their own
     (``data_gen.frames.pairs``), by Mitsuba's integrator, without features. Each pair is two paths, one in the scene of
     the frame before: where parameters change, scenes are loaded twice a frame. Their seconds are in ``ngpt:seconds``.
@@ -106,22 +116,35 @@ def render_sequence(
     before: Snapshot | None = None
     last = None
     step = frames[1] - frames[0] if len(frames) > 1 else 1
-    for i, frame in enumerate(frames):
-        if skip(frame):
+    remembers = FRAME_SAMPLERS.get(sampler)
+    remembering = None if remembers is None else Remembering(remembers, shot.changes(frames), spp, seed, options)
+    done = 0
+    for i, wanted in enumerate(frames):
+        if skip(wanted):
             continue
-        previous = frames[i - 1] if i else frame - step
-        if last != previous:
-            before = _before(shot, previous, first=i == 0)
-        now = shot.snapshot(frame)
-        scene = shot.at(frame)
-        width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
-        motion = np.full((height, width, 2), np.nan) if before is None else motion_vectors(scene, now, before)
-        stack = render_stack(scene, spp, frame_seed(seed, frame), progress=progress(frame), **options)
+        # Frames before it, for their history alone
+        for j in range(max(done, i - remembers.warm_up if remembers else i), i + 1):
+            frame, previous = frames[j], frames[j - 1] if j else frames[0] - step
+            if last != previous:
+                before = _before(shot, previous, first=j == 0)
+            now = shot.snapshot(frame)
+            scene = shot.at(frame)
+            width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+            motion, what = np.full((height, width, 2), np.nan), None
+            if before is not None:
+                what = seen(scene)
+                motion = motion_vectors(scene, now, before, what)
+            if remembering is not None:
+                far = None if what is None else depth(scene, now, what)
+                stack = remembering.render(scene, j, motion, far, progress(frame))
+            else:
+                stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
+            before, last = now, frame
+        done = i + 1
         stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
         stack = stack.replace(motion=motion)
         del scene  # two scenes in memory would make kernels larger
         yield frame, _with_dt(stack, shot, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
-        before, last = now, frame
 
 
 def _with_dt(stack: GradientStack, shot: Shot, frame: int, previous: int, pairs: int, seed: int) -> GradientStack:

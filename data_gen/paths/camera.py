@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from copy import copy
+from typing import Self
 
 import drjit as dr
 import mitsuba as mi
@@ -49,15 +50,29 @@ class CameraSamples:
             pixel, first = dr.gather(mi.UInt32, some, pixel), dr.gather(mi.UInt32, first, pixel)
         self.pixel = pixel
         sample = lane // in_block * in_pixel + lane % in_pixel + first
-        self.random = sample_streams(seed, pixel, sample)
+        self._draw(seed, pixel, sample)
         corner = mi.Point2f(pixel % self.size.x, pixel // self.size.x)
-        self.position = corner + self.random.next_2d()
-        self.lens = self.random.next_2d() if sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        self.time = sensor.shutter_open() + sensor.shutter_open_time() * self.random.next_1d()
-        self.wavelength = self.random.next_1d()
+        self.position = corner + self.position
         dr.schedule(self.position, self.lens, self.time, self.wavelength)
         self.random.schedule_state()
         dr.eval()
+
+    @classmethod
+    def replayed(cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f) -> Self:
+        """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
+        camera = cls.__new__(cls)
+        camera.sensor, camera.size, camera.pixel = sensor, mi.ScalarVector2u(sensor.film().crop_size()), pixel
+        camera._draw(seed, pixel, sample)
+        camera.position = place
+        return camera
+
+    def _draw(self, seed: int, pixel: mi.UInt32, sample: mi.UInt32) -> None:
+        """All random numbers of a camera sample; ``position`` is that within the pixel."""
+        self.random = sample_streams(seed, pixel, sample)
+        self.position = self.random.next_2d()
+        self.lens = self.random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
+        self.time = self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d()
+        self.wavelength = self.random.next_1d()
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
         """The samples of these ``lanes`` alone, as far as rays and random numbers go."""

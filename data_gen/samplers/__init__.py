@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ngpt.errors import NgptError
 
@@ -62,7 +62,30 @@ class Sampler:
     module: str = ""
 
 
+@dataclass(frozen=True)
+class FrameSampler:
+    """What renders the frames of a shot one after the other, for it remembers those before; no single images.
+
+    ``name``, ``summary``, ``refuses``, ``options``  as of a ``Sampler``
+    ``make``     (scene, seed, samples per pixel, memory in MiB, options) -> an object whose ``film(index, motion,
+                 depth)`` is the film of a frame, numbered in the shot; raises NgptError for what it cannot render
+    ``spp``      samples per pixel of a frame, where the user gives none
+    ``warm_up``  frames before, that are rendered where a shot is gone on with: its history
+    ``alone``    why it renders no single images
+    """
+
+    name: str
+    summary: str
+    make: Callable[..., Any]
+    refuses: Callable[[Facts], str]
+    options: Mapping[str, str]
+    spp: int
+    warm_up: int
+    alone: str
+
+
 SAMPLERS: dict[str, Sampler] = {}
+FRAME_SAMPLERS: dict[str, FrameSampler] = {}
 
 
 def register(sampler: Sampler) -> None:
@@ -74,6 +97,10 @@ def register(sampler: Sampler) -> None:
 
 def find(name: str, facts: Facts | None = None) -> Sampler:
     """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
+    if name in FRAME_SAMPLERS:
+        raise NgptError(
+            f"sampler '{name}' is for sequences (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt"
+        )
     if name not in SAMPLERS:
         raise NgptError(f"unknown sampler '{name}'; choose one of: auto, {', '.join(SAMPLERS)}")
     sampler = SAMPLERS[name]
@@ -100,12 +127,12 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 def summaries() -> dict[str, str]:
     """Name -> summary, for help texts."""
-    return {name: sampler.summary for name, sampler in SAMPLERS.items()}
+    return {name: sampler.summary for name, sampler in (*SAMPLERS.items(), *FRAME_SAMPLERS.items())}
 
 
-def _from_module(module: str) -> Callable[..., SamplePass]:
+def _from_module(module: str) -> Callable[..., Any]:
     """The function ``make`` of a module, which is imported when it is first called."""
-    return lambda scene, **options: import_module(module).make(scene, **options)
+    return lambda scene, *args, **options: import_module(module).make(scene, *args, **options)
 
 
 def _refused_by_gpt(facts: Facts) -> str:
@@ -273,7 +300,6 @@ for _sampler in (
         _notes_on_photons,
         _PHOTON_OPTIONS,
         gradients=False,
-        tried=False,
         batch=1,
         biased=True,
         module=_PPM,
@@ -285,7 +311,6 @@ for _sampler in (
         lambda facts: _refused_but_for_surfaces(facts, "gpm"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
-        tried=False,
         batch=1,
         biased=True,
         module=_GPM,
@@ -325,3 +350,18 @@ for _sampler in (
     ),
 ):
     register(_sampler)
+
+FRAME_SAMPLERS["restir"] = FrameSampler(
+    "restir",
+    "gradients of paths that are reused from frame to frame (sequences whose camera alone moves)",
+    _from_module("data_gen.samplers.restir.sampler"),
+    lambda facts: _refused_but_for_surfaces(facts, "restir"),
+    {
+        "history": "frames that a reservoir can count for (32)",
+        "gradients": "pairs: of reservoirs of pairs of pixels; after: of the paths that pixels have kept",
+        "roughness_threshold": "the microfacet roughness above which materials are connectable",
+    },
+    spp=2,
+    warm_up=16,
+    alone="without frames before, it takes 2 to 3 times as long as 'gpt' to the same error",
+)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import math
 import shlex
 import time
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from ngpt.cli.arguments import add_json, assignment, duration, natural, positive, print_json, size
 from ngpt.errors import NgptError
-from ngpt.measure.advice import Advice, advise, describe, read_table, relative_noise
+from ngpt.measure.advice import LARGEST_SPP, Advice, advise, describe, read_table, relative_noise
 from ngpt.methods import METHODS
 from ngpt.system.console import Console
 
 if TYPE_CHECKING:
     from data_gen.pilot import Choice
+    from data_gen.pipelines import Pipeline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -25,9 +27,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument("--seconds", type=duration, help="time for rendering and reconstruction")
     goal.add_argument("--error", type=duration, metavar="ERROR", help="trimmed relMSE to reach")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
-    parser.add_argument("--pilot", type=positive, default=4, metavar="SPP", help="samples of the pilot (default: 4)")
-    parser.add_argument("--seed", type=natural, default=0, help="of the pilot (default: 0)")
-    parser.add_argument("--table", metavar="FILE", help="measurements, as `ngpt evaluate --advice FILE` writes them")
+    parser.add_argument(
+        "--table",
+        metavar="FILE",
+        help="go by measurements of other scenes, as `ngpt evaluate --advice FILE` writes them, and a smaller pilot; "
+        "'shipped' stands for those of the package",
+    )
+    parser.add_argument(
+        "--pilot", type=positive, default=4, metavar="SPP", help="with --table: samples of the pilot (default: 4)"
+    )
+    parser.add_argument("--seed", type=natural, default=0, help="with --table: of the pilot (default: 0)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -35,8 +44,88 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_json(parser)
 
 
+@dataclass(frozen=True)
+class Row:
+    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` are those of both."""
+
+    sampler: str
+    method: str
+    adaptive: bool
+    spp: int
+    seconds: float
+    error: float
+
+
 def run(args: argparse.Namespace, console: Console) -> int:
-    table = read_table(args.table)
+    return by_pilot(args, console) if args.table is None else by_table(args, console)
+
+
+def by_pilot(args: argparse.Namespace, console: Console) -> int:
+    """What each sampler and method is expected to do, by small renders of this scene."""
+    # Only the verbs that render import the renderer.
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(args.variant or DEFAULT_VARIANT)
+    from data_gen.pipelines import LONG, explore
+    from data_gen.scenes.load import load_scene
+
+    start = time.perf_counter()
+    scene = load_scene(args.scene, args.size, dict(args.define))
+    found = rows_of(explore(scene, args.seconds or LONG), args.seconds, args.error)
+    console.say(f"{args.scene}: pilot of {time.perf_counter() - start:.1f} s with compilation")
+    if args.json:
+        film = scene.sensors()[0].film().crop_size()
+        rows = [asdict(row) | {"commands": commands_of(row, args)} for row in found]
+        report = {"scene": args.scene, "size": [int(n) for n in film], "sampler": found[0].sampler}
+        print_json(report | {"advice": rows})
+        return 0
+    print(f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}")
+    for row in found:
+        shared = "adaptive" if row.adaptive else "even"
+        print(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}")
+    print("", *commands_of(found[0], args), sep="\n")
+    return 0
+
+
+def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | None) -> list[Row]:
+    """The best of each sampler and method, adaptive or not, in so many ``seconds`` or to the ``error``; the one to take
+    first. Raises NgptError where none fits."""
+    found = []
+    for p in pipelines:
+        spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error))
+        if max(p.least, 2) <= spp < LARGEST_SPP:
+            found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp)))
+    if not found and seconds is not None:
+        least = min(p.takes(max(p.least, 2)) for p in pipelines)
+        raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {least:.2g} s")
+    if not found:
+        raise NgptError(f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; ask for more")
+    found.sort(key=lambda row: row.error if seconds is not None else row.seconds)
+    best: dict[tuple[str, str], Row] = {}
+    for row in found:
+        best.setdefault((row.sampler, row.method), row)
+    return list(best.values())
+
+
+def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
+    """What to type for that row: a line that renders the stack, and one that denoises it."""
+    stem = f"{Path(args.scene).stem}-{row.spp}spp"
+    adaptive = ["--adaptive"] if row.adaptive else []
+    render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(row.spp), "--sampler", row.sampler]
+    denoise = ["ngpt", "denoise", f"{stem}.exr", "-o", f"{stem}-{row.method}.exr", "--method", row.method]
+    return [shlex.join([*render, *adaptive, *of_the_scene(args)]), shlex.join(denoise)]
+
+
+def of_the_scene(args: argparse.Namespace) -> list[str]:
+    """The options of this call that are those of a render too."""
+    words = ["--size", "{}x{}".format(*args.size)] if args.size else []
+    words += ["--variant", args.variant] if args.variant else []
+    return words + [word for name, value in args.define for word in ("-D", f"{name}={value}")]
+
+
+def by_table(args: argparse.Namespace, console: Console) -> int:
+    """What each method is expected to do, by laws that were fitted on other scenes."""
+    table = read_table(None if args.table == "shipped" else args.table)
     # Only the verbs that render import the renderer.
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
@@ -144,12 +233,7 @@ def commands(advice: Advice, args: argparse.Namespace, table: dict, sampler: str
     render = ["ngpt", "render", args.scene, "-o", f"{stem}.exr", "--spp", str(advice.spp)]
     # Gradients that are not wanted are not rendered.
     render += ["--sampler", "primal" if SAMPLERS[sampler].gradients and advice.stack != "gradients" else sampler]
-    if args.size:
-        render += ["--size", "{}x{}".format(*args.size)]
-    if args.variant:
-        render += ["--variant", args.variant]
-    for name, value in args.define:
-        render += ["-D", f"{name}={value}"]
+    render += of_the_scene(args)
     method, options = call(advice.method, table)
     denoise = ["ngpt", "denoise", f"{stem}.exr", "-o", f"{stem}-{advice.method}.exr", "--method", method]
     for name, value in options.items():

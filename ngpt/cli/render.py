@@ -1,13 +1,14 @@
 """``ngpt render``: from a scene to a gradient stack."""
 
 import argparse
+import shlex
 import signal
 from collections.abc import Callable, Iterator
 from concurrent.futures import as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
-from data_gen.samplers import summaries
+from data_gen.samplers import FRAME_SAMPLERS, summaries
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.cli.frames import filled, frames, targets, varies
 from ngpt.errors import NgptError
@@ -47,7 +48,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--for",
         dest="method",
         metavar="METHOD",
-        help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv)",
+        help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv). With "
+        "--time alone: what a pilot chooses the sampler for, and whether samples are adaptive, by the error that it "
+        "expects of the result; with `auto` it chooses the method too. --time is then that of pilot, render and method",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     samplers = "; ".join(f"{name}: {summary}" for name, summary in summaries().items())
@@ -122,8 +125,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
+    from data_gen.adaptive import Adaptive
     from data_gen.passes import DEFAULT_MEMORY
     from data_gen.pilot import choose_by_pilot
+    from data_gen.pipelines import plan
     from data_gen.render import check_options, render_stack
     from data_gen.scenes.load import load_scene
 
@@ -133,9 +138,14 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Before the scene is loaded, which may take long.
     check_options(spp, args.seed, args.sampler, args.time, memory, args.error is not None)
     scene = load_scene(args.scene, args.size, dict(args.define))
-    sampler, seconds = args.sampler, args.time
+    sampler, seconds, planned = args.sampler, args.time, None
     # A pilot compares samplers at even samples, and may choose one that renders no others.
-    if sampler == "auto" and adaptive is None:
+    if args.method is not None and adaptive is None:
+        planned = plan(scene, args.time, args.method, memory)
+        sampler, seconds, adaptive = planned.sampler, planned.render, Adaptive() if planned.shared else None
+        shared = ", samples shared out" if planned.shared else ""
+        console.say(f"{args.scene}: sampler '{sampler}'{shared}, method '{planned.method}': {planned.reason}")
+    elif sampler == "auto" and adaptive is None:
         choice = choose_by_pilot(scene, spp, seconds, memory)
         sampler = choice.sampler
         console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
@@ -153,6 +163,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             diagnostics=args.diagnostics,
             adaptive=adaptive,
         )
+    if planned:
+        stack.attributes["ngpt:for"] = planned.method
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
@@ -165,6 +177,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if interrupted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
+    if planned:
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {planned.method}")
     if args.json:
         ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
         print_json({"output": str(target), "width": stack.width, "height": stack.height, "layers": stack.names} | ours)
@@ -174,8 +188,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
 def sharing(args: argparse.Namespace):
     """How samples are shared out; None: evenly."""
     if args.error is None and not args.adaptive:
-        if args.method is not None:
-            raise NgptError("--for says what --adaptive and --error go by; give one of them too")
+        if args.method is not None and (args.sampler != "auto" or args.time is None or args.spp is not None):
+            raise NgptError(
+                "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
+                "with --time, and without --sampler and --spp"
+            )
         return None
     from data_gen.adaptive import Adaptive
 
@@ -245,7 +262,10 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
 
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)
     memory = args.memory or DEFAULT_MEMORY
-    check_options(spp, args.seed, args.sampler, args.time, memory)
+    sampler = args.sampler
+    if args.sampler in FRAME_SAMPLERS:
+        spp, sampler = args.spp or FRAME_SAMPLERS[args.sampler].spp, "auto"
+    check_options(spp, args.seed, sampler, args.time, memory)
     camera = None
     if args.camera:
         animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")

@@ -27,8 +27,8 @@ class Alias(NamedTuple):
 # V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
     *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic", "error")),
-    Alias("direct", "ngpt", "direct", "only beside dx or dy: elsewhere `direct` is direct lighting"),
-    Alias("caustic", "ngpt", "caustic", "only beside dx, dy or caustic_var: elsewhere it may be any light"),
+    Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
+    Alias("caustic", "ngpt", "caustic", "in files of ngpt, or beside dx, dy or caustic_var: elsewhere it is any light"),
     Alias("error", "ngpt", "error", "in results: of the reconstruction"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),
@@ -128,12 +128,16 @@ def format_aliases() -> str:
 
 
 def resolve(
-    parts: Sequence[tuple[str, Sequence[str]]], overrides: Mapping[str, str] | None = None, path: str = "image"
+    parts: Sequence[tuple[str, Sequence[str]]],
+    overrides: Mapping[str, str] | None = None,
+    path: str = "image",
+    ours: bool = False,
 ) -> Resolution:
     """Finds the layers of the contract among the channel names of a file.
 
     ``parts`` lists each part's name and its channel names. ``overrides`` maps names of the contract to the name of a
-    layer in the file, whole or its tail, and wins over the aliases. ``path`` is for messages.
+    layer in the file, whole or its tail, and wins over the aliases. ``path`` is for messages. In a file of ``ours``
+    ``direct`` and ``caustic`` are what the contract says; elsewhere only layers that nobody else writes show it.
 
     A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part; there
     other layers can also be called ``part.layer``. Where a name fits several layers, the one it fits whole wins, then
@@ -174,7 +178,7 @@ def resolve(
         if name != "primal" and "primal" not in overrides and other[:2] == primal[:2]:
             raise _no_primal(groups, path)
     for name, beside in _OWN.items():
-        if name in found and name not in overrides and not beside & found.keys():
+        if name in found and name not in overrides and not ours and not beside & found.keys():
             del found[name]
     if "alpha" not in found:
         own = next((group for group in groups if group.part == primal.part and group.name == primal.name), None)

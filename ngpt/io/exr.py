@@ -88,7 +88,8 @@ def read(
     such a file of a layer.
     """
     image = read_exr_isolated(path) if isolated else read_exr(path)
-    resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path))
+    ours = any("ngpt:sampler" in part.header for part in image.parts)
+    resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path), ours)
     layers_found = map_parts(lambda found: _gather(image.parts[found.part], found.channels), resolution.values())
     arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]

@@ -39,3 +39,25 @@ def test_refusals(renderer, tmp_path, capsys, options, message):
     target = str(tmp_path / ("frame-{frame}.exr" if "--frames" in options else "stack.exr"))
     assert main(["render", "diffuse", "-o", target, "--size", "8x8", *options]) != 0
     assert message in capsys.readouterr().err
+
+
+def test_a_pilot_chooses_for_a_method(renderer, tmp_path, capsys, monkeypatch):
+    """What it chose is rendered, in the time that is left, and written down."""
+    from data_gen import pipelines
+
+    asked = []
+
+    def plan(scene, seconds, method, memory):
+        asked.append((seconds, method))
+        return pipelines.Plan("primal", "oidn", True, 1.5, "for a test")
+
+    monkeypatch.setattr(pipelines, "plan", plan)
+    target = str(tmp_path / "stack.exr")
+    assert main(["render", "diffuse", "-o", target, "--size", "24x16", "--time", "60", "--for", "auto"]) == 0
+    said, stack = capsys.readouterr().err, ngpt.read(target)
+    assert asked == [(60.0, "auto")] and "method 'oidn': for a test" in said
+    assert f"then: ngpt denoise {target} --method oidn" in said
+    assert stack.attributes["ngpt:for"] == "oidn" and stack.attributes["ngpt:sampler"] == "primal"
+    # The first 16 samples of those that are shared out are rendered in any case, and may have taken all the time.
+    assert "samples shared out" in said and stack.attributes["ngpt:spp"] >= 16
+    assert stack.attributes["ngpt:seconds"] < 50

@@ -40,6 +40,32 @@ def test_light_that_a_reconstruction_has_lost_counts(renderer):
     assert judge("gpt", times)[0] == "bdpt"
 
 
+def test_an_error_is_no_less_than_what_two_images_differ_by(renderer):
+    """Where noise of the others says that there is none, or less than none."""
+    from data_gen.pilot import times_to_an_error
+
+    for noise in np.linspace(8, 12, 9):
+        trials = {"gpt": trial(noise, 1.0, error=0.01), "primal": trial(noise, 1.0)}
+        assert times_to_an_error(trials)["gpt"] > 0.009
+
+
+def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
+    """Their blur counts, and falls slower than noise; a witness they are not."""
+    from data_gen.pilot import doubtful, judge, times_to_an_error
+
+    others = {"gpt": trial(2.0, 1.0, error=0.5), "primal": trial(1.0, 1.0)}
+    trials = others | {"ppm": trial(0.001, 1.0, error=0.001, bias=0.1)}
+    short, long = (times_to_an_error(trials, seconds) for seconds in (100.0, 1e6))
+    assert judge("gpt", short)[0] == "ppm" and judge("gpt", long)[0] == "gpt"
+    # Errors of others fall by 10,000 meanwhile, so it needs 10,000^1.5 times as long in 10,000 times the time.
+    assert long["ppm"] / long["gpt"] == pytest.approx(100 * short["ppm"] / short["gpt"])
+    # The mean of those who find the light is not sure of it.
+    dark = {"gpt": trial(900.0, 1.0, error=0.02), "primal": trial(900.0, 1.0), "ppm": trials["ppm"]}
+    assert judge("gpt", times_to_an_error(dark, 100.0))[0] == "gpt" and doubtful(dark) == ["ppm"]
+    clear = {"gpt": trial(0.01, 1.0, error=0.001), "primal": trial(0.01, 1.0), "ppm": trials["ppm"]}
+    assert doubtful(clear) == [] and doubtful(others) == []
+
+
 def test_a_choice_needs_a_margin():
     from data_gen.pilot import judge
 
@@ -54,6 +80,8 @@ def test_candidates_are_those_of_the_registry(renderer):
     names = candidates(load(renderer, "diffuse", (48, 32)))
     assert names[0] == "gpt" and {"bdpt", "primal"} <= set(names)
     assert not {"gpt-basic", "gpt-simple"} & set(names) and len(names) == len(set(names))
+    more = candidates(load(renderer, "diffuse", (48, 32)), biased=True)
+    assert more[: len(names)] == names and set(more[len(names) :]) == {"ppm", "gpm"}
     assert candidates(load(renderer, "diffuse", (16, 12))) == ["gpt"]
     assert "bdpt" not in candidates(load(renderer, "haze", (48, 32)))
 
@@ -74,15 +102,16 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
 
     scene = load(renderer, "diffuse", (48, 32))
     before = render_stack(scene, 2, 0, "gpt")
-    monkeypatch.setattr(pilot, "_PIXELS", 24 * 16)
+    monkeypatch.setattr(pilot, "PIXELS", 24 * 16)
+    monkeypatch.setattr(pilot, "candidates", lambda scene, biased: ["gpt", "primal"])
     sizes = []
     tried = pilot.try_out
     monkeypatch.setattr(
         pilot, "try_out", lambda scene, *a: (sizes.append(tuple(scene.sensors()[0].film().size())), tried(scene, *a))[1]
     )
     choice = pilot.choose_by_pilot(scene, 1 << 30, 1e6)
-    assert choice.sampler in pilot.candidates(scene) and choice.reason.startswith("chosen by a pilot: to a given error")
-    assert len(sizes) == len(pilot.candidates(scene)) and {tuple(map(int, size)) for size in sizes} == {(24, 16)}
+    assert choice.sampler in ("gpt", "primal") and choice.reason.startswith("chosen by a pilot: to a given error")
+    assert len(sizes) == 2 and {tuple(map(int, size)) for size in sizes} == {(24, 16)}
     after = render_stack(scene, 2, 0, "gpt")
     assert all(np.array_equal(before[name], after[name]) for name in before.names)
 

@@ -14,6 +14,8 @@ from ngpt.testing import z_test
 
 FAR = 8
 DISTANCES = (1, FAR)
+# First seed of images to compare with: none of those of what is judged, since samplers may share their paths.
+REFERENCES = 1000
 
 
 def load(mi, scene, size):
@@ -40,18 +42,20 @@ def far_shifts(pixels):
         SHIFTS.update(before)
 
 
-def render_ours(scene, sampler, batches=16, spp=64, pixels=1, **options):
-    """Layers of independent stacks, whose gradients are differences over so many pixels."""
+def render_ours(scene, sampler, batches=16, spp=64, pixels=1, seed=0, **options):
+    """Layers of independent stacks, of seeds from ``seed`` on, whose gradients are differences over so many pixels."""
     from data_gen.render import render_stack
 
     with far_shifts(pixels):
-        return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]
+        return [render_stack(scene, spp, seed + i, sampler, **options).layers for i in range(batches)]
 
 
 def render_references(mi, scene, batches=24, spp=256):
     """Independent images, (batches, H, W, 3)."""
     integrator = right_integrator(mi, scene)
-    return np.stack([np.array(mi.render(scene, integrator=integrator, spp=spp, seed=1000 + i)) for i in range(batches)])
+    return np.stack(
+        [np.array(mi.render(scene, integrator=integrator, spp=spp, seed=REFERENCES + i)) for i in range(batches)]
+    )
 
 
 def right_integrator(mi, scene):

@@ -393,6 +393,7 @@ def test_direct_lighting_of_other_renderers_is_not_ngpts_direct():
     assert "direct" not in resolve([("", names("RGB", "direct.RGB"))])
     assert "direct" in resolve([("", names("RGB", "direct.RGB", "dy.RGB"))])
     assert "direct" in resolve([("", names("RGB", "direct.RGB"))], {"direct": "direct"})
+    assert "direct" in resolve([("", names("RGB", "direct.RGB"))], ours=True)
 
 
 def test_variances_of_a_sample_are_not_taken_for_variances_of_the_mean():

@@ -20,6 +20,9 @@ alone, by s = 0 and s = 1: that bounds what is kept of a light path, and paths m
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
@@ -32,19 +35,16 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import NULL, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.light_path import Seen, Visitor, light_path
 from data_gen.samplers.bdpt.lights import LightEnds
-from data_gen.samplers.bdpt.strategies import connected, emission_at, to_camera, to_light
+from data_gen.samplers.bdpt.strategies import connected, emission_at, to_light
 from data_gen.samplers.bdpt.vertex import (
-    IMPORTANCE,
     RADIANCE,
     Vertex,
     context,
     cosine,
     leave,
-    light_leaves,
     recall,
-    record,
-    record_class,
     reverse_density,
     scatters_smoothly,
 )
@@ -52,6 +52,25 @@ from data_gen.samplers.common import GradientIntegrator, like_path
 from ngpt.errors import NgptError
 
 _CAMERAS = ("PerspectiveCamera", "ThinLensCamera")
+
+
+@dataclass
+class Splatter:
+    """Splats what light paths bring to the camera."""
+
+    splats: Splats
+    ray: mi.Ray3f
+    importance: mi.Spectrum
+
+    def start(self) -> None:
+        return None
+
+    def sees(self, state: None, seen: Seen) -> None:
+        light = to_rgb(seen.C * self.importance / (1 + seen.others), self.ray.wavelengths)
+        self.splats.add(seen.pixel, list(light), dr.max(seen.C) > 0)
+
+    def leaves(self, state: None, *_) -> None:
+        return None
 
 
 class BDPT(GradientIntegrator):
@@ -89,8 +108,8 @@ class BDPT(GradientIntegrator):
         longest = min(self.max_depth, self.joined_depth)
         kept, count = None, mi.UInt32(0)
         if longest > 1 and lights.emitters is not None:
-            splats = film.splats("primal")
-            kept, count, random = self.light_path(scene, lights, camera, random, ray, importance, longest, splats)
+            splatter = Splatter(film.splats("primal"), ray, importance)
+            kept, count, random, _ = self.light_path(scene, lights, camera, random, ray, longest, splatter)
         L, Le = self.camera_path(scene, lights, camera, random, ray, importance, kept, count, longest)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
@@ -98,57 +117,10 @@ class BDPT(GradientIntegrator):
         dr.eval(values)
         film.put_all(values)
 
-    @dr.syntax
-    def light_path(self, scene, lights, camera, random, camera_ray, importance, longest, splats: Splats):
-        """Traces a path from a light; returns its vertices, how many they are, and ``random``."""
-        size, lens = camera.size, camera.sensor.needs_aperture_sample()
-        start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
-        ray, β = start.ray, start.β
-        active = dr.max(β) > 0
-        brightest = dr.rcp(dr.max(β))
-        hit = scene.ray_intersect_preliminary(ray, active=active)
-        si = hit.compute_surface_interaction(ray)
-        active &= si.is_valid()
-        e, p_light = lights.densities(scene, start, si)
-        end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
-        depth, count = mi.UInt32(1), mi.UInt32(0)
-        Record = record_class(mi.variant())
-        kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
-        while dr.hint(active, label="light path"):
-            y = Vertex(si, β, end, depth)
-            bsdf = si.bsdf()
-            smooth = active & scatters_smoothly(bsdf)
-            # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
-            kept.write(record(ray, hit, y, smooth), depth - 1, active)
-            count = dr.select(active, depth, count)
-
-            # ------------------- To the camera -----------------------
-            on_lens = mi.Point2f(0.5)
-            if dr.hint(lens, mode="scalar"):
-                on_lens = random.next_2d()
-            C, others, uv = to_camera(
-                camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
-            )
-            light = to_rgb(C * importance / (1 + others), camera_ray.wavelengths)
-            pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
-            splats.add(pixel, list(light), dr.max(C) > 0)
-
-            # -------------------- Next vertex ------------------------
-            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-            sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
-            d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
-            β *= dr.select(sample.pdf > 0, f_p, 0)
-            # By what is left of the light that the path began with
-            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
-            active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
-            β /= survival
-            depth += 1
-            ray = si.spawn_ray(d)
-            hit = scene.ray_intersect_preliminary(ray, active=active)
-            si = hit.compute_surface_interaction(ray)
-            active &= si.is_valid()
-            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-        return kept, count, random
+    def light_path(self, scene, lights, camera, random, camera_ray, longest, visitor: Visitor, lanes=True):
+        """``light_path.light_path`` with these parameters."""
+        occluded = partial(self.hidden_from_camera, scene)
+        return light_path(scene, lights, camera, random, camera_ray, longest, self.rr_depth, occluded, visitor, lanes)
 
     @dr.syntax
     def camera_path(self, scene, lights, camera, random, ray, importance, kept, count, longest):

@@ -39,21 +39,16 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
 from data_gen.samplers.bdpt.lights import LightEnds
-from data_gen.samplers.bdpt.strategies import connection, to_camera
+from data_gen.samplers.bdpt.strategies import connection
 from data_gen.samplers.bdpt.vertex import (
-    IMPORTANCE,
     Vertex,
-    context,
     cosine,
-    light_leaves,
     recall,
-    record,
-    record_class,
     scatters_smoothly,
 )
 from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan, base_step
-from data_gen.samplers.gbdpt.light_shift import Link, Splatted, differences, next_link
+from data_gen.samplers.gbdpt.light_shift import Shifter
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -87,7 +82,10 @@ class GBDPT(BDPT):
         kept, count, bent = None, mi.UInt32(0), mi.Bool(False)
         if plan.longest > 1 and plan.lights.emitters is not None:
             splats = {name: film.splats(name) for name in ("primal", *SHIFTS)}
-            kept, count, random, bent = self.shifted_light_path(scene, plan, camera, random, ray, importance, splats)
+            shifter = Shifter(scene, plan, camera, ray, importance, self.first_hit, splats)
+            kept, count, random, (*_, bent) = self.light_path(
+                scene, plan.lights, camera, random, ray, plan.longest, shifter
+            )
         L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
@@ -111,92 +109,10 @@ class GBDPT(BDPT):
         some = camera.at(mi.UInt32(lanes))
         ray, importance, _ = some.rays()
         importance = dr.select(mi.Bool(exists), importance, 0)
-        *_, again = self.shifted_light_path(
-            scene, plan, some, some.random.clone(), ray, importance, splats, mi.Bool(exists)
-        )
-        dr.eval(again)
-
-    @dr.syntax
-    def shifted_light_path(self, scene, plan, camera, random, camera_ray, importance, splats, again=None):
-        """``BDPT.light_path``, with the differences of all that it splats; and which lanes are bent.
-
-        Bent is what ends behind mirrors or glass. Its differences alone are splatted where the lanes are traced
-        ``again``, and all others in the first place.
-        """
-        lights, materials, longest = plan.lights, plan.materials, plan.longest
-        size, lens = camera.size, camera.sensor.needs_aperture_sample()
-        start = lights.sample(scene, random, camera_ray.time, camera_ray.wavelengths)
-        ray, β = start.ray, start.β
-        active = dr.max(β) > 0
-        if dr.hint(again is not None, mode="scalar"):
-            active &= again
-        brightest = dr.rcp(dr.max(β))
-        hit = scene.ray_intersect_preliminary(ray, active=active)
-        si = hit.compute_surface_interaction(ray)
-        active &= si.is_valid()
-        e, p_light = lights.densities(scene, start, si)
-        end = mis.begin_light(e, p_light, start.delta, cosine(si, ray.d))
-        depth, count, any_bent = mi.UInt32(1), mi.UInt32(0), mi.Bool(False)
-        # The vertex that light has left smoothly last
-        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
-        Record = record_class(mi.variant())
-        kept = dr.alloc_local(Record, longest - 1, dr.zeros(Record))
-        while dr.hint(active, label="light path"):
-            y = Vertex(si, β, end, depth)
-            bsdf = si.bsdf()
-            smooth = active & scatters_smoothly(bsdf)
-            # In the place of its depth, smooth or not: Dr.Jit 1.5 (LLVM) errs where the places of lanes differ.
-            kept.write(record(ray, hit, y, smooth), depth - 1, active)
-            count = dr.select(active, depth, count)
-
-            # ------------------- To the camera -----------------------
-            on_lens = mi.Point2f(0.5)
-            if dr.hint(lens, mode="scalar"):
-                on_lens = random.next_2d()
-            C, others, uv = to_camera(
-                camera.sensor, on_lens, y, bsdf, smooth, lambda *toward: self.hidden_from_camera(scene, *toward)
-            )
-            lit = dr.max(C) > 0
-            pixel = dr.minimum(mi.UInt32(uv.x), size.x - 1) + dr.minimum(mi.UInt32(uv.y), size.y - 1) * size.x
-            if dr.hint(again is None, mode="scalar"):
-                light = to_rgb(weighted(C, others) * importance, camera_ray.wavelengths)
-                splats["primal"].add(pixel, list(light), lit)
-
-            # ----------------- Its four shifts -----------------------
-            first = link.depth == 0
-            before = recall(kept.read(dr.maximum(link.depth, 1) - 1), camera_ray.time, camera_ray.wavelengths)
-            allowed = link.whole & materials.connectable(bsdf) & (first | materials.connectable(before.si.bsdf()))
-            path = Splatted(
-                *(y, ray.d, uv, on_lens, C, others, first, start, before),
-                *(link.p, link.survival, link.events, allowed),
-            )
-            bent = lit & allowed & (link.events != 0)
-            any_bent |= bent
-            if dr.hint(again is None, mode="scalar"):
-                Δ = differences(scene, plan, camera, path, self.first_hit, lit & ~bent)
-            else:
-                Δ = differences(scene, plan, camera, path, self.first_hit, bent, True)
-            for name in SHIFTS:
-                one, on_film = Δ[name]
-                splats[name].add(pixel, list(to_rgb(one * importance, camera_ray.wavelengths)), on_film)
-
-            # -------------------- Next vertex ------------------------
-            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-            sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, active)
-            d, f_p, end = light_leaves(y, bsdf, sample, f_p, active & (sample.pdf > 0))
-            β *= dr.select(sample.pdf > 0, f_p, 0)
-            # By what is left of the light that the path began with
-            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * brightest, 0.95))
-            active &= (sample.pdf > 0) & (dr.max(β) > 0) & (u_survival < survival) & (depth + 1 < longest)
-            β /= survival
-            link = next_link(link, depth, sample, dr.rcp(survival))
-            depth += 1
-            ray = si.spawn_ray(d)
-            hit = scene.ray_intersect_preliminary(ray, active=active)
-            si = hit.compute_surface_interaction(ray)
-            active &= si.is_valid()
-            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-        return kept, count, random, any_bent
+        shifter = Shifter(scene, plan, some, ray, importance, self.first_hit, splats, again=True)
+        random = some.random.clone()
+        *_, state = self.light_path(scene, plan.lights, some, random, ray, plan.longest, shifter, mi.Bool(exists))
+        dr.eval(state)
 
     @dr.syntax
     def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):

@@ -8,19 +8,24 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS
+from data_gen.film.splats import Splats
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.manifold import Target, event, follow, prepend_event, walk
+from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.light_path import Seen
 from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.bdpt.mis import Partial
-from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, record_class
 from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
+from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
 
 
 @dataclass
@@ -65,6 +70,56 @@ def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: m
         dr.select(smooth, 0, dr.select(fits, events, link.events)),
         smooth | (link.whole & fits & (code != 0)),
     )
+
+
+@dataclass
+class Shifter:
+    """Splats what light paths bring to the camera, and the differences of that.
+
+    Bent is what ends behind mirrors or glass. Its differences alone are splatted where the lanes are traced ``again``,
+    and all others in the first place. The state is the ``Link`` to the vertex that light has left smoothly last, what
+    is kept of that vertex, and which lanes are bent.
+    """
+
+    scene: mi.Scene
+    plan: Plan
+    camera: CameraSamples
+    ray: mi.Ray3f
+    importance: mi.Spectrum
+    first_hit: Callable
+    splats: dict[str, Splats]
+    again: bool = False
+
+    def start(self) -> tuple[Link, Any, mi.Bool]:
+        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
+        return link, dr.zeros(record_class(mi.variant())), mi.Bool(False)
+
+    def sees(self, state: tuple, seen: Seen) -> tuple[Link, Any, mi.Bool]:
+        link, left, any_bent = state
+        wavelengths, lit = self.ray.wavelengths, dr.max(seen.C) > 0
+        if not self.again:
+            light = to_rgb(weighted(seen.C, seen.others) * self.importance, wavelengths)
+            self.splats["primal"].add(seen.pixel, list(light), lit)
+
+        # --------------------- Its four shifts -----------------------
+        first, before = link.depth == 0, recall(left, self.ray.time, wavelengths)
+        connectable = self.plan.materials.connectable
+        allowed = link.whole & connectable(seen.y.si.bsdf()) & (first | connectable(before.si.bsdf()))
+        path = Splatted(
+            *(seen.y, seen.d, seen.uv, seen.lens, seen.C, seen.others, first, seen.start, before),
+            *(link.p, link.survival, link.events, allowed),
+        )
+        bent = lit & allowed & (link.events != 0)
+        now = bent if self.again else lit & ~bent
+        Δ = differences(self.scene, self.plan, self.camera, path, self.first_hit, now, self.again)
+        for name, (one, on_film) in Δ.items():
+            self.splats[name].add(seen.pixel, list(to_rgb(one * self.importance, wavelengths)), on_film)
+        return link, left, any_bent | bent
+
+    def leaves(self, state: tuple, depth: mi.UInt32, kept: Any, sample, survival: mi.Float) -> tuple:
+        link, left, any_bent = state
+        link = next_link(link, depth, sample, survival)
+        return link, dr.select(link.depth == depth, kept, left), any_bent
 
 
 def differences(

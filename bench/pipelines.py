@@ -1,0 +1,313 @@
+"""Is the sampler and method that a pilot chooses as good as the best of all: scene by scene, at equal time.
+
+    python -m bench.pipelines --scenes diffuse glossy SCENE.xml ... [--apart SCENE.xml ...] [--size 64 36]
+    python -m bench.pipelines --table        print what the file says, with the rules as they are now
+
+All samplers take turns: each renders four parts of fixed numbers of samples, chosen so that a part takes about the time
+of 64 samples of the first sampler. What a sample costs over one of the first is the median of the ratios of the parts,
+in seconds of the processor on all cores together. So a busy machine counts little. Errors (trimmed relMSE against two
+halves of a reference) are those of each method on a few samples, on one part and on all four, with samples even or
+shared out. Seconds of the methods are measured in the same turns. Stacks are kept in --cache, so that a benchmark that
+was broken off goes on, and rules can be judged anew without a render.
+
+The pilot (data_gen/pipelines.py) is not told any of it. Times are those of 16, 64 and 256 samples of the first sampler
+and of the slowest method, so that every pipeline fits into each of them. Of the samples that a pipeline has time for,
+the error is on the straight line of logarithms between the measured ones. Regret is the error of what the pilot chose
+over the least of all.
+
+Nothing may be chosen by scenes ``--apart``.
+"""
+
+import argparse
+import json
+import math
+import statistics
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+from bench.common import metadata, save
+from ngpt.evaluation.config import scene_name
+from ngpt.io.exr import read, write
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.merging import merge
+from ngpt.methods import reconstruct
+from ngpt.stack import GradientStack
+
+LADDER = (16, 64, 256)
+PARTS = 4
+# Samples of the first sampler that a sampler's trial may cost: what the pilot of a 14 times larger image allows, in the
+# time of 256 samples. What is dearer is left out of the comparison, too.
+DEAREST = 700
+_REFERENCE, _SHARED = 1 << 20, 1 << 21
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", nargs="+", default=[])
+    parser.add_argument("--apart", nargs="+", default=[])
+    parser.add_argument("--size", type=int, nargs=2, default=(64, 36), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--samplers", nargs="+", help="default: those that `--sampler auto` would compare")
+    parser.add_argument("--reference", type=int, default=512, help="samples of a half, in samples of the first sampler")
+    parser.add_argument("--cache", type=Path, default=Path("out/pipelines"), help="folder for stacks")
+    parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/pipelines.json"))
+    args = parser.parse_args()
+
+    from data_gen.backend import use_variant
+
+    use_variant()
+    result: dict = {"benchmark": "pipelines", "size": list(args.size), "metadata": metadata("mitsuba"), "scenes": {}}
+    if args.output.exists():
+        result["scenes"] = json.loads(args.output.read_text())["scenes"]
+    for path in () if args.table else (*args.scenes, *args.apart):
+        start = time.perf_counter()
+        result["scenes"][scene_name(path)] = bench_scene(path, args) | {"apart": path in args.apart}
+        save(args.output, result)
+        print(f"{scene_name(path)}: {time.perf_counter() - start:.0f} s", flush=True)
+    print(*table(result), sep="\n")
+
+
+class Kept:
+    """Stacks and numbers of a scene in a folder: what is there is not made again."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+        folder.mkdir(parents=True, exist_ok=True)
+
+    def stack(self, name: str, make: Callable[[], GradientStack]) -> GradientStack:
+        path = self.folder / f"{name}.exr"
+        if not path.exists():
+            write(path, make())
+        return read(path)
+
+    def numbers(self, name: str, make: Callable[[], dict]) -> dict:
+        path = self.folder / f"{name}.json"
+        if not path.exists():
+            save(path, make())
+        return json.loads(path.read_text())
+
+
+def bench_scene(path: str, args: argparse.Namespace) -> dict:
+    """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
+    from data_gen import passes, pilot, pipelines
+    from data_gen.adaptive import LEAST, Adaptive
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(path, tuple(args.size))
+    kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
+    trials = {}
+    for i, name in enumerate(args.samplers or pilot.candidates(scene)):
+        limit = DEAREST * trials[first].seconds if (first := next(iter(trials), None)) else math.inf
+        if (trial := _trial(kept, scene, name, pilot.SEED + 8 * i, limit)) is not None:
+            trials[name] = trial
+    first, names = next(iter(trials)), list(trials)
+    compiled: set[str] = set()
+
+    def render(key: str, name: str, spp: int, seed: int, **more) -> GradientStack:
+        def make() -> GradientStack:
+            if name not in compiled:
+                render_stack(scene, 1, seed, name)
+                compiled.add(name)
+            start = time.process_time()
+            stack = render_stack(scene, spp, seed, name, **more)
+            stack.attributes["bench:seconds"] = time.process_time() - start
+            return stack
+
+        return kept.stack(f"{key}-{spp}-{name}", make)
+
+    part = {}  # samples of a part, by sampler
+    for name, trial in trials.items():
+        batch = max(1, SAMPLERS[name].batch)
+        part[name] = max(
+            4 * LEAST // PARTS, 8 * batch, round(64 * trials[first].seconds / trial.seconds / batch) * batch
+        )
+        part[name] = kept.numbers(f"part-{name}", lambda spp=part[name]: {"spp": spp})["spp"]
+    even: dict[str, dict[int, list[GradientStack]]] = {name: {part[name]: []} for name in names}
+    shared: dict[str, dict[int, list[GradientStack]]] = {}
+    with patch.object(passes, "PASS_SECONDS", 60.0):
+        for i in range(PARTS):
+            for name in names:
+                even[name][part[name]].append(render(f"part{i}", name, part[name], i))
+        cost = {name: _cost(even[name][part[name]]) for name in names}
+        relative = {
+            name: statistics.median(
+                _cost([ours]) / _cost([theirs])
+                for ours, theirs in zip(even[name][part[name]], even[first][part[first]], strict=True)
+            )
+            for name in names
+        }
+        for name in names:
+            few = part[name] // 4
+            if few >= 2 * SAMPLERS[name].batch:  # else it has no variances
+                even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
+            even[name][PARTS * part[name]] = [merge(even[name][part[name]])]
+            if not SAMPLERS[name].batch:
+                shared[name] = {
+                    n: [render("shared", name, n, _SHARED, adaptive=Adaptive())]
+                    for n in (part[name], PARTS * part[name])
+                }
+        # The reference is of the sampler with the least noise at equal time.
+        middle = sum(even[n][PARTS * part[n]][0]["primal"].astype("f8") for n in names) / len(names)
+        noise = {
+            n: pilot.noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
+            for n in names
+            if not SAMPLERS[n].biased
+        }
+        quiet = min(noise, key=lambda n: noise[n])
+        batch = max(1, SAMPLERS[quiet].batch)
+        spp = max(1, round(args.reference / relative[quiet] / batch)) * batch
+        spp = kept.numbers(f"reference-{quiet}-{args.reference}", lambda: {"spp": spp})["spp"]
+        halves = [render(f"reference{i}", quiet, spp, _REFERENCE | i)["primal"] for i in range(2)]
+
+    rows: list[dict] = []
+    for p in pipelines.measure(trials, time.process_time):
+        errors, after = {}, []
+        for n, stacks in (shared if p.shared else even)[p.sampler].items():
+            each = []
+            for stack in stacks:
+                start = time.process_time()
+                image = reconstruct(stack, p.method).image
+                after.append(time.process_time() - start)
+                each.append(relmse_trimmed(image, *halves))
+            errors[str(n)] = max(statistics.mean(each), 1e-9)
+        # In units of the first sampler's, whose seconds are those of the same turns.
+        rows.append(
+            {"pilot": vars(p), "errors": errors}
+            | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
+        )
+    auto = choice_of_auto(trials)
+    return {"reference": [quiet, spp], "first": first, "auto": auto, "rows": [rounded(row) for row in rows]}
+
+
+def choice_of_auto(trials: dict) -> str:
+    """The sampler that `--sampler auto` chooses by two of the stacks of each."""
+    from data_gen import pilot
+
+    judged = {}
+    for name, trial in trials.items():
+        two = trial.stacks[:2]
+        images = tuple(reconstruct(stack, simple(name)).image for stack in two)
+        primals = tuple(stack["primal"] for stack in two)
+        judged[name] = pilot.Trial(images, primals, trial.seconds * two[0].attributes["ngpt:spp"])
+    return pilot.judge(next(iter(trials)), pilot.times_to_an_error(judged))[0]
+
+
+def simple(sampler: str) -> str:
+    """The method by which `--sampler auto` compares samplers."""
+    from data_gen.samplers import SAMPLERS
+
+    return "wcv" if SAMPLERS[sampler].gradients else "primal"
+
+
+def rounded(value):
+    """Numbers to five digits, in dicts too."""
+    if isinstance(value, dict):
+        return {name: rounded(one) for name, one in value.items()}
+    return float(f"{value:.5g}") if isinstance(value, float) else value
+
+
+def _trial(kept: Kept, scene, name: str, seed: int, limit: float):
+    """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene, or not in the time."""
+    from data_gen import pipelines
+
+    made = []
+
+    def make() -> dict:
+        trial = pipelines.try_out(scene, name, seed, time.process_time, limit)
+        if trial is not None:
+            made.extend(trial.stacks)
+            for i, stack in enumerate(trial.stacks):
+                kept.stack(f"pilot{i}-{name}", lambda stack=stack: stack)
+        return {"seconds": None if trial is None else trial.seconds}
+
+    seconds = kept.numbers(f"pilot-{name}", make)["seconds"]
+    if seconds is None:
+        return None
+    return pipelines.Trial([kept.stack(f"pilot{i}-{name}", lambda i=i: made[i]) for i in range(4)], seconds)
+
+
+def _cost(stacks: list[GradientStack]) -> float:
+    """Seconds of a sample, the median of stacks."""
+    return statistics.median(stack.attributes["bench:seconds"] / stack.attributes["ngpt:spp"] for stack in stacks)
+
+
+def true_error(errors: dict[str, float], spp: float) -> float:
+    """At a number of samples, between those that were measured; beyond them the last line goes on."""
+    known = sorted((int(n), e) for n, e in errors.items())
+    i = next((i for i in range(1, len(known) - 1) if spp < known[i][0]), len(known) - 1)
+    (n0, e0), (n1, e1) = known[i - 1], known[i]
+    return e0 * (spp / n0) ** (math.log(e1 / e0) / math.log(n1 / n0))
+
+
+def cells(entry: dict) -> list[dict]:
+    """For each time of ``LADDER`` samples of the first sampler: name -> error, the pilot's choice, and the error by the
+    sampler that `--sampler auto` chooses over that by the best, both by a simple method."""
+    from data_gen.pipelines import FROM, Pipeline, choose
+
+    pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
+    unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
+    found = []
+    for n in LADDER:
+        # So much that the slowest of the methods fits too.
+        seconds = n * unit + max(row["after"] for row in entry["rows"])
+        errors = {}
+        for p, row in zip(pipelines, entry["rows"], strict=True):
+            spp = replace(p, seconds=row["seconds"], after=row["after"]).samples(seconds)
+            if spp >= (FROM if p.shared else 2):
+                errors[name_of(p)] = true_error(row["errors"], spp)
+        ranked = [p for p in choose(pipelines, seconds) if name_of(p) in errors]
+        by_sampler = {
+            p.sampler: errors[name] for p in pipelines if (name := f"{p.sampler} {simple(p.sampler)}") in errors
+        }
+        auto = by_sampler.get(entry["auto"], math.inf) / min(by_sampler.values())
+        found.append({"spp": n, "errors": errors, "choice": name_of(ranked[0]), "auto": auto})
+    return found
+
+
+def name_of(p) -> str:
+    return f"{p.sampler} {p.method}" + (" shared" if p.shared else "")
+
+
+def table(result: dict) -> list[str]:
+    """Lines: choice, regret, the best, for each scene and time; then geometric mean and worst; and of fixed choices."""
+    lines, fixed = [], {False: {}, True: {}}
+    regrets: dict[bool, list] = {False: [], True: []}
+    autos: dict[bool, list] = {False: [], True: []}
+    for scene, entry in result["scenes"].items():
+        for cell in cells(entry):
+            least = min(cell["errors"], key=lambda n: cell["errors"][n])
+            ratios = {name: e / cell["errors"][least] for name, e in cell["errors"].items()}
+            regrets[entry["apart"]].append(ratios[cell["choice"]])
+            if math.isfinite(cell["auto"]):
+                autos[entry["apart"]].append(cell["auto"])
+            for name, ratio in ratios.items():
+                fixed[entry["apart"]].setdefault(name, []).append(ratio)
+                if not name.endswith(" shared"):
+                    best = ratios.get(f"{name} shared", ratio)
+                    fixed[entry["apart"]].setdefault(f"{name}, shared where there are enough", []).append(best)
+            lines.append(f"| {scene} | {cell['spp']} | `{cell['choice']}` | {ratios[cell['choice']]:.2f} | `{least}` |")
+    for apart, title in ((False, "chosen on"), (True, "apart")):
+        if rows := regrets[apart]:
+            lines.append(f"{title}: {mean_log(rows):.3f} in the mean, {max(rows):.2f} at worst, {len(rows)} cells")
+            by_auto = autos[apart]
+            lines.append(f"  sampler auto, of samplers alone: {mean_log(by_auto):.3f}, {max(by_auto):.2f}")
+            whole_rows = {n: r for n, r in fixed[apart].items() if len(r) == len(rows)}
+            whole = {n: mean_log(r) for n, r in whole_rows.items()}
+            for name in sorted(whole, key=lambda n: whole[n])[:8]:
+                ahead = sum(r < 0.98 * ours for r, ours in zip(whole_rows[name], rows, strict=True))
+                worst = max(whole_rows[name])
+                lines.append(f"  always {name}: {whole[name]:.3f}, {worst:.2f}; ahead by 2 % in {ahead} cells")
+    return lines
+
+
+def mean_log(values: list[float]) -> float:
+    return math.exp(statistics.mean(math.log(v) for v in values))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,70 @@
+"""Frames by a sampler that remembers the frames before."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.passes import DEFAULT_MEMORY
+from data_gen.render import stack_of
+from data_gen.samplers import FrameSampler
+from data_gen.scenes.facts import scene_facts
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+
+class Remembering:
+    """The frames of one shot; ``options`` are those of ``render_stack``.
+
+    Raises NgptError where anything but the camera ``changes`` from frame to frame, and for options that it has not.
+    """
+
+    def __init__(
+        self,
+        entry: FrameSampler,
+        changes: bool,
+        spp: int | None,
+        seed: int,
+        options: dict[str, Any],
+    ):
+        self.entry, self.seed, self.options = entry, seed, dict(options)
+        if changes:
+            raise NgptError(
+                f"sampler '{entry.name}' reuses paths of the frames before, which is right only while nothing but the "
+                "camera moves; this scene changes from frame to frame: use --sampler gpt"
+            )
+        if self.options.pop("seconds", None) is not None:
+            raise NgptError(f"sampler '{entry.name}' renders a number of samples, not for a time: use --spp")
+        self.spp = spp or entry.spp
+        self.memory = self.options.pop("memory", None) or DEFAULT_MEMORY
+        self.diagnostics = self.options.pop("diagnostics", False)
+        self.options.pop("stop", None)
+        if unknown := [name for name in self.options if name not in entry.options]:
+            have = ", ".join(entry.options)
+            raise NgptError(f"sampler '{entry.name}' has no option '{unknown[0]}'; it has: {have}")
+        self._sampler: Any = None
+
+    def render(
+        self,
+        scene: mi.Scene,
+        index: int,
+        motion: np.ndarray,
+        depth: np.ndarray | None,
+        progress: Callable[[int, int], None],
+    ) -> GradientStack:
+        """The stack of frame number ``index`` of the shot."""
+        start = time.perf_counter()
+        progress(0, self.spp)
+        if self._sampler is None:
+            if reason := self.entry.refuses(scene_facts(scene)):
+                raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
+            self._sampler = self.entry.make(scene, self.seed, self.spp, self.memory, **self.options)
+        film = self._sampler.film(index, motion, depth)
+        more = {"ngpt:confidence": self._sampler.confidence}
+        stack = stack_of(film, self.seed, self.entry.name, start, self.diagnostics, more)
+        progress(self.spp, self.spp)
+        return stack

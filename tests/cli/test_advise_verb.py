@@ -1,0 +1,78 @@
+"""``ngpt advise`` without a table: by a pilot of this scene, for a time or an error."""
+
+import json
+import shlex
+
+import pytest
+
+import ngpt
+from ngpt.cli import main
+
+
+@pytest.fixture
+def seen(renderer, monkeypatch):
+    """A scene in which samples of two samplers leave known errors."""
+    from data_gen import pipelines
+    from data_gen.pipelines import Pipeline
+
+    usual = {m: pipelines.usual_fall(m) for m in ("wcv", "primal", "l1")}
+    found = [
+        Pipeline("primal", "primal", 16, 0.02, usual["primal"], 0.001, 0.0),
+        Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01),
+        Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01, adaptive=0.5, choosing=0.001),
+        Pipeline("gpt", "l1", 16, 0.05, usual["l1"], 0.002, 0.01),
+    ]
+    monkeypatch.setattr(pipelines, "explore", lambda scene, seconds: found)
+    return found
+
+
+def advice(capsys, *goal):
+    assert main(["advise", "diffuse", "--size", "32x24", "--json", "-q", *goal]) == 0
+    return json.loads(capsys.readouterr().out)["advice"]
+
+
+def test_the_least_error_in_a_time(seen, capsys):
+    rows = advice(capsys, "--seconds", "0.1")
+    assert [(r["sampler"], r["method"], r["adaptive"]) for r in rows] == [
+        ("primal", "primal", False),
+        ("gpt", "wcv", False),
+        ("gpt", "l1", False),
+    ]
+    assert rows[0]["spp"] in (99, 100) and rows[0]["error"] == pytest.approx(0.02 * 16 / 100, rel=0.02)
+    assert all(row["seconds"] <= 0.1 + 1e-9 for row in rows)
+    best = advice(capsys, "--seconds", "1")[0]
+    assert (best["sampler"], best["method"], best["adaptive"]) == ("gpt", "wcv", True)
+
+
+def test_the_least_time_to_an_error(seen, capsys):
+    rows = advice(capsys, "--error", "0.001")
+    assert all(row["error"] <= 0.001 * (1 + 1e-9) for row in rows)
+    assert [row["seconds"] for row in rows] == sorted(row["seconds"] for row in rows)
+    assert rows[0]["adaptive"] and rows[0]["spp"] < rows[-1]["spp"]
+    for wrong, message in ((("--seconds", "1e-9"), "nothing fits into"), (("--error", "1e-12"), "no method reaches")):
+        assert main(["advise", "diffuse", "--size", "32x24", *wrong]) == 2
+        assert message in capsys.readouterr().err
+
+
+def test_the_commands_of_a_pilot_run_as_printed(seen, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main(["advise", "diffuse", "--size", "16x12", "--seconds", "0.4", "-q"]) == 0
+    render, denoise = (line for line in capsys.readouterr().out.splitlines() if line.startswith("ngpt "))
+    for line in (render, denoise):
+        assert main(shlex.split(line)[1:]) == 0
+    (stack,) = tmp_path.glob("diffuse-*spp.exr")
+    assert "samples" in ngpt.read(stack) and "--adaptive" in render
+    (result,) = tmp_path.glob("diffuse-*-wcv.exr")
+    assert ngpt.read(result).attributes["ngpt:method"] == "wcv"
+
+
+def test_a_pilot_advises(renderer, capsys, monkeypatch):
+    """Whatever it may be: a row for each method of each sampler that was tried."""
+    from data_gen import pipelines
+
+    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
+    monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "l1"))
+    monkeypatch.setattr(pipelines, "WITHOUT", ("primal",))
+    rows = advice(capsys, "--seconds", "1000")
+    assert {(row["sampler"], row["method"]) for row in rows} == {("gpt", "wcv"), ("gpt", "l1"), ("primal", "primal")}
+    assert all(row["error"] > 0 and row["spp"] > 100 for row in rows)

@@ -1,0 +1,176 @@
+"""Which sampler and method a pilot chooses: by the error that it expects of the final image."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from unbiased import load
+
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import relmse_trimmed
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+
+SHAPE = (48, 64)
+
+
+def pipeline(sampler="gpt", method="wcv", error=0.01, fall=-0.8, seconds=0.01, after=0.0, **more):
+    from data_gen.pipelines import Pipeline
+
+    return Pipeline(sampler, method, 16, error, fall, seconds, after, **more)
+
+
+def truth():
+    y, x = np.mgrid[: SHAPE[0], : SHAPE[1]] / 16.0
+    image = 1 + 0.5 * np.sin(x + 2 * y)[..., None] * np.array([1.0, 0.8, 0.5])
+    image[12:30, 20:40] *= 0.3
+    return image
+
+
+def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
+    """Of ``truth``, with the relative variance of a sample; and of gradients, where there are any."""
+    image = truth()
+    attributes = {"ngpt:spp": spp, "ngpt:seed": str(seed), "ngpt:sampler": "test", "ngpt:normalSpace": "camera"}
+    noise = variance / spp * image**2
+    layers = {"primal": image + rng.normal(0, np.sqrt(noise)), "primal_var": noise}
+    layers["albedo"], layers["normal"] = np.full_like(image, 0.5), np.broadcast_to([0, 0, 1.0], image.shape)
+    layers["depth"] = np.ones((*SHAPE, 1))
+    if of_gradients is not None:
+        for name, axis in (("dx", 1), ("dy", 0)):
+            d = np.diff(image, axis=axis, append=np.take(image, [-1], axis))
+            var = np.full_like(d, of_gradients / spp)
+            layers[name], layers[f"{name}_var"] = d + rng.normal(0, np.sqrt(var)), var
+    return GradientStack({k: np.asarray(v, np.float32) for k, v in layers.items()}, attributes)
+
+
+def trials(rng):
+    from data_gen.pipelines import Trial
+
+    return {
+        "gpt": Trial([stack(rng, i, of_gradients=0.01) for i in range(4)], 0.02),
+        "primal": Trial([stack(rng, i) for i in range(4)], 0.01),
+    }
+
+
+def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
+    """Of every method, whatever it blurs: no pilot knows the truth."""
+    from data_gen import pipelines
+    from data_gen.pipelines import measure, methods_for
+
+    monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
+    monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
+    made = trials(rng)
+    found = measure(made)
+    names = {(p.sampler, p.method) for p in found}
+    assert names == {(s, m) for s in made for m in methods_for(s)} and ("gpt", "wcv") in names
+    for p in found:
+        four = [stack(rng, i, p.spp, of_gradients=0.01 if p.sampler == "gpt" else None) for i in range(4)]
+        errors = [relmse_trimmed(reconstruct(s, p.method).image, truth()) for s in four]
+        # Twice the square root of how far a mean over so few pixels can be off
+        assert p.error == pytest.approx(np.mean(errors), rel=0.35, abs=1e-4), p
+    noise = next(p for p in found if (p.sampler, p.method, p.shared) == ("primal", "primal", False))
+    assert noise.step == pytest.approx(-1, abs=0.15)
+
+
+def test_the_best_depends_on_the_time(renderer):
+    """A denoiser that hardly improves wins at first, gradients in the end."""
+    from data_gen.pipelines import choose
+
+    flat = pipeline("primal", "oidn", error=0.005, fall=-0.4, seconds=0.005)
+    steep = pipeline("gpt", "wcv", error=0.01, fall=-0.9)
+    assert choose([flat, steep], 0.2)[0] == flat and choose([flat, steep], 20.0)[0] == steep
+    for best in choose([flat, steep], 5.0):
+        assert math.isfinite(best.expected(best.samples(5.0)))
+
+
+def test_time_of_the_method_counts(renderer):
+    from data_gen.pipelines import choose
+
+    quick, slow = pipeline(error=0.011), pipeline(method="ngpt-combine", after=0.5)
+    assert slow.samples(1.0) == pytest.approx(50) and quick.samples(1.0) == pytest.approx(100)
+    assert choose([quick, slow], 1.0)[0] == quick and choose([quick, slow], 100.0)[0] == slow
+    assert choose([slow], 0.4) == []
+
+
+def test_samples_are_shared_out_where_that_pays(renderer):
+    from data_gen.pipelines import choose
+
+    even, shared = pipeline(), pipeline(adaptive=0.6, choosing=0.01)
+    assert shared.shared and not even.shared and shared.samples(2.0) < even.samples(2.0)
+    assert choose([even, shared], 2.0)[0] == shared
+    assert choose([even, shared], 0.3)[0] == even  # too few samples
+    dear = pipeline(adaptive=0.95, choosing=1.0)
+    assert choose([even, dear], 10.0)[0] == even
+
+
+def test_the_gain_of_shared_out_samples(renderer):
+    from data_gen.adaptive import gain
+
+    assert gain(np.ones(100)) == pytest.approx(1)
+    need = np.where(np.arange(100) < 50, 1.0, 2.0)
+    assert gain(need) == pytest.approx(1.5**2 / 2.5)
+
+
+def ticking(tick):
+    """A clock that goes on by as much whenever it is looked at."""
+    seconds = itertools.count()
+    return lambda: tick * next(seconds)
+
+
+def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
+    from data_gen import pipelines
+
+    scene = load(renderer, "diffuse", (48, 32))
+    monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
+    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
+    found = pipelines.plan(scene, 200.0, clock=ticking(0.01))
+    assert found.sampler in ("gpt", "primal") and found.method in pipelines.methods_for(found.sampler)
+    assert 0 < found.render < 200 and "expected to leave an error of" in found.reason
+    assert tuple(scene.sensors()[0].film().size()) == (48, 32)
+    with pytest.raises(NgptError, match="there is no method 'none'"):
+        pipelines.plan(scene, 200.0, "none")
+    with pytest.raises(NgptError, match="nothing fits into"):
+        pipelines.plan(scene, 1.0, "wcv", clock=ticking(0.1))
+
+
+def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
+    """The first two always; and the less time there is, the smaller the images."""
+    from data_gen import pipelines
+
+    scene = load(renderer, "diffuse", (48, 32))
+    monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
+    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
+    tried, sizes = [], []
+
+    def try_out(scene, name, seed, clock, limit):
+        assert limit == (math.inf if len(tried) < 2 else 0.2 * seconds)
+        for _ in range(8):
+            clock()
+        tried.append(name)
+        sizes.append(tuple(int(n) for n in scene.sensors()[0].film().size()))
+
+    monkeypatch.setattr(pipelines, "try_out", try_out)
+    for seconds, names, size in ((20.0, 2, (8, 5)), (250.0, 3, (24, 16)), (300.0, 4, (24, 16))):
+        tried.clear()
+        with pytest.raises(NgptError, match="none of the samplers"):
+            pipelines.plan(scene, seconds, clock=ticking(1.0))
+        assert tried == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
+
+
+def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
+    from data_gen.pipelines import try_out
+
+    scene = load(renderer, "diffuse", (16, 12))
+    # One look at the clock before a render of a sample, one after it: four renders of 8 and of 1 take 36 times that.
+    assert try_out(scene, "primal", 0, ticking(1.0), 35.0) is None
+    assert len(try_out(scene, "primal", 0, ticking(1.0), 37.0).stacks) == 4
+
+
+def test_a_method_is_tried_where_it_can_run(renderer):
+    from data_gen.pipelines import methods_for
+
+    assert methods_for("primal", "wcv") == [] and methods_for("gpt", "wcv") == ["wcv"]
+    assert methods_for("primal", "primal") == ["primal"]
+    for sampler in ("gpt", "primal", "bdpt"):
+        assert all(not METHODS[m].missing() for m in methods_for(sampler))

@@ -1,0 +1,124 @@
+"""The sampler ``restir``: frames of a shot, resumed or not, and what it refuses."""
+
+import numpy as np
+import pytest
+
+import ngpt
+from data_gen.samplers import FRAME_SAMPLERS, find
+from data_gen.scenes.facts import Facts
+from ngpt.cli import main
+from ngpt.errors import NgptError
+
+KEYS = [
+    {"frame": 0, "origin": [0, 1.2, 4], "target": [0, 1, 0]},
+    {"frame": 24, "origin": [2, 1, 3], "target": [0, 1, 0]},
+]
+
+
+def shot(size=(16, 12), **options):
+    from data_gen.frames.camera_path import CameraPath, Key, look_at
+    from data_gen.frames.sequence import Shot
+
+    views = [(np.array([key["origin"], key["target"], (0, 1, 0)], float), key["frame"]) for key in KEYS]
+    path = CameraPath([Key(frame, look_at(*look), look) for look, frame in views])
+    return Shot(options.pop("describe", lambda frame: ("diffuse", {})), size, path, **options)
+
+
+def rendered(frames=range(3), spp=2, seed=7, size=(16, 12), **options):
+    from data_gen.frames.sequence import render_sequence
+
+    return dict(render_sequence(shot(size), frames, spp, seed, sampler="restir", **options))
+
+
+@pytest.fixture(scope="module")
+def frames(renderer):
+    return rendered()
+
+
+def test_frames_have_all_layers(frames):
+    assert {"primal", "direct", "dx", "dy", "albedo", "normal", "depth", "motion"} <= set(frames[2].names)
+    assert {"primal_var", "dx_var", "dy_var"} <= set(frames[2].names)
+    attributes = [stack.attributes for stack in frames.values()]
+    assert [a["ngpt:sampler"] for a in attributes] == ["restir"] * 3
+    confidence = [a["ngpt:confidence"] for a in attributes]
+    assert confidence[0] == 1 and confidence[0] < confidence[1] < confidence[2] <= 3
+
+
+def test_one_chain_has_no_variance(renderer):
+    stack = rendered(range(2), spp=1)[1]
+    assert not [name for name in stack.names if name.endswith("_var")]
+
+
+def test_a_shot_is_gone_on_with_after_the_frames_before(frames):
+    """With all frames before it, a frame has the same bits; they are not given."""
+    later = rendered(skip=lambda frame: frame < 2)
+    assert list(later) == [2]
+    for name in ("primal", "dx", "dy_var", "motion"):
+        assert np.array_equal(later[2][name], frames[2][name], equal_nan=True), name
+
+
+def test_a_gap_is_bridged_by_so_many_frames_and_no_more(renderer, monkeypatch):
+    from dataclasses import replace
+
+    monkeypatch.setitem(FRAME_SAMPLERS, "restir", replace(FRAME_SAMPLERS["restir"], warm_up=1))
+    found = rendered(range(5), skip=lambda frame: frame in (1, 2, 3))
+    confidence = {frame: stack.attributes["ngpt:confidence"] for frame, stack in found.items()}
+    assert list(found) == [0, 4] and confidence[0] == 1 and 1 < confidence[4] <= 2
+
+
+def test_variances_are_those_over_seeds(renderer):
+    """Of the mean over chains; and differences are not half of themselves."""
+    found = [rendered(range(2), spp=8, seed=seed)[1] for seed in range(12)]
+    for name in ("dx", "dy"):
+        over_seeds = np.var([stack[name] for stack in found], axis=0, ddof=1).mean()
+        within = np.mean([stack[f"{name}_var"] for stack in found])
+        assert 0.6 < within / over_seeds < 1.6, name
+    edge = np.mean([stack["dx"] for stack in found], axis=0)
+    image = np.mean([stack["primal"] - stack["direct"] for stack in found], axis=0)
+    smooth = np.diff(image, axis=1)
+    assert np.sum(edge[:, :-1] * smooth) / np.sum(smooth * smooth) == pytest.approx(1, abs=0.15)
+
+
+def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
+    with pytest.raises(NgptError, match=r"sequences.*2 to 3 times as long.*--sampler gpt"):
+        find("restir")
+    assert main(["render", "diffuse", "--sampler", "restir", "-o", str(tmp_path / "x.exr")]) == 2
+    assert "--frames" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"describe": lambda frame: ("diffuse", {"x": str(frame)})}, "nothing but the camera moves"),
+        ({"update": lambda params, frame: None}, "nothing but the camera moves"),
+        ({"seconds": 2.0}, "--spp"),
+        ({"history": 0}, "1 or more"),
+        ({"gradients": "none"}, "pairs or after"),
+        ({"shift": "replay"}, "no option 'shift'"),
+        ({"memory": 1}, "--memory"),
+    ],
+)
+def test_what_cannot_be_rendered_is_refused(renderer, options, message):
+    from data_gen.frames.sequence import render_sequence
+
+    scene = shot(**{name: options.pop(name) for name in ("describe", "update") if name in options}, size=(32, 24))
+    with pytest.raises(NgptError, match=message):
+        next(render_sequence(scene, range(3), 4, sampler="restir", **options))
+
+
+def test_media_are_refused():
+    assert "media" in FRAME_SAMPLERS["restir"].refuses(Facts("path", ("fog",)))
+    assert "volpath" in FRAME_SAMPLERS["restir"].refuses(Facts("volpath", ()))
+    assert not FRAME_SAMPLERS["restir"].refuses(Facts("path", ()))
+
+
+def test_the_command_renders_a_shot(renderer, tmp_path):
+    import json
+
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps({"keys": KEYS}))
+    command = ["render", "diffuse", "--frames", "0:2", "--camera", str(path), "--sampler", "restir", "--size", "16x12"]
+    assert main([*command, "-o", str(tmp_path / "shot")]) == 0
+    stack = ngpt.read(tmp_path / "shot" / "diffuse.0001.exr")
+    assert stack.attributes["ngpt:sampler"] == "restir"
+    assert stack.attributes["ngpt:spp"] == FRAME_SAMPLERS["restir"].spp

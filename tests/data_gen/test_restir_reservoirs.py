@@ -1,0 +1,142 @@
+"""Reservoirs: weights sum to one, and W is unbiased, in NumPy over paths that can be counted."""
+
+import numpy as np
+import pytest
+
+# Of five paths: light in two pixels, of which the second does not have the last; densities of either's candidates.
+LIGHT = np.array([[0.2, 1.5, 0.7, 0.05, 2.0], [0.4, 1.0, 0.1, 0.6, 0.0]])
+FOUND = np.array([[0.1, 0.3, 0.2, 0.1, 0.3], [0.25, 0.25, 0.2, 0.3, 0.0]])
+# |J| of the shift from the first pixel to the second
+JACOBIAN = np.array([0.5, 2.0, 1.0, 1.25, 1.0])
+DRAWS = 400
+
+
+def gray(mi, values):
+    return mi.Spectrum(mi.Float(np.asarray(values, np.float32)))
+
+
+def all_outcomes(mi, M, both=False):
+    """Every candidate of the first pixel with every one of the second, of all random numbers: what is kept.
+
+    The paths of the second pixel are J(x) shorter than the first's: what has density p there has p / |J|. With
+    ``both``, there is a third reservoir, like the second. Returns the estimates, the number and p̂ of the path that was
+    kept, W, and the probability of each outcome.
+    """
+    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
+
+    a, b, c, u = (
+        n.ravel()
+        for n in np.meshgrid(np.arange(5), np.arange(4), np.arange(4 if both else 1), (np.arange(DRAWS) + 0.5) / DRAWS)
+    )
+    here, there = LIGHT
+    probability = FOUND[0][a] * FOUND[1][b] * (FOUND[1][c] if both else 1) / DRAWS
+    floats = [
+        [M[0] * here[a], (1 + both) * M[1] * there[a] * JACOBIAN[a], here[a], 1 / FOUND[0][a]],
+        # In the measure of the second pixel, |J| of the way back is 1 / J.
+        *(
+            [
+                M[1] * there[x],
+                (M[0] * here[x] + both * M[1] * there[x] * JACOBIAN[x]) / JACOBIAN[x],
+                here[x] / JACOBIAN[x],
+                JACOBIAN[x] / FOUND[1][x],
+            ]
+            for x in ((b, c) if both else (b,))
+        ),
+    ]
+    weights = [weigh(*(mi.Float(np.asarray(v, np.float32)) for v in row))[1] for row in floats]
+    chosen, total = choose(weights, mi.Float(u))
+    kept = np.choose(np.array(chosen), [a, b, c])
+    W = np.array(weight_of(total, gray(mi, here[kept])))
+    return here[kept] * W, kept, W, probability
+
+
+@pytest.mark.parametrize("both", [False, True])
+@pytest.mark.parametrize("M", [(1, 1), (1, 7), (5, 0.5)])
+def test_what_is_kept_of_all_that_is_offered_is_unbiased(renderer, M, both):
+    """E[value W] is the integral, here the sum over the first pixel's paths."""
+    estimate, _, _, probability = all_outcomes(renderer, M, both)
+    assert np.sum(probability) == pytest.approx(1)
+    assert np.sum(probability * estimate) == pytest.approx(LIGHT[0].sum(), rel=3e-3)
+
+
+@pytest.mark.parametrize("wrong", ["share", "others", "value"])
+def test_a_wrong_weight_is_seen_by_that(renderer, monkeypatch, wrong):
+    from data_gen.samplers.restir import reservoir as module
+
+    if wrong == "share":
+        monkeypatch.setattr(module, "share", lambda own, others: renderer.Float(0.5))
+    elif wrong == "others":
+        right = module.share
+        monkeypatch.setattr(module, "share", lambda own, others: right(own, 0.5 * others))
+    else:
+        monkeypatch.setattr(module, "weight_of", lambda total, value: total)
+    estimate, _, _, probability = all_outcomes(renderer, (1, 7))
+    assert abs(np.sum(probability * estimate) / LIGHT[0].sum() - 1) > 0.02
+
+
+def test_a_path_is_kept_in_proportion_to_its_weight(renderer, rng):
+    from data_gen.samplers.restir.reservoir import choose
+
+    mi, weights = renderer, [0.5, 0.0, 1.5, 2.0, 0.0]
+    u = (np.arange(1000) + 0.5) / 1000
+    chosen, total = choose([mi.Float(w) for w in weights], mi.Float(u))
+    assert np.allclose(np.array(total), 4)
+    assert np.allclose(np.bincount(np.array(chosen), minlength=5) / 1000, np.array(weights) / 4, atol=1e-3)
+
+
+def test_of_nothing_comes_nothing(renderer):
+    """Paths without light, or with weights that are not finite, add nothing."""
+    from data_gen.samplers.restir.reservoir import choose, weigh, weight_of
+
+    mi = renderer
+    for W in (0.0, np.inf, np.nan):
+        nothing = weigh(mi.Float(9), mi.Float(0), mi.Float(2), mi.Float(W))[1]
+        chosen, total = choose([nothing, mi.Float(3)], mi.Float(0.0))
+        assert (np.array(chosen), np.array(total)) == (1, 3)
+    assert np.array(weight_of(mi.Float(1), gray(mi, [0.0]))) == 0
+
+
+@pytest.mark.parametrize("others", [1, 2, 5])
+def test_pairwise_weights_of_a_path_sum_to_one(renderer, rng, others):
+    """p̂ of a path is given in each of the pixels, in the measure of the first; 0 where it cannot be."""
+    from data_gen.samplers.restir.reservoir import pairwise, pairwise_other
+
+    mi = renderer
+    p = rng.exponential(size=(others + 1, 50)).astype(np.float32)
+    p[1:][rng.random((others, 50)) < 0.3] = 0
+    M = rng.uniform(0.5, 20, size=(others + 1, 50)).astype(np.float32)
+    pairs = [(mi.Float(c), mi.Float(q)) for c, q in zip(M[1:], p[1:], strict=True)]
+    rest = mi.Float(M[1:].sum(axis=0))
+    total = np.array(pairwise(mi.Float(M[0]), mi.Float(p[0]), pairs))
+    expected = M[0] / M.sum(axis=0)
+    for (c, q), row, weight in zip(pairs, p[1:], M[1:], strict=True):
+        total = total + np.array(pairwise_other(c, q, mi.Float(M[0]), mi.Float(p[0]), rest))
+        others_sum = M[1:].sum(axis=0)
+        expected = expected + weight / M.sum(axis=0) * (M[0] * p[0] / (M[0] * p[0] + others_sum * row))
+    assert np.allclose(total, 1, atol=1e-5)
+    own = np.array(pairwise(mi.Float(M[0]), mi.Float(p[0]), pairs))
+    assert np.allclose(own, expected, rtol=1e-4)
+
+
+def test_a_difference_counts_each_path_once(renderer, rng):
+    """From both sides of a pair, a path's weights add up to "second - first"."""
+    from data_gen.samplers.restir.reservoir import difference
+
+    mi = renderer
+    a, b = (rng.exponential(size=(3, 40)).astype(np.float32) for _ in range(2))
+    b[:, :10] = 0
+    a[:, 10:15] = 0
+    first, second = mi.Spectrum(a), mi.Spectrum(b)
+    sides = [difference(first, second, mi.UInt32(side)) for side in (0, 1)]
+    assert np.allclose(np.array(sides[0] + sides[1]), b - a, atol=1e-5)
+    # What only the first pixel can see, only the first can sample.
+    assert np.allclose(np.array(sides[0])[:, :10], -a[:, :10])
+
+
+def test_a_difference_is_its_positive_less_its_negative_part(renderer, rng):
+    from data_gen.samplers.restir.reservoir import part
+
+    values = rng.normal(size=(3, 30)).astype(np.float32)
+    parts = [np.array(part(renderer.Spectrum(values), sign)) for sign in (1, -1)]
+    assert all((p >= 0).all() for p in parts)
+    assert np.array_equal(parts[0] - parts[1], values)
