@@ -23,7 +23,7 @@ def alike(renderer, scene, radius=0.4, photons=128, block=4):
     assert_alike(images, references, block)
 
 
-SLOW = (pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "colours", "milk"))
+SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "colours", "milk")]
 
 
 @pytest.mark.parametrize("name", ["haze", *SLOW])
