@@ -22,12 +22,15 @@ def alike(renderer, scene, radius=0.4, photons=96, block=4, batches=6):
     assert_alike(images, references, block)
 
 
-@pytest.mark.parametrize(("name", "block"), [("forward", 4), ("colours", 4), ("milk", 8)])
+@pytest.mark.parametrize(
+    ("name", "block"), [pytest.param("forward", 4, marks=pytest.mark.slow), ("colours", 4), ("milk", 8)]
+)
 def test_small_radii_have_the_image_of_volpath(renderer, name, block):
     """One phase function or another, colours apart, liquids in clear and in frosted glass: few photons get there."""
     alike(renderer, getattr(media_scenes, name), block=block, batches=10 if name == "milk" else 6)
 
 
+@pytest.mark.slow
 def test_media_within_each_other(renderer):
     """Behind boundaries that bend nothing, along which it is too dark by a share that falls like the radius."""
     alike(renderer, media_scenes.nested, radius=0.15, photons=192, block=16)
