@@ -12,7 +12,7 @@ from unbiased import REFERENCES, load, render_ours, render_references
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
-QUICK = ("points", "areas", "sky", "glass", "hidden_lamp", "bumps")
+QUICK = ("points", "sky", "glass", "bumps")
 
 
 def check(mi, description, **options):

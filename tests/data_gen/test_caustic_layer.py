@@ -28,7 +28,7 @@ def verdict(stacks, images, name):
     return z_test(np.stack([stack[name] for stack in stacks]), np.stack(slopes))
 
 
-@pytest.mark.parametrize("scene", ["glossy", glass, plenty])
+@pytest.mark.parametrize("scene", [glass, *(pytest.param(s, marks=pytest.mark.slow) for s in ("glossy", plenty))])
 def test_differences_are_those_of_the_rest(renderer, scene):
     scene = load(renderer, scene, (32, 32))
     stacks, images = render_ours(scene, "gpt"), others(scene)

@@ -230,6 +230,7 @@ def test_views_of_a_scene_share_their_kernels(renderer):
     assert kernels([replace(view, film=film, window=window, fov=42.0) for film, window in sizes]) == 2
 
 
+@pytest.mark.slow
 def test_tiny(renderer, tmp_path):
     """The real thing, twice: killed on the way and continued, then by a pool of processes; the same bits."""
     command = [sys.executable, "-m", "data_gen", "--config", "configs/data-tiny.toml", "--out"]

@@ -52,14 +52,14 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     assert np.array(r).ravel().tolist() == [1]
 
 
-@pytest.mark.parametrize("name", ["points", "sky", "bumps"])
+@pytest.mark.parametrize("name", ["sky", "bumps"])
 def test_unbiased_far_away(renderer, long_passes, name):
     """All kinds of lights, where ``diffuse`` has none but a rectangle; and normals that shapes do not know."""
     check(renderer, SCENES[name])
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", [name for name in SCENES if name not in ("points", "sky", "bumps", "diffuse")])
+@pytest.mark.parametrize("name", [name for name in SCENES if name not in ("sky", "bumps", "diffuse")])
 def test_unbiased_far_away_on_more_scenes(renderer, long_passes, name):
     check(renderer, SCENES[name])
 

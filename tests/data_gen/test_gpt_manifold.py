@@ -23,7 +23,9 @@ def under_the_sky():
     }
 
 
-@pytest.mark.parametrize("scene", [caustics, under_the_sky, glass])
+@pytest.mark.parametrize(
+    "scene", [caustics, *(pytest.param(s, marks=pytest.mark.slow) for s in (under_the_sky, glass))]
+)
 def test_unbiased(renderer, scene):
     scene = load(renderer, scene, (32, 32))
     references = render_references(renderer, scene, spp=128)

@@ -80,7 +80,7 @@ def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
         assert off.mean() < 0.01, layer
 
 
-@pytest.mark.parametrize("scene", [plenty, glass, "environment"])
+@pytest.mark.parametrize("scene", [pytest.param(plenty, marks=pytest.mark.slow), glass, "environment"])
 def test_half_vector_copy_is_unbiased(renderer, scene, monkeypatch):
     from data_gen.paths import shift
     from data_gen.samplers.gpt.integrator import stand_in
@@ -174,7 +174,7 @@ def mostly(condition):
     return np.array(condition).mean() > 0.99
 
 
-@pytest.mark.parametrize("scene", ["glossy", plenty])
+@pytest.mark.parametrize("scene", ["glossy", pytest.param(plenty, marks=pytest.mark.slow)])
 def test_the_primal_of_base_and_offset_paths_is_unbiased(renderer, scene):
     from data_gen.samplers.gpt.integrator import stand_in
 

@@ -181,8 +181,9 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
     assert not any(np.greater(found, FLOORS).any() for found in gains(renderer, "gpt"))
 
 
-# 64 renders of it take minutes. Its film is that of ppm.
-SLOW = [pytest.param(name, marks=pytest.mark.slow) if name == "gpm" else name for name in NAMES]
+# 64 renders of these take long. Their film is that of the others.
+DEAR = ("gbdpt", "ppm", "gpm")
+SLOW = [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in NAMES]
 
 
 @pytest.mark.parametrize("name", SLOW)

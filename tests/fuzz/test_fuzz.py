@@ -64,6 +64,7 @@ def test_bytes_that_reach_new_lines(target, tmp_path):
     record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)
 
 
+@pytest.mark.slow
 def test_campaigns_notice_what_they_are_for():
     """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
     report = run("probe", 0, 10, patience=20)

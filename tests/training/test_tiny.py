@@ -3,6 +3,8 @@
 import json
 import runpy
 
+import pytest
+
 import ngpt
 from ngpt.measure.metrics import relmse_trimmed
 
@@ -24,6 +26,7 @@ def render_views(folder):
         ngpt.write(view / "reference.exr", reference)
 
 
+@pytest.mark.slow
 def test_a_network_trained_in_a_minute_halves_the_error_of_a_scene_it_never_saw(renderer, tmp_path):
     render_views(tmp_path / "views")
     folders = [f"--set=data.folders=['{tmp_path / 'views'}']", f"--set=data.validation=['{HELD_OUT}']"]
