@@ -13,8 +13,8 @@ import numpy as np
 
 # What the shipped networks knew of each scene. docs/training.md and the model cards say how.
 GROUPS = {
-    "untouched": ("dining-room", "bedroom"),
-    "constants": ("living-room",),
+    "blind": ("classroom",),
+    "rooms": ("living-room", "dining-room", "bedroom"),
     "watched": ("lamp", "staircase", "glass-of-water"),
     "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
 }

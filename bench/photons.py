@@ -9,9 +9,10 @@ photons, in two halves with their own seeds, of --reference-spp passes each with
 within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
 on the photons' side. Errors are the trimmed relMSE.
 
-Scenes with media have `bre` for `ppm`, and `vpm`. With --by-paths the reference is of path tracing, which is right
-where paths find the light. The picture has a row for each scene of surfaces alone. Scenes that are in the cache are not
-rendered again.
+Scenes with media have `bre` and `beams` for `ppm`, their gradient twins, and `vpm`. With --reference-by the reference
+is by another sampler: `primal` or `bdpt`, which are right where they find the light, of --reference-spp samples. With
+--samplers others are compared than those of the picture, which has a row for each scene of surfaces alone. Scenes that
+are in the cache are not rendered again.
 """
 
 import argparse
@@ -36,16 +37,25 @@ METHODS = {
     "gpm": ("primal", "l1", "wcv"),
     "gpt": ("l1", "wcv"),
     "primal": ("oidn",),
+    "bdpt": ("primal", "oidn"),
+    "vcm": ("primal", "oidn"),
 }
 METHODS_IN_MEDIA = {
     "bre": ("primal", "oidn"),
+    "gbre": ("primal", "l1", "wcv"),
+    "beams": ("primal", "oidn"),
+    "gbeams": ("primal", "l1", "wcv"),
     "vpm": ("primal", "oidn"),
     "gpt": ("l1", "wcv"),
     "primal": ("primal", "oidn"),
 }
-PHOTONS = ("ppm", "gpm", "vpm", "bre")
+PHOTONS = ("ppm", "gpm", "vpm", "bre", "gbre", "beams", "gbeams")
+# Samplers with one sample of each pixel in a pass, or a few
+IN_PASSES = (*PHOTONS, "bdpt", "vcm")
+DEFAULT = (*PHOTONS, "gpt", "primal")
 SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
+SETUP = ("size", "seconds", "radius", "photons", "reference_spp")
 REFERENCE = {"radius": 1.0, "photons": 16}
 TILE = 192
 
@@ -56,8 +66,10 @@ def main() -> None:
     parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
-    parser.add_argument("--by-paths", action="store_true", help="the reference by path tracing")
+    parser.add_argument("--reference-by", metavar="SAMPLER", help="default: ppm, or bre in media")
+    parser.add_argument("--samplers", nargs="+", default=DEFAULT, help="default: %(default)s")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
+    parser.add_argument("--vcm-radius", type=float, help="that of vcm (default: its own)")
     parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
@@ -67,7 +79,7 @@ def main() -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    setup = {name: getattr(args, name) for name in ("size", "seconds", "radius", "photons", "reference_spp")}
+    setup = {name: getattr(args, name) for name in SETUP}
     result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
     rows = []
     for scene in args.scenes:
@@ -81,7 +93,7 @@ def main() -> None:
         row = json.loads((folder / "row.json").read_text())
         images = [read_image(path) for path in sorted(folder.glob("*.exr"))]
         result["scenes"][scene_name(scene)] = row
-        if len(images) > len(SHOWN):
+        if len(images) > len(SHOWN) and all(sampler in row for sampler, _ in SHOWN):
             rows.append(images)
         save(args.output, result)
         print(scene_name(scene), row, flush=True)
@@ -97,16 +109,20 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
 
     scene = load_scene(path, tuple(args.size))
     foggy = bool(media_of(scene))
-    by = "primal" if args.by_paths else "bre" if foggy else "ppm"
-    options = REFERENCE if by != "primal" else {}
+    by = args.reference_by or ("bre" if foggy else "ppm")
+    options = REFERENCE if by in PHOTONS else {}
     halves = [
         render_stack(scene, args.reference_spp, 1 << 20 | i, by, **options)["primal"].astype(np.float64)
         for i in range(2)
     ]
-    row: dict = {"error of half a reference": relmse_trimmed(halves[0], halves[1])}
+    row: dict = {"reference": by, "error of half a reference": relmse_trimmed(halves[0], halves[1])}
     shown = {}
     for sampler, methods in (METHODS_IN_MEDIA if foggy else METHODS).items():
+        if sampler not in args.samplers:
+            continue
         options = {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
+        if sampler == "vcm" and args.vcm_radius:
+            options = {"radius": args.vcm_radius}
         spp = samples_within(scene, sampler, args.seconds, options)
         stack = render_stack(scene, spp, 0, sampler, **options)
         row[sampler] = {"spp": spp}
@@ -125,7 +141,7 @@ def samples_within(scene, sampler: str, seconds: float, options: dict) -> int:
         render_stack(scene, spp, 1, sampler, **options)
         return time.process_time() - start
 
-    few, many = (2, 8) if sampler in PHOTONS else (16, 64)
+    few, many = (4, 12) if sampler in IN_PASSES else (16, 64)
     cost(few)  # compiles the kernels
     fixed = cost(few)
     each = max(cost(many) - fixed, 1e-3) / (many - few)

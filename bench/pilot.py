@@ -2,7 +2,8 @@
 
     python -m bench.pilot --scenes diffuse glossy SCENE.xml ... [--size 96 64]
 
-    pilot     seconds to a given error, over the least, as `--sampler auto` estimates them (data_gen/pilot.py)
+    pilot     seconds to the error that the scene's own sampler has after --spp samples, over the least, as
+              `--sampler auto` estimates them (data_gen/pilot.py)
     measured  the same from renders of --spp samples, reconstructed as the pilot does: their trimmed relMSE against two
               halves of a reference, times their seconds. The reference is that of the sampler with the least noise, of
               as many samples as --reference-spp.
@@ -47,18 +48,17 @@ def main() -> None:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """The choice, its loss, and times over the least by sampler."""
-    from data_gen.pilot import candidates, compare_with, judge, times_to_an_error, try_out
+    from data_gen.pilot import best_of, seen, simple, times_to_the_end
     from data_gen.render import render_stack
-    from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
+    from data_gen.trials import candidates, try_all
 
     scene = load_scene(path, tuple(args.size))
-    names = candidates(scene)
-    first = try_out(scene, names[0])
-    assert first is not None
-    trials = compare_with(scene, names, first)
-    pilot = times_to_an_error(trials)
-    choice, reason = judge(names[0], pilot)
+    trials = try_all(scene, candidates(scene))
+    expected = seen(trials)
+    seconds = args.spp * expected[0].seconds
+    pilot = times_to_the_end(expected, seconds)
+    choice, reason = best_of(expected, seconds)
     stacks: dict[str, list] = {name: [] for name in trials}
     for seed in range(args.seeds):
         for name, rendered in stacks.items():
@@ -67,8 +67,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
     halves = [render_stack(scene, args.reference_spp // 2, 1 << 20 | i, quietest)["primal"] for i in range(2)]
     errors, measured = {}, {}
     for name, rendered in stacks.items():
-        method = "wcv" if SAMPLERS[name].gradients else "primal"
-        logs = [math.log(max(relmse_trimmed(reconstruct(s, method).image, *halves), 1e-9)) for s in rendered]
+        logs = [math.log(max(relmse_trimmed(reconstruct(s, simple(name)).image, *halves), 1e-9)) for s in rendered]
         errors[name] = math.exp(statistics.mean(logs))
         measured[name] = errors[name] * min(float(stack.attributes["ngpt:seconds"]) for stack in rendered)
     least = {"pilot": min(pilot.values()), "measured": min(measured.values())}

@@ -38,9 +38,10 @@ from ngpt.stack import GradientStack
 
 LADDER = (16, 64, 256)
 PARTS = 4
-# Samples of the first sampler that a sampler's trial may cost: what the pilot of a 14 times larger image allows, in the
-# time of 256 samples. What is dearer is left out of the comparison, too.
-DEAREST = 700
+# Samples of the first sampler that a sampler's trial may cost: twice what the pilot of a 14 times larger image allows,
+# in the time of 256 samples, since half of a pass of so small images goes by with recording it. What is dearer is left
+# out of the comparison, too.
+DEAREST = 1400
 _REFERENCE, _SHARED = 1 << 20, 1 << 21
 
 
@@ -92,18 +93,19 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
-    from data_gen import passes, pilot, pipelines
+    from data_gen import passes, pipelines
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
+    from data_gen.trials import candidates, noise_of
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
     trials = {}
-    for i, name in enumerate(args.samplers or pilot.candidates(scene)):
+    for name in args.samplers or candidates(scene):
         limit = DEAREST * trials[first].seconds if (first := next(iter(trials), None)) else math.inf
-        if (trial := _trial(kept, scene, name, pilot.SEED + 8 * i, limit)) is not None:
+        if (trial := _trial(kept, scene, name, limit)) is not None:
             trials[name] = trial
     first, names = next(iter(trials)), list(trials)
     compiled: set[str] = set()
@@ -154,7 +156,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
         # The reference is of the sampler with the least noise at equal time.
         middle = sum(even[n][PARTS * part[n]][0]["primal"].astype("f8") for n in names) / len(names)
         noise = {
-            n: pilot.noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
+            n: noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
             for n in names
             if not SAMPLERS[n].biased
         }
@@ -180,28 +182,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
             {"pilot": vars(p), "errors": errors}
             | {"seconds": relative[p.sampler] * cost[first], "after": statistics.median(after)}
         )
-    auto = choice_of_auto(trials)
-    return {"reference": [quiet, spp], "first": first, "auto": auto, "rows": [rounded(row) for row in rows]}
-
-
-def choice_of_auto(trials: dict) -> str:
-    """The sampler that `--sampler auto` chooses by two of the stacks of each."""
-    from data_gen import pilot
-
-    judged = {}
-    for name, trial in trials.items():
-        two = trial.stacks[:2]
-        images = tuple(reconstruct(stack, simple(name)).image for stack in two)
-        primals = tuple(stack["primal"] for stack in two)
-        judged[name] = pilot.Trial(images, primals, trial.seconds * two[0].attributes["ngpt:spp"])
-    return pilot.judge(next(iter(trials)), pilot.times_to_an_error(judged))[0]
-
-
-def simple(sampler: str) -> str:
-    """The method by which `--sampler auto` compares samplers."""
-    from data_gen.samplers import SAMPLERS
-
-    return "wcv" if SAMPLERS[sampler].gradients else "primal"
+    return {"reference": [quiet, spp], "first": first, "rows": [rounded(row) for row in rows]}
 
 
 def rounded(value):
@@ -211,24 +192,24 @@ def rounded(value):
     return float(f"{value:.5g}") if isinstance(value, float) else value
 
 
-def _trial(kept: Kept, scene, name: str, seed: int, limit: float):
+def _trial(kept: Kept, scene, name: str, limit: float):
     """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene, or not in the time."""
-    from data_gen import pipelines
+    from data_gen.trials import Trial, try_out
 
     made = []
 
     def make() -> dict:
-        trial = pipelines.try_out(scene, name, seed, time.process_time, limit)
+        trial = try_out(scene, name, time.process_time, limit)
         if trial is not None:
             made.extend(trial.stacks)
             for i, stack in enumerate(trial.stacks):
                 kept.stack(f"pilot{i}-{name}", lambda stack=stack: stack)
         return {"seconds": None if trial is None else trial.seconds}
 
-    seconds = kept.numbers(f"pilot-{name}", make)["seconds"]
+    seconds = kept.numbers(f"trial-{name}", make)["seconds"]
     if seconds is None:
         return None
-    return pipelines.Trial([kept.stack(f"pilot{i}-{name}", lambda i=i: made[i]) for i in range(4)], seconds)
+    return Trial([kept.stack(f"pilot{i}-{name}", lambda i=i: made[i]) for i in range(4)], seconds)
 
 
 def _cost(stacks: list[GradientStack]) -> float:
@@ -247,7 +228,8 @@ def true_error(errors: dict[str, float], spp: float) -> float:
 def cells(entry: dict) -> list[dict]:
     """For each time of ``LADDER`` samples of the first sampler: name -> error, the pilot's choice, and the error by the
     sampler that `--sampler auto` chooses over that by the best, both by a simple method."""
-    from data_gen.pipelines import FROM, Pipeline, choose
+    from data_gen.pilot import best_of, simple
+    from data_gen.pipelines import Pipeline, choose
 
     pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
@@ -258,13 +240,12 @@ def cells(entry: dict) -> list[dict]:
         errors = {}
         for p, row in zip(pipelines, entry["rows"], strict=True):
             spp = replace(p, seconds=row["seconds"], after=row["after"]).samples(seconds)
-            if spp >= (FROM if p.shared else 2):
+            if spp >= max(p.least, 2):
                 errors[name_of(p)] = true_error(row["errors"], spp)
         ranked = [p for p in choose(pipelines, seconds) if name_of(p) in errors]
-        by_sampler = {
-            p.sampler: errors[name] for p in pipelines if (name := f"{p.sampler} {simple(p.sampler)}") in errors
-        }
-        auto = by_sampler.get(entry["auto"], math.inf) / min(by_sampler.values())
+        plain = [p for p in pipelines if p.method == simple(p.sampler) and not p.shared and name_of(p) in errors]
+        by_sampler = {p.sampler: errors[name_of(p)] for p in plain}
+        auto = by_sampler[best_of(plain, seconds)[0]] / min(by_sampler.values())
         found.append({"spp": n, "errors": errors, "choice": name_of(ranked[0]), "auto": auto})
     return found
 
@@ -283,8 +264,7 @@ def table(result: dict) -> list[str]:
             least = min(cell["errors"], key=lambda n: cell["errors"][n])
             ratios = {name: e / cell["errors"][least] for name, e in cell["errors"].items()}
             regrets[entry["apart"]].append(ratios[cell["choice"]])
-            if math.isfinite(cell["auto"]):
-                autos[entry["apart"]].append(cell["auto"])
+            autos[entry["apart"]].append(cell["auto"])
             for name, ratio in ratios.items():
                 fixed[entry["apart"]].setdefault(name, []).append(ratio)
                 if not name.endswith(" shared"):

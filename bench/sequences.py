@@ -8,17 +8,22 @@ sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and 
 the scene is one of those. Stacks and references are rendered once and kept in
 OUT. relMSE is without the worst 0.1 % of the pixels, flicker is ``ngpt.measure.flicker``; both are means over all
 frames but the first. What the references' own noise adds to both, by their variances, is taken off. ``+ temporal`` is
-`ngpt denoise --temporal`. With ``--pairs``, stacks have differences in time, and there is a row more, ``wcv + dt``, at
-``--spp``; all other rows are then of stacks without, at ``--spp-without``, for pairs take their time.
+`ngpt denoise --temporal`, ``+ rules`` the same without its network.
+
+With ``--plain``, methods that read no gradients have stacks without, of so many samples: as many as take the time of
+``--spp`` with. With ``--pairs``, stacks have differences in time, and there is a row more, ``wcv + dt``, at ``--spp``;
+all other rows are then of stacks without, at ``--spp-without``, for pairs take their time.
 """
 
 import argparse
+import time
 from pathlib import Path
 
 import numpy as np
 
 import ngpt
 from bench.common import metadata, save
+from ngpt.blending import shipped
 from ngpt.measure.flicker import flicker
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
@@ -51,6 +56,7 @@ def main() -> None:
     parser.add_argument("--spp", type=int, default=8)
     parser.add_argument("--pairs", type=int, default=0, help="of differences in time (default: 0, none)")
     parser.add_argument("--spp-without", type=int, default=12, help="of stacks without them (default: 12)")
+    parser.add_argument("--plain", type=int, default=0, help="samples of stacks without gradients (default: none)")
     parser.add_argument("--reference-spp", type=int, default=512)
     parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
@@ -61,8 +67,13 @@ def main() -> None:
             if shot not in SPEEDS and (scene, shot) not in MOVES:
                 continue
             kinds = render_shot(args, scene, shot, folder)
-            stacks, paired, references = ([ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in kinds)
-            found = [row for method in args.methods for row in judge(stacks, references, method)]
+            stacks, paired, references, plain = (
+                [ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in (*kinds, "plain")
+            )
+            found = []
+            for method in args.methods:
+                apart = bool(args.plain) and not {"dx", "dx_var"} & {*METHODS[method].needs, *METHODS[method].estimates}
+                found += judge(plain if apart else stacks, references, method)
             if args.pairs:
                 images = [result.image for _, _, result in reconstruct_shot(paired)]
                 found += measured(paired, references, {"wcv + dt": images})
@@ -75,11 +86,12 @@ def main() -> None:
 def judge(stacks: list, references: list, method: str) -> list[dict]:
     """Rows of a method, frame by frame and over time."""
     results = [ngpt.reconstruct(stack, method) for stack in stacks]
-    temporal = Temporal()
-    over_time = [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)]
-    return measured(
-        stacks, references, {method: [result.image for result in results], f"{method} + temporal": over_time}
-    )
+    images = {method: [result.image for result in results]}
+    for name, corrections in (("rules", None), ("temporal", shipped())):
+        temporal, begun = Temporal(corrections), time.perf_counter()
+        images[f"{method} + {name}"] = [temporal.next(s, r.image) for s, r in zip(stacks, results, strict=True)]
+        print(f"{method} + {name}: {(time.perf_counter() - begun) / len(stacks):.3f} s a frame")
+    return measured(stacks, references, images)
 
 
 def measured(stacks: list, references: list, images: dict[str, list[np.ndarray]]) -> list[dict]:
@@ -130,6 +142,8 @@ def render_shot(args: argparse.Namespace, scene: str, shot: str, folder: Path) -
     stacks: dict = {"in": {"spp": args.spp, "seed": 1, "sampler": "gpt", "dt": args.pairs}}
     if args.pairs:
         stacks["without"] = {"spp": args.spp_without, "seed": 3, "sampler": "gpt"}
+    if args.plain:
+        stacks["plain"] = {"spp": args.plain, "seed": 4, "sampler": "primal"}
     reference = {
         "spp": args.reference_spp * (4 if rests else 1),
         "seed": 2,

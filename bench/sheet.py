@@ -37,12 +37,13 @@ def draw(results: dict, methods: list[str], rows: int, size: int, seed: int) -> 
         raise NgptError(f"no scene has kept images of all of {', '.join(methods)}; evaluate with images = 'first'")
     rng = np.random.default_rng(seed)
     drawn = []
-    for index in rng.permutation(np.arange(rows) % len(whole)):
-        scene, spp = whole[index]
+    order = rng.permutation(len(whole))
+    for row in range(rows):
+        scene, spp = whole[order[row % len(whole)]]
         width, height = results["scenes"][scene]["size"]
         corner = [int(rng.integers(max(1, n - size + 1))) for n in (width, height)]
-        order = [methods[i] for i in rng.permutation(len(methods))]
-        drawn.append({"scene": scene, "spp": spp, "corner": corner, "order": order, "images": images[scene, spp]})
+        letters = [methods[i] for i in rng.permutation(len(methods))]
+        drawn.append({"scene": scene, "spp": spp, "corner": corner, "order": letters, "images": images[scene, spp]})
     return drawn
 
 
@@ -53,8 +54,8 @@ def crops(folder: Path, results: dict, row: dict, size: int) -> tuple[list[np.nd
     def crop(path: str) -> np.ndarray:
         return read_image(folder / path)[top : top + size, left : left + size]
 
-    reference = crop(entry["image"])
-    halves = tuple(crop(path) for path in entry["images of halves"]) or (reference,)
+    reference = crop(entry["reference"]["image"])
+    halves = tuple(crop(path) for path in entry["reference"]["images of halves"]) or (reference,)
     found = {method: crop(row["images"][method]) for method in row["order"]}
     errors = {
         method: {"FLIP": float(flip(image, reference)[0]), "relMSE trimmed": float(relmse_trimmed(image, *halves))}

@@ -19,7 +19,7 @@ _POINTS = ("point", "spot", "directional", "projector")
 # What light goes through and is focussed by, so that no connection finds it behind
 _LENSES = ("dielectric", "roughdielectric")
 # Samplers by photons, first the ones without gradients
-_PHOTONS = ("ppm", "gpm", "bre")
+_PHOTONS = ("ppm", "gpm", "bre", "gbre")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:

@@ -2,9 +2,12 @@
 
 Each sampler that could render the scene renders four small stacks. Every method that can use them reconstructs each of
 the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
-the other samplers, whose noise has no mean (``data_gen.pilot``): so what a method blurs or loses counts. From the
+the other samplers, whose noise has no mean (``data_gen.trials``): so what a method blurs or loses counts. From the
 pilot's samples to those that fit into the time errors fall by a power of the samples. Part of that power is what the
 pilot saw from one stack to two, the rest what is usual for methods of its kind.
+
+The image of a biased sampler (photons) is judged as a reconstruction is, and no biased sampler judges others. Where it
+finds most of the light, those that judge it have much noise: twice the standard error is added to what they say.
 
 Samples are even, or shared out (``data_gen.adaptive``) where that is expected to pay for itself: the gain is that of
 the pilot's expected errors, pixel by pixel, were they known.
@@ -15,19 +18,16 @@ Not handled: light that no sampler has found in the pilot.
 from __future__ import annotations
 
 import math
-import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import mitsuba as mi
-import numpy as np
 
 from data_gen.adaptive import LEAST, Adaptive, assess, gain
 from data_gen.passes import DEFAULT_MEMORY, film_within
-from data_gen.pilot import PIXELS, SEED, SPP, at_most, candidates, error_of, mean_of, noise_of
-from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS
+from data_gen.trials import PIXELS, Trial, Witnesses, at_most, candidates, try_all
 from ngpt.errors import NgptError
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
@@ -45,17 +45,11 @@ WITHOUT = ("primal", "oidn", "ngpt-primal")
 # the pilot has in such a power, and the steepest and flattest that it may be
 BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
 SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
+# The same power of photons' images, by theory; and how much of the standard error of their errors is added to these
+_BY_PHOTONS, _DOUBT = -2 / 3, 2.0
 # The power by which shared out samples with gradients are better than the pilot says, whose need is smoother than it
 # is; and the samples from which on they are thought of
 REALISED, FROM = 2.0, 2 * LEAST
-
-
-@dataclass(frozen=True)
-class Trial:
-    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image."""
-
-    stacks: list[GradientStack]
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -68,6 +62,7 @@ class Pipeline:
     ``after``     those of the method
     ``adaptive``  error of shared out samples over that of even ones, as the need for them says; 1: samples are even
     ``choosing``  seconds of the method that shares them out, each time
+    ``doubt``     standard error of the error of a biased sampler, by which it is taken for larger; else 0
     """
 
     sampler: str
@@ -79,6 +74,7 @@ class Pipeline:
     after: float
     adaptive: float = 1.0
     choosing: float = 0.0
+    doubt: float = 0.0
 
     @property
     def shared(self) -> bool:
@@ -88,10 +84,15 @@ class Pipeline:
     @property
     def fall(self) -> float:
         """The power of the samples by which the error falls."""
-        usual = usual_fall(self.method)
-        if self.method == "primal":
+        usual = usual_fall(self.sampler, self.method)
+        if self.method == "primal" or SAMPLERS[self.sampler].biased:
             return usual
         return min(max(SEEN * self.step + (1 - SEEN) * usual, STEEPEST), FLATTEST)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the others find too little of the light to judge it."""
+        return _DOUBT * self.doubt > self.error
 
     @property
     def gain(self) -> float:
@@ -114,117 +115,73 @@ class Pipeline:
     @property
     def least(self) -> int:
         """Samples below which nothing is expected."""
-        return FROM if self.shared else max(1, SAMPLERS[self.sampler].batch)
+        if self.shared:
+            return FROM
+        batch = SAMPLERS[self.sampler].batch
+        # Of one batch there are no variances.
+        return max(1, 2 * batch if self.method == "wcv" else batch)
 
     def expected(self, spp: float) -> float:
         """The error after so many samples; infinite where there are too few."""
         if spp < self.least:
             return math.inf
-        return self.error * self.gain * (spp / self.spp) ** self.fall
+        return self._begins * (spp / self.spp) ** self.fall
 
     def needed(self, error: float) -> float:
         """The samples that are expected to leave the error, or the least there are."""
-        return max(self.least, self.spp * (error / (self.error * self.gain)) ** (1 / self.fall))
+        return max(self.least, self.spp * (error / self._begins) ** (1 / self.fall))
+
+    @property
+    def _begins(self) -> float:
+        """What the error is taken for at ``spp``."""
+        return (self.error + _DOUBT * self.doubt) * self.gain
 
 
-def usual_fall(method: str) -> float:
-    """The power of the samples by which errors of a method usually fall."""
+def usual_fall(sampler: str, method: str) -> float:
+    """The power of the samples by which errors of a method usually fall, on stacks of the sampler."""
+    if SAMPLERS[sampler].biased:
+        return _BY_PHOTONS
     if method == "primal":
         return -1.0  # The samples are independent.
     return BY_GRADIENTS if "dx" in METHODS[method].needs else BY_DENOISERS
 
 
-def try_pipelines(
-    scene: mi.Scene,
-    samplers: Sequence[str],
-    goes_on: Callable[[], bool] = lambda: True,
-    limit: float = math.inf,
+def measure(
+    trials: dict[str, Trial],
     clock: Callable[[], float] = time.perf_counter,
-    only: str = "auto",
+    methods: Callable[[str], list[str]] | None = None,
+    shared: bool = True,
 ) -> list[Pipeline]:
-    """All pipelines of the samplers, as far as there is time: the first two are always tried.
+    """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
 
-    Each other one may take ``limit`` seconds. ``clock`` is what seconds are measured by, ``only`` the one method to
-    consider. Raises NgptError where no sampler can render the scene.
+    Or those of the ``methods`` that are given for a sampler; samples are ``shared`` out too, or only even.
     """
-    trials: dict[str, Trial] = {}
-    for i, name in enumerate(samplers):
-        if i > 1 and not goes_on():
-            break
-        if (trial := try_out(scene, name, SEED + 8 * i, clock, limit if i > 1 else math.inf)) is not None:
-            trials[name] = trial
-    if not trials:
-        raise NgptError(f"none of the samplers {', '.join(samplers)} can render the scene")
-    return measure(trials, clock, only)
-
-
-def try_out(
-    scene: mi.Scene, sampler: str, seed: int, clock: Callable[[], float], limit: float = math.inf
-) -> Trial | None:
-    """Four small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
-    expected to take longer than the ``limit``."""
-    spp, least = max(SPP, 2 * SAMPLERS[sampler].batch), max(1, SAMPLERS[sampler].batch)
-    try:
-        render_stack(scene, 1, seed, sampler)  # compiles
-    except NgptError:
-        return None
-    if limit < math.inf:
-        start = clock()
-        render_stack(scene, least, seed, sampler)
-        if 4 * (spp / least + 1) * (clock() - start) > limit:
-            return None
-    stacks, seconds, begin = [], [], []
-    for i in range(4):
-        start = clock()
-        render_stack(scene, least, seed + i, sampler)
-        begin.append(clock() - start)
-        start = clock()
-        stacks.append(render_stack(scene, spp, seed + i, sampler))
-        seconds.append(clock() - start)
-    # What a render takes to begin is no part of what a sample takes.
-    each = (statistics.median(seconds) - statistics.median(begin)) / (spp - least)
-    return Trial(stacks, max(each, 0.2 * statistics.median(seconds) / spp))
-
-
-def measure(trials: dict[str, Trial], clock: Callable[[], float] = time.perf_counter, only: str = "auto"):
-    """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use."""
-    primals = {name: [stack["primal"].astype(np.float64) for stack in trial.stacks] for name, trial in trials.items()}
-    middle = sum(sum(images) / 4 for images in primals.values()) / len(primals)
-    noise = {name: max(noise_of(*images[:2], middle), 1e-12) for name, images in primals.items()}
-    scale = mean_of({name: sum(images) / 4 for name, images in primals.items()}, noise)
+    witnesses = Witnesses.of(trials)
     found = []
     for name, trial in trials.items():
         halves = [merge(trial.stacks[:2]), merge(trial.stacks[2:])]
         need = None
-        for method in methods_for(name, only):
+        for method in (methods or methods_for)(name):
             single, double, after = [], [], []
             for half in range(2):
-                single += [reconstruct(stack, method).image for stack in trial.stacks[2 * half : 2 * half + 2]]
+                single.append([reconstruct(stack, method).image for stack in trial.stacks[2 * half : 2 * half + 2]])
                 start = clock()
-                double.append(reconstruct(halves[half], method).image)
+                double.append([reconstruct(halves[half], method).image])
                 after.append(clock() - start)
-            witnesses = [_witnesses(primals, noise, name, half) for half in (1, 0)]
-            one = _expected([single[:2], single[2:]], [[w, w] for w in witnesses], scale)
-            two = _expected([double], [witnesses], scale)
-            spp = int(halves[0].attributes["ngpt:spp"])
-            # Of both: at twice the samples, the one that was measured there and the one that falls to it.
-            error = math.sqrt(two * one * 2 ** usual_fall(method))
-            pipeline = Pipeline(name, method, spp, error, math.log2(two / one), trial.seconds, min(after))
+            one, two = witnesses.error(name, single), witnesses.error(name, double)
+            spp, doubt = int(halves[0].attributes["ngpt:spp"]), 0.0
+            if SAMPLERS[name].biased:
+                doubt = witnesses.doubt(name, double[0][0])
+            else:
+                # Of both: at twice the samples, the one that was measured there and the one that falls to it.
+                two = math.sqrt(two * one * 2 ** usual_fall(name, method))
+            pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)
-            if not SAMPLERS[name].batch:
+            if shared and not SAMPLERS[name].batch:
                 if need is None:
                     need = _need(merge(halves), clock)
                 found.append(replace(pipeline, adaptive=need[0], choosing=need[1]))
     return found
-
-
-def _expected(pairs: list, witnesses: list, scale: np.ndarray) -> float:
-    """The error of images in independent pairs, each by its two witnesses: at least what those of a pair differ by,
-    which is sure, where noise of the witnesses hides the rest."""
-    errors = [
-        error_of(x, w, scale) for pair, by in zip(pairs, witnesses, strict=True) for x, w in zip(pair, by, strict=True)
-    ]
-    return max(statistics.mean(errors), statistics.mean(noise_of(*pair, scale) for pair in pairs), 1e-9)
 
 
 def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, float]:
@@ -244,18 +201,6 @@ def methods_for(sampler: str, only: str = "auto") -> list[str]:
             raise NgptError(f"method '{only}' cannot be used: {lack}; name another, or auto")
         names = (only,) if SAMPLERS[sampler].gradients or "dx" not in METHODS[only].needs else ()
     return [m for m in names if not METHODS[m].missing()]
-
-
-def _witnesses(primals: dict, noise: dict[str, float], sampler: str, half: int) -> list[np.ndarray]:
-    """Two independent images that the sampler's other half has no part in: that ``half`` of its own, all of others."""
-    sides = []
-    for i in range(2):
-        images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in primals.items() if n != sampler}
-        weights = {n: noise[n] / 2 for n in images}
-        images[sampler], weights[sampler] = primals[sampler][2 * half + i], noise[sampler]
-        fair = [n for n in images if not SAMPLERS[n].biased] or list(images)
-        sides.append(mean_of({n: images[n] for n in fair}, weights))
-    return sides
 
 
 def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
@@ -280,7 +225,11 @@ def explore(
     entry = SAMPLERS[able[0]]
     film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
     with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
-        found = try_pipelines(scene, able, lambda: clock() - start < SHARE * seconds, DEAREST * seconds, clock, method)
+        trials = try_all(scene, able[:2], clock=clock)
+        trials |= try_all(scene, able[2:], lambda: clock() - start < SHARE * seconds, DEAREST * seconds, clock)
+        if not trials:
+            raise NgptError(f"none of the samplers {', '.join(able)} can render the scene")
+        found = measure(trials, clock, lambda sampler: methods_for(sampler, method))
     return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
 
 

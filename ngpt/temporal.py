@@ -20,15 +20,18 @@ How much history counts, b, is made of
     change        less history where h - x is many times what it is around: edges that were seen otherwise
 
 b* is the minimum of Stein's unbiased risk over the line from x to h; Rousselle et al. 2013, "Robust denoising using
-feature and color information", choose between filters by that risk. Where direct emission is known, the rest alone is
-blended. The method may be any, and knows nothing of time.
+feature and color information", choose between filters by that risk. These are rules (``ngpt.evidence``); a network that
+sees them and more corrects b, at each of several scales of h - x (``ngpt.blending``). Where direct emission is known,
+the rest alone is blended. The method may be any, and knows nothing of time.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
 
+from ngpt.blending import Blend, Corrections, shipped
+from ngpt.evidence import agreement, weighed
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.warp import warped
@@ -37,16 +40,6 @@ from ngpt.warp import warped
 LONGEST = 16
 # Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
 FAST = 0.005
-# Pixels, of the window of the evidence (standard deviation).
-WINDOW = 4.0
-# What b may be off from that of the variances, before there is evidence (standard deviation).
-DOUBT = 0.12
-# Differences of features beyond what is allowed, at which history counts exp(-1) = 0.37. A pixel that two surfaces
-# share in parts u and 1 - u has features with a standard deviation of sqrt(u (1 - u) / spp) times what they differ by.
-MIXED = 1.0
-# Times the change around it, from which a pixel's counts the less.
-UNUSUAL = 15.0
-ALBEDO, NORMAL, DEPTH = 0.1, 0.2, 0.03
 
 
 @dataclass(frozen=True)
@@ -60,10 +53,16 @@ class _History:
 
 
 class Temporal:
-    """Blends the frames of a shot, in their order, one after the other."""
+    """Blends the frames of a shot, in their order, one after the other.
 
-    def __init__(self) -> None:
+    ``corrections``  of the rules, by a network (``ngpt.blending``): by default the one that comes with ngpt, where ONNX
+                     Runtime is installed; None for the rules alone
+    """
+
+    def __init__(self, corrections: Corrections | Literal["shipped"] | None = "shipped") -> None:
+        self.corrections = shipped() if corrections == "shipped" else corrections
         self._history: _History | None = None
+        self.blend: Blend | None = None  # what the last frame was made of; None for a restart
         self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
 
     @property
@@ -82,24 +81,35 @@ class Temporal:
         frame = stack.attributes.get("ngpt:frame")
         relative = np.ones(now.shape[:2], np.float32)
         features = data.features
-        self.weight = np.zeros(now.shape[:2], np.float32)
+        self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
         before = self._history
         if before is not None and _follows(stack, before):
             motion = stack["motion"]
             history, found = warped(before.light, motion, sharp=True)
             spread = warped(before.variance[..., None], motion)[0][..., 0]
             then = {name: warped(layer, motion)[0] for name, layer in before.features.items() if name in features}
-            trust = found * _agreement(features, then, found)
+            trust = found * agreement(features, then, found)
             speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
             spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
-            b = _share(now, history, data.image, data.noise, trust, 1 / (1 + spread))
+            first = 1 / (1 + spread)
+            evidence = weighed(now, history, data.image, data.noise, trust, first)
+            if self.corrections is None:
+                b = evidence.share
+                now = now + b[..., None] * (history - now)
+            else:
+                self.blend = Blend(now, history, data.image, evidence, trust, first, speed, features)
+                now, b = self.blend.by(self.corrections(self.blend.inputs()))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
-            now = now + b[..., None] * (history - now)
             self.weight = b
             # They have noise as well, and are blended as the light is, that they stay those of its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
         self._history = _History(now, relative, features, frame)
         return (now + data.direct).astype(np.float32)
+
+    def assume(self, variance: float) -> None:
+        """Takes the last result for one of so much of a frame's own variance, as of 1 / ``variance`` frames."""
+        if self._history is not None:
+            self._history = replace(self._history, variance=np.full_like(self._history.variance, variance))
 
 
 def _follows(stack: GradientStack, before: _History) -> bool:
@@ -108,76 +118,3 @@ def _follows(stack: GradientStack, before: _History) -> bool:
         return False
     previous = stack.attributes.get("ngpt:previousFrame")
     return previous is None or before.frame is None or previous == before.frame
-
-
-def _agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np.ndarray) -> np.ndarray:
-    """How far the features ``then`` are those of each pixel now, (H, W) from 0 to 1."""
-    strange = np.zeros(found.shape)
-    for name, scale in (("albedo", ALBEDO), ("normal", NORMAL), ("depth", DEPTH)):
-        if name not in then:
-            continue
-        here, there = now[name], then[name]
-        if name == "depth":
-            here, there = (np.log(np.maximum(layer, 1e-6)) for layer in (here, there))
-            # A camera that comes nearer changes all depths: alike, if not by the same factor.
-            there = there + (np.median((here - there)[found]) if found.any() else 0)
-        low, high = minimum_filter(here, (3, 3, 1)), maximum_filter(here, (3, 3, 1))
-        allowed = MIXED * np.sqrt((here - low) * (high - here))
-        beyond = np.maximum(np.abs(there - here) - allowed, 0) / scale
-        strange += np.square(beyond).sum(axis=-1)
-    return np.exp(-strange).astype(np.float32)
-
-
-def _share(
-    x: np.ndarray, h: np.ndarray, p: np.ndarray, variance: np.ndarray | None, trust: np.ndarray, first: np.ndarray
-) -> np.ndarray:
-    """b of the evidence and of the variances (``first``) together, (H, W) from 0 to ``first``."""
-    rest, change = p - x, h - x
-    if variance is None:
-        variance = np.full_like(p, np.nan)
-    # That of single pixels is known no better than they are, and goes with their values.
-    noise = _noise(variance, rest)
-    rest = np.clip(rest, -4 * np.sqrt(noise), 4 * np.sqrt(noise))
-    trust = trust * _usual((np.square(change) / noise).mean(axis=-1), trust)
-    weight = trust[..., None] / noise
-    kept = _kept(rest, noise, trust)
-    squares = _mean((weight * np.square(change)).sum(axis=-1))
-    above = _mean((weight * (change * rest + kept * noise)).sum(axis=-1))
-    # Noise of the channels goes together, and so does their part in the variance of `above`.
-    spread = _mean(np.square((weight * np.abs(change) * np.sqrt(noise)).sum(axis=-1))) / (4 * np.pi * WINDOW**2)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        evidence, doubt = above / squares, spread / np.square(squares)
-        precise = np.where(squares > 0, 1 / np.maximum(doubt, 1e-12), 0)
-    b = (np.where(squares > 0, evidence, 0) * precise + first / DOUBT**2) / (precise + 1 / DOUBT**2)
-    return trust * np.clip(b, 0, first)
-
-
-def _usual(change: np.ndarray, trust: np.ndarray) -> np.ndarray:
-    """1 where history differs from now as it does around a pixel, less where by more: edges that were seen otherwise.
-
-    Around a pixel is the geometric mean, which single ones do not move.
-    """
-    tiny = 1e-6 * change.mean() + 1e-30
-    around = _mean(trust * np.log(change + tiny)) / np.maximum(_mean(trust), 1e-6)
-    return np.minimum(1, UNUSUAL * np.exp(around) / (change + tiny))
-
-
-def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The variance of the primal around each pixel, (H, W, 3), positive; of what the method took off where unknown."""
-    known = np.isfinite(variance)
-    filled = np.where(known, variance, np.square(rest))
-    smooth = gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")
-    return np.maximum(smooth, 1e-6 * smooth.mean() + 1e-30)
-
-
-def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
-    """d: the share of its own noise that a method leaves in a pixel, from 0 (smooth) to 1 (the noisy image itself).
-
-    For a projection, E (p - x)² is σ² (1 - d), and more where x is biased: so d is no less than this.
-    """
-    ratio = _mean((np.square(rest) / noise).mean(axis=-1))
-    return float(np.clip(1 - np.median(ratio), 0, 1))
-
-
-def _mean(image: np.ndarray) -> np.ndarray:
-    return gaussian_filter(image, WINDOW, mode="nearest", truncate=3)

@@ -25,6 +25,8 @@ ngpt.classical
 ngpt.denoisers
 ngpt.network
 ngpt.methods
+ngpt.evidence
+ngpt.blending
 ngpt.uncertainty ngpt.lightgroups ngpt.temporal ngpt.shots
 ngpt.denoiser
 ngpt.report
@@ -37,12 +39,13 @@ data_gen.film data_gen.paths
 data_gen.passes
 data_gen.uneven
 data_gen.samplers
-data_gen.adaptive
+data_gen.adaptive data_gen.spectral
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames
-data_gen.costs data_gen.pilot
+data_gen.costs data_gen.trials
 data_gen.pipelines
+data_gen.pilot
 data_gen.dataset
 ngpt.evaluation
 ngpt.cli

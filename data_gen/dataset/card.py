@@ -50,10 +50,11 @@ def card(data: Dataset, told: dict) -> str:
     counts = np.array([n for crop in records for n in crop["spp"]])
     edges = 2 ** np.arange(int(np.log2(config["spp"][0])), int(np.log2(config["spp"][1])) + 2)
     exposures = np.array([-auto_exposure(crop.reference) for crop in data])
+    shots = f"{told['shots']} shots of up to {config['frames']} frames: " if "shots" in told else ""
     lines = [
         "# Training set",
         "",
-        f"{told['crops']} crops of {config['size']}x{config['size']} pixels from {told['scenes']} scenes "
+        f"{shots}{told['crops']} crops of {config['size']}x{config['size']} pixels from {told['scenes']} scenes "
         f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each; "
         f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
         "",

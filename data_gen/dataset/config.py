@@ -30,6 +30,7 @@ class Config:
     seed: int = 0
     size: int = 128
     inputs: int = 4
+    frames: int = 1
     spp: tuple[int, int] = (2, 64)
     sampler: str = "gpt"
     roll: float = 20.0
@@ -49,7 +50,7 @@ class Config:
         for bad, text in (
             (not 2 <= low <= high, f"spp = [{low}, {high}]: at least 2 (one sample has no variance), low to high"),
             (self.size < 8, f"size = {self.size}: at least 8 pixels"),
-            (min(self.inputs, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
+            (min(self.inputs, self.frames, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
             (self.reference_spp < 4, f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves"),
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
             (

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 import time
 import zlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -55,13 +56,13 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
         record["scene_seconds"] = time.perf_counter() - start
         for crop in job.crops:
             try:
-                data, told = make_crop(config, around, job.scene, crop)
+                made = make_crop(config, around, job.scene, crop)
             except (NgptError, RuntimeError) as error:
                 stop_if_interrupted(error)
                 record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
             else:
-                crops.append(data)
-                record["crops"].append(told)
+                crops += [data for data, _ in made]
+                record["crops"] += [told for _, told in made]
     write_shard(Path(folder) / job.file, crops, record)
     # Kernels are those of the scene: a process that makes thousands of scenes would keep them all.
     import drjit as dr
@@ -97,32 +98,73 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
     return [int(n) for n in np.exp(low + u * (high - low))]
 
 
-def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, dict]:
-    """One crop and its record; ``around`` are the ``Surroundings`` of its scene."""
+def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
+    """One crop and its record, or one of each frame of a shot; ``around`` are the ``Surroundings`` of its scene."""
     from data_gen.dataset.cameras import find_view
+    from data_gen.dataset.movement import Movement, random_movement
+    from data_gen.frames.motion import motion_vectors, snapshot
     from data_gen.render import render_stack
 
     rng = np.random.default_rng((*scene_seed(config, name), crop))
     counts = sample_counts(rng, config)
+    scene, moving = around.scene, config.frames > 1
     clock = time.perf_counter()
     for _ in range(ATTEMPTS):
         view = find_view(around, rng, config.size, config.roll, config.lens)
-        view.apply(around.scene)
-        seconds = {"camera": time.perf_counter() - clock}
-        seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs + HALVES)]
+        movement = random_movement(around, view, rng, config.frames) if moving else Movement(view)
+        movement.apply(scene, 0)
+        found = time.perf_counter() - clock
+        seeds = _seeds(rng, config)
         clock = time.perf_counter()
-        stacks = [render_stack(around.scene, counts[0], seeds[0], config.sampler)]
-        if np.mean(np.nan_to_num(stacks[0]["primal"]).max(axis=-1) > 0) > LIT:
+        first = render_stack(scene, counts[0], seeds[0], config.sampler)
+        if np.mean(np.nan_to_num(first["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
         raise NgptError(f"{name}: {ATTEMPTS} views in a row were black")
-    stacks += [
-        render_stack(around.scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-HALVES], strict=True)
+    made: list[tuple[CropData, dict]] = []
+    before = None
+    try:
+        for frame in range(config.frames):
+            if frame:
+                clock = time.perf_counter()
+                movement.apply(scene, frame)
+                found = time.perf_counter() - clock
+                seeds = _seeds(rng, config)
+                clock = time.perf_counter()
+                first = render_stack(scene, counts[0], seeds[0], config.sampler)
+            data, told = _crop(config, scene, first, counts, seeds, clock)
+            told = {"crop": crop, "view": movement.view_at(frame).record()} | told
+            told["seconds"]["camera"] = round(found, 4)
+            if moving:
+                now = snapshot(scene, None if before is None or movement.shape else before.shapes)
+                motion = np.full((config.size, config.size, 2), np.nan, np.float32)
+                data = replace(data, motion=motion if before is None else motion_vectors(scene, now, before))
+                told |= {"frame": frame, "movement": movement.record()}
+                before = now
+            made.append((data, told))
+    finally:
+        # Other crops of the scene find it as it was.
+        movement.apply(scene, 0)
+    return made
+
+
+def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
+    return [int(seed) for seed in rng.integers(0, 2**32, config.inputs + HALVES)]
+
+
+def _crop(
+    config: Config, scene, first: GradientStack, counts: list[int], seeds: list[int], clock: float
+) -> tuple[CropData, dict]:
+    """The crop of which ``first`` is the first input, begun at ``clock``, and its record."""
+    from data_gen.render import render_stack
+
+    stacks = [first] + [
+        render_stack(scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-HALVES], strict=True)
     ]
-    seconds["inputs"] = time.perf_counter() - clock
+    seconds = {"inputs": time.perf_counter() - clock}
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
-    halves = [render_stack(around.scene, spp, seed, config.sampler) for seed in seeds[-HALVES:]]
+    halves = [render_stack(scene, spp, seed, config.sampler) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]
@@ -139,10 +181,8 @@ def make_crop(config: Config, around, name: str, crop: int) -> tuple[CropData, d
         tuple(np.maximum(half, direct) for half in apart),
     )
     told = {
-        "crop": crop,
         "spp": counts,
         "seeds": seeds,
-        "view": view.record(),
         "repaired": [count for _, count in cleaned],
         "seconds": {part: round(value, 4) for part, value in seconds.items()},
     }

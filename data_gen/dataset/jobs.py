@@ -84,7 +84,7 @@ def generate(
     cannot be written or a worker dies; what is finished by then is kept, and the same call continues.
     """
     plan = config.plan()
-    start(config, folder, sum(len(job.crops) for job in plan))
+    start(config, folder, config.frames * sum(len(job.crops) for job in plan))
     part = plan[shard[0] :: shard[1]]
     todo = [job for job in part if not (folder / job.file).exists()]
     total = sum(len(job.crops) for job in part)

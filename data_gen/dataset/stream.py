@@ -105,7 +105,10 @@ class Stream:
         shard = Shard(path)
         told = shard.record["crops"]
         with self._changed:
-            self._crops.extend(Crop(shard, i, shard.record["scene"], tuple(crop["spp"])) for i, crop in enumerate(told))
+            self._crops.extend(
+                Crop(shard, i, shard.record["scene"], tuple(crop["spp"]), crop.get("frame"))
+                for i, crop in enumerate(told)
+            )
             self._changed.notify_all()
         # Mapped into memory, it lives on for as long as one of its crops does.
         path.unlink()

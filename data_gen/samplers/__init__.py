@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 # Bytes that a lane of a path tracer takes in a pass: the most that any was seen to take, 200, and some more.
 PATH_BYTES = 256
 # Of one that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a pass
-_GBDPT_BYTES = PATH_BYTES + 160
+# and the list of vertices that the camera sees, some of them for each lane
+_GBDPT_BYTES = PATH_BYTES + 224
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -200,6 +201,15 @@ def _notes_on_photons(facts: Facts) -> list[str]:
     return lines
 
 
+def _notes_on_vcm(facts: Facts) -> list[str]:
+    lines = [
+        f"transport: Mitsuba's '{facts.integrator}', found from both ends and by photons; blurred where by photons"
+    ]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too")
+    return lines
+
+
 def _notes_on_gbdpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', found from both ends and shifted as a whole"]
     if facts.mirrors:
@@ -209,7 +219,14 @@ def _notes_on_gbdpt(facts: Facts) -> list[str]:
     return lines
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _BRE, _PRIMAL = (
+def _notes_on_gmlt(facts: Facts) -> list[str]:
+    return [
+        f"transport: Mitsuba's '{facts.integrator}', by chains of paths that change little by little",
+        "noise: correlated between pixels, which denoisers of independent noise do not expect",
+    ]
+
+
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -217,10 +234,15 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _PPM, _GPM, _VPM, _BRE, _PRIMAL = (
         "gpt_simple",
         "bdpt.integrator",
         "gbdpt.integrator",
+        "gmlt.integrator",
         "photons.ppm",
         "photons.gpm",
         "photons.vpm",
         "photons.bre",
+        "photons.gbre",
+        "photons.beams",
+        "photons.gbeams",
+        "vcm.integrator",
         "primal",
     )
 )
@@ -293,6 +315,16 @@ for _sampler in (
         module=_GBDPT,
     ),
     Sampler(
+        "gmlt",
+        "gradients of chains of paths that stay where light was found (rooms lit through a slit)",
+        _from_module(_GMLT),
+        lambda facts: _refused_but_for_surfaces(facts, "gmlt"),
+        _notes_on_gmlt,
+        tried=False,
+        batch=8,
+        lane_bytes=_GBDPT_BYTES,
+    ),
+    Sampler(
         "ppm",
         "photons gathered within a shrinking radius, without gradients (caustics seen in mirrors and through glass)",
         _from_module(_PPM),
@@ -340,6 +372,60 @@ for _sampler in (
         batch=1,
         biased=True,
         module=_BRE,
+    ),
+    Sampler(
+        "gbre",
+        "gradients of photons in media gathered along whole rays (caustics in fog, beams of lamps in haze)",
+        _from_module(_GBRE),
+        lambda facts: _refused_but_for_media(facts, "gbre"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GBRE,
+    ),
+    Sampler(
+        "beams",
+        "photon beams: light in media gathered from whole light paths, without gradients (thin fog, beams of lamps)",
+        _from_module(_BEAMS),
+        lambda facts: _refused_but_for_media(facts, "beams"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS,
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_BEAMS,
+    ),
+    Sampler(
+        "gbeams",
+        "gradients of photon beams (thin fog, beams of lamps)",
+        _from_module(_GBEAMS),
+        lambda facts: _refused_but_for_media(facts, "gbeams"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GBEAMS,
+    ),
+    Sampler(
+        "vcm",
+        "paths from both ends, joined and merged with photons, without gradients (hidden lamps and all caustics)",
+        _from_module(_VCM),
+        lambda facts: _refused_but_for_surfaces(facts, "vcm"),
+        _notes_on_vcm,
+        {
+            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
+            "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
+            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+        },
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_VCM,
     ),
     Sampler(
         "primal",

@@ -147,7 +147,7 @@ def solve_weighted(
     derivative is added, and that is sent through the same solver on the way back, for the system is symmetric.
     """
     constants = detach(r), detach(screen), detach(weights)
-    system = _Weighted(*constants[1:])
+    system = Weighted(*constants[1:])
     flux = constants[2] * constants[0]
     b, _ = adjoint_by_rows(lambda i, j: (None, *flux[..., i:j, :]), empty(r, len(r[0])))
     u, iterations = system.solve(b, tolerance, max_iterations)
@@ -160,7 +160,7 @@ def solve_weighted(
     return u, iterations
 
 
-class _Weighted:
+class Weighted:
     """The matrix screen + ∇ᵀ weights ∇ and its preconditioner D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2, by cosine transforms.
 
     D is the mean weight around a pixel where ``screen`` varies, and 1 where it does not [Concus and Golub 1973, "Use of

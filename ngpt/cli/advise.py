@@ -130,11 +130,12 @@ def by_table(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
+    from data_gen.pipelines import LONG
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))
-    choice = choose_sampler(scene, set(table["methods"].values()))
+    choice = choose_sampler(scene, set(table["methods"].values()), args.seconds or LONG)
     seconds, pilot, described = measured(scene, choice, args)
     pixels = pilot.width * pilot.height
     cost = {kind: min(values) / pixels for kind, values in seconds.items()}
@@ -168,12 +169,13 @@ def by_table(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def choose_sampler(scene, kinds: set[str]) -> Choice:
-    """The sampler of the scene, compared with others by a pilot; of those alone that render the ``kinds`` of stacks
-    that methods read."""
-    from data_gen.pilot import Choice, candidates, compare_with, judge, times_to_an_error, try_out
+def choose_sampler(scene, kinds: set[str], seconds: float) -> Choice:
+    """The sampler of the scene for so many ``seconds``, compared with others by a pilot; of those alone that render
+    the ``kinds`` of stacks that methods read."""
+    from data_gen.pilot import Choice, best_of, seen
     from data_gen.samplers import SAMPLERS, choose
     from data_gen.scenes.facts import scene_facts
+    from data_gen.trials import candidates, try_all
 
     default, reason = choose(scene_facts(scene))
     names = [
@@ -181,9 +183,9 @@ def choose_sampler(scene, kinds: set[str]) -> Choice:
         for name in candidates(scene)
         if name == default or ("gradients" in kinds if SAMPLERS[name].gradients else kinds - {"gradients"})
     ]
-    if len(names) == 1 or (first := try_out(scene, default)) is None:
+    if len(names) == 1 or default not in (trials := try_all(scene, names)):
         return Choice(default, reason)
-    return Choice(*judge(default, times_to_an_error(compare_with(scene, names, first))))
+    return Choice(*best_of(seen(trials), seconds))
 
 
 def measured(scene, choice: Choice, args: argparse.Namespace):

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ngpt import lightgroups
+from ngpt.blending import Network
 from ngpt.cli.arguments import (
     RESULT_SUFFIX,
     add_files,
@@ -30,6 +31,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, reconstruct
+from ngpt.network.identity import Identity, identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
@@ -196,6 +198,7 @@ class Frame(NamedTuple):
     groups: tuple[str, ...] = ()
     there: bool = False
     history: float | None = None
+    blended_by: Identity | None = None
 
 
 def read_frame(
@@ -222,28 +225,31 @@ def compute_frame(
         return frame
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
     result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
-    history = None
+    history, blended_by = None, None
     if temporal is not None:
         begun = time.perf_counter()
         image = temporal.next(stack, result.image)
         seconds = result.seconds + time.perf_counter() - begun
         result, history = replace(result, image=image, seconds=seconds), temporal.share
+        blended_by = identify(temporal.corrections.path) if isinstance(temporal.corrections, Network) else None
     metrics = compare(result.image, reference) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), history=history)
+    frame = frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups))
+    return frame._replace(history=history, blended_by=blended_by)
 
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, history = frame
+    source, target, stack, result, metrics, groups, there, history, blended_by = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
     made = result.attributes | ({} if history is None else {"ngpt:history": history})
+    made |= {"ngpt:historyWeights": str(blended_by)} if blended_by else {}
     write(target, result.image, like=stack, overwrite=overwrite, attributes=made)
     report |= {
         "method": result.method,

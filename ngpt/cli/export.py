@@ -39,6 +39,12 @@ def write(args: argparse.Namespace) -> list[Path]:
         from ngpt.export.poisson import l2_model
 
         models = {args.output: l2_model(args.alpha)}
+    elif kind_of(args.weights) == "temporal":
+        from ngpt.export.temporal import temporal_model
+
+        if args.statistics or args.vector:
+            raise NgptError(f"{args.weights}: blends frames; leave --statistics and --vector out")
+        models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model
 
@@ -54,3 +60,9 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         write_vector(models[args.output], args.vector, args.force)
     return list(models)
+
+
+def kind_of(weights: Path) -> str:
+    from ngpt.network.weights import read_tensors
+
+    return read_tensors(weights)[1].get("kind", "")

@@ -111,29 +111,36 @@ class _Half(torch.nn.Module):
 
 def network_body(model: Reconstructor, precision: str = "float32") -> onnx.ModelProto:
     """The network proper, ``channels`` to ``prediction``, (N, C, H, W) of any aligned size."""
-    for module in model.network.modules():
+    inputs = features.channels(model.config.inputs)
+    return convolutions(model.network, inputs, model.alignment, "channels", "prediction", precision)
+
+
+def convolutions(
+    network: torch.nn.Module, inputs: int, alignment: int, given: str, made: str, precision: str = "float32"
+) -> onnx.ModelProto:
+    """A network of ``ngpt.network.unet`` with so many input channels; ``given`` and ``made`` name input and output."""
+    for module in network.modules():
         if isinstance(module, Convolution):
             # Normalised once and for all, rather than in each run of the graph.
             weight = module.weight().detach()
-            if precision == "float16" and module is not model.network.head.convolution:
+            if precision == "float16" and module is not network.head.convolution:  # type: ignore[union-attr]
                 weight = weight.half()
             module.weight = partial(_same, weight)  # type: ignore[method-assign]
-    a = model.alignment
     # Sizes that are not special: the exporter takes 0 and 1 for constants.
-    example = torch.zeros(2, features.channels(model.config.inputs), 5 * a, 7 * a)
+    example = torch.zeros(2, inputs, 5 * alignment, 7 * alignment)
     tiles, rows, columns = (torch.export.Dim(name, min=2, max=1 << 16) for name in ("tiles", "r", "c"))
     # It would tell everyone that torchvision is not installed, which is not needed.
     logging.getLogger("torch.onnx._internal.exporter._registration").setLevel(logging.ERROR)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         program = torch.onnx.export(
-            model.network if precision == "float32" else _Half(model.network),
+            network if precision == "float32" else _Half(network),
             (example,),
             dynamo=True,
             opset_version=OPSET,
-            dynamic_shapes=({0: tiles, 2: a * rows, 3: a * columns},),
-            input_names=["channels"],
-            output_names=["prediction"],
+            dynamic_shapes=({0: tiles, 2: alignment * rows, 3: alignment * columns},),
+            input_names=[given],
+            output_names=[made],
             verbose=False,
         )
     assert program is not None

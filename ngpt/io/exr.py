@@ -51,6 +51,7 @@ MADE_BY = (
     "ngpt:estimated",
     "ngpt:reconstructSeconds",
     "ngpt:history",
+    "ngpt:historyWeights",
 )
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14

@@ -14,6 +14,8 @@ from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
 SUFFIXES = (".onnx", ".safetensors")
+# What the metadata of the network that blends frames have (``ngpt.blending``).
+FRAMES = "ngpt.temporal inputs"
 
 # What of a training's settings is worth a line, by table.
 _SETTINGS = {
@@ -34,10 +36,13 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def _onnx(path: Path) -> dict[str, Any]:
-    network = run_onnx.Network(path)
-    metadata = network.session.get_modelmeta().custom_metadata_map
+    metadata = run_onnx.session(str(path), path.stat().st_mtime_ns, "cpu", 0).get_modelmeta().custom_metadata_map
     training = parse_json(metadata.get("ngpt.training", "{}"), f"{path}: its record of the training")
     claims = f"method '{metadata.get('ngpt.method', '')}', written by ngpt {metadata.get('ngpt.version', '?')}"
+    if FRAMES in metadata:
+        told = {"inputs": metadata[FRAMES].split(", "), "needs packages": ["ONNX Runtime"]}
+        return _whose(path, claims) | told | {"training": _training(training)}
+    network = run_onnx.Network(path)
     names = (*network.inputs, "base") if network.base else network.inputs
     return (
         _whose(path, claims)

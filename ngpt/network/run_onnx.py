@@ -224,11 +224,11 @@ class Network:
     def _session(self, path: Path):
         if not path.is_file():
             raise NgptError(f"{path}: no such file; `python -m export` writes it")
-        return _session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
+        return session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
 
 
 @lru_cache(maxsize=8)
-def _session(path: str, _modified: int, device: str, threads: int):
+def session(path: str, _modified: int, device: str, threads: int):
     """The session of a file; made again when the file has changed."""
     try:
         import onnxruntime

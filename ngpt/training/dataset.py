@@ -3,6 +3,8 @@
     data = Dataset("DIR")
     crop = data[0]
     crop.stack(0), crop.reference        # a GradientStack, (H, W, 3)
+    for shot in data.shots:              # sets of sequences: the crops of each, frame by frame
+        frames = [data[i] for i in shot]
 
 ``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.
 """
@@ -23,7 +25,9 @@ from ngpt.stack import GradientStack
 from ngpt.system.records import Shape, check, read_json
 from ngpt.training.shards import (
     CAUSTIC,
+    FAR,
     GRADIENTS,
+    MOTION,
     OF_INPUTS,
     REFERENCE_CAUSTIC,
     REFERENCE_HALVES,
@@ -42,13 +46,15 @@ _MANIFEST: Shape = {"config": dict, "planned": int, "shards": [_ENTRY]}
 class Crop:
     """One crop; cheap: pixels are read when they are asked for.
 
-    ``scene`` names the scene, ``spp`` are the samples per pixel of its inputs.
+    ``scene`` names the scene, ``spp`` are the samples per pixel of its inputs, ``frame`` is its number in a
+    shot, from 0, None for a single image.
     """
 
     shard: Shard
     index: int
     scene: str
     spp: tuple[int, ...]
+    frame: int | None = None
 
     @property
     def inputs(self) -> int:
@@ -56,7 +62,10 @@ class Crop:
         return len(self.spp)
 
     def stack(self, k: int) -> GradientStack:
-        """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite."""
+        """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite.
+
+        Frames of shots have the layer ``motion`` too, NaN where it is not known: everywhere in the first.
+        """
         if not 0 <= k < self.inputs:
             raise NgptError(f"{self.shard.path}: input {k} of a crop that has {self.inputs}, 0 .. {self.inputs - 1}")
         names = [name for name in self.shard.names if name in OF_INPUTS]
@@ -64,7 +73,12 @@ class Crop:
         layers["primal"] = layers.pop("indirect") + layers["direct"] + layers.get("caustic", 0)
         for name in [name for name in layers if name.endswith("_se")]:
             layers[name.removesuffix("_se") + "_var"] = np.square(layers.pop(name))
-        attributes = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
+        attributes: dict[str, Any] = {"ngpt:spp": self.spp[k], "ngpt:normalSpace": "camera"}
+        if MOTION in self.shard.names:
+            motion = self.shard.crop(MOTION, self.index)
+            layers[MOTION] = np.where(motion < FAR, motion, np.float32(np.nan))
+        if self.frame is not None:
+            attributes |= {"ngpt:frame": self.frame, "ngpt:previousFrame": self.frame - 1}
         return GradientStack(layers, attributes, path=f"{self.shard.path}, crop {self.index}, input {k}")
 
     @property
@@ -116,6 +130,19 @@ class Dataset:
         """Names of the scenes that have crops, each once."""
         return tuple(dict.fromkeys(entry["scene"] for entry, _ in self._places))
 
+    @property
+    def shots(self) -> tuple[range, ...]:
+        """The indices of the crops of each shot, frame by frame; () for a set of single images."""
+        frames = [(entry["file"], entry["crops"][place].get("frame")) for entry, place in self._places]
+        first = [i for i, (_, frame) in enumerate(frames) if frame == 0]
+        shots = []
+        for begin in first:
+            file, end = frames[begin][0], begin + 1
+            while end < len(frames) and frames[end] == (file, end - begin):
+                end += 1
+            shots.append(range(begin, end))
+        return tuple(shots)
+
     def __len__(self) -> int:
         return len(self._places)
 
@@ -126,7 +153,7 @@ class Dataset:
         if entry["file"] not in self._open:
             self._open[entry["file"]] = _checked(self.folder / entry["file"], entry)
         crop = entry["crops"][place]
-        return Crop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]))
+        return Crop(self._open[entry["file"]], place, entry["scene"], tuple(crop["spp"]), crop.get("frame"))
 
     def __iter__(self) -> Iterator[Crop]:
         return (self[i] for i in range(len(self)))
@@ -147,6 +174,9 @@ def read_manifest(folder: Path) -> dict[str, Any]:
         raise NgptError(f"{path}: is of version {manifest.get('version')}, this ngpt reads version {VERSION}")
     check(manifest, _MANIFEST, str(path))
     for entry in manifest["shards"]:
+        for crop in entry["crops"]:
+            if "frame" in crop:
+                check(crop["frame"], int, f"{path}: 'frame' of a crop of {entry['file']!r}")
         name = PurePosixPath(entry["file"])
         if name.is_absolute() or ".." in name.parts or "\0" in entry["file"]:
             raise NgptError(f"{path}: lists {entry['file']!r}, which is not in its folder; do not trust this file")
@@ -195,7 +225,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     if not crops:
         return shard
     gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
-    names = tensor_names(gradients, caustic, REFERENCE_HALVES in shard.names)
+    names = tensor_names(gradients, caustic, [name for name in (REFERENCE_HALVES, MOTION) if name in shard.names])
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
@@ -211,6 +241,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
             expected = (len(crops), inputs, height, width, OF_INPUTS[name])
         elif name == REFERENCE_HALVES:
             expected = (len(crops), 2, height, width, 3)
+        elif name == MOTION:
+            expected = (len(crops), height, width, 2)
         if shard.shape(name) != expected:
             raise NgptError(f"{path}: tensor '{name}' is {shard.shape(name)}, it must be {expected}")
         if shard.type(name) not in (("I32",) if name == "spp" else ("F16", "F32")):
@@ -229,6 +261,7 @@ def summary(folder: Path) -> dict[str, Any]:
             seconds[part] = seconds.get(part, 0.0) + value
     return {
         "training set": str(folder),
+        **({"shots": len(data.shots)} if data.shots else {}),
         "crops": len(data),
         "planned": data.manifest["planned"],
         "failed": sum(len(entry["failures"]) for entry in entries),

@@ -11,7 +11,10 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     reference_caustic           (N, H, W, 3)
     reference_indirect, reference_direct    (N, H, W, 3)
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
+    motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
+
+Shots are crops too, one for each frame, in their order; the records of crops number the frames.
 
 A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured crop by crop, and of floats elsewhere.
 The header's metadata holds the record of the shard as JSON under "ngpt".
@@ -40,6 +43,10 @@ OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC
 REFERENCES = ("reference_indirect", "reference_direct")
 REFERENCE_CAUSTIC = "reference_caustic"
 REFERENCE_HALVES = "reference_halves"
+MOTION = "motion"
+
+# Pixels of motion that stand for motion that is not known: both lead out of any image.
+FAR = 1e6
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -52,6 +59,7 @@ class CropData:
     ``reference`` is all of it, ``reference_direct`` the emission seen directly in it, and ``reference_caustic`` what
     the layer ``caustic`` of the stacks estimates; None where they have no such layer. ``halves`` are two independent
     images, each of half of the reference's samples, without ``reference_caustic``; () where it was not made so.
+    ``motion`` (H, W, 2) is that of a frame of a shot, NaN where it is not known; None for single images.
     """
 
     stacks: Sequence[GradientStack]
@@ -60,6 +68,7 @@ class CropData:
     reference_direct: np.ndarray
     reference_caustic: np.ndarray | None = None
     halves: tuple[np.ndarray, ...] = ()
+    motion: np.ndarray | None = None
 
     def tensors(self) -> dict[str, np.ndarray]:
         inputs = [_input_tensors(stack) for stack in self.stacks]
@@ -71,13 +80,15 @@ class CropData:
             tensors[REFERENCE_CAUSTIC] = self.reference_caustic
         if self.halves:
             tensors[REFERENCE_HALVES] = np.stack(self.halves) - self.reference_direct
+        if self.motion is not None:
+            tensors[MOTION] = np.where(np.abs(self.motion) < FAR, self.motion, FAR).astype(np.float32)
         tensors["spp"] = np.array(self.spp, np.int32)
         return tensors
 
 
-def tensor_names(gradients: bool, caustic: bool = False, halves: bool = False) -> tuple[str, ...]:
-    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and halves."""
-    further = (*((*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()), *((REFERENCE_HALVES,) if halves else ()))
+def tensor_names(gradients: bool, caustic: bool = False, further: Sequence[str] = ()) -> tuple[str, ...]:
+    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and others."""
+    further = (*((*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()), *further)
     return (*INPUTS, *(GRADIENTS if gradients else ()), *further, *REFERENCES, "spp")
 
 
@@ -114,7 +125,9 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     from safetensors.numpy import save
 
     each = [crop.tensors() for crop in crops]
-    tensors = {name: smallest_float(np.stack([t[name] for t in each])) for name in each[0]} if each else {}
+    tensors = {name: np.stack([t[name] for t in each]) for name in each[0]} if each else {}
+    # Halves of motion would be off by hundredths of a pixel, and FAR is none of them.
+    tensors = {name: tensor if name == MOTION else smallest_float(tensor) for name, tensor in tensors.items()}
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")

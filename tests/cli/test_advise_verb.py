@@ -15,7 +15,7 @@ def seen(renderer, monkeypatch):
     from data_gen import pipelines
     from data_gen.pipelines import Pipeline
 
-    usual = {m: pipelines.usual_fall(m) for m in ("wcv", "primal", "l1")}
+    usual = {m: pipelines.usual_fall("gpt", m) for m in ("wcv", "primal", "l1")}
     found = [
         Pipeline("primal", "primal", 16, 0.02, usual["primal"], 0.001, 0.0),
         Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01),

@@ -118,6 +118,13 @@ def test_info_on_our_network(capsys):
     assert report["bytes"] == (WEIGHTS / "ngpt-combine.onnx").stat().st_size
 
 
+def test_info_on_the_network_that_blends_frames(capsys):
+    assert main(["info", str(WEIGHTS / "temporal.onnx"), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert "ngpt's own, method temporal" in report["whose"] and report["needs packages"] == ["ONNX Runtime"]
+    assert "trust" in report["inputs"] and report["training"]["shots"] > 0
+
+
 def test_info_on_a_network_of_ones_own(own, capsys):
     path = own.rename(own.with_name("x.onnx"))
     assert main(["info", str(path)]) == 0

@@ -5,6 +5,7 @@ That it is unbiased on quick scenes, repeats its bits and says how noisy it is, 
 
 import numpy as np
 import pytest
+from bdpt_ends import Ends, check_weights, without_hole
 from bdpt_scenes import SCENES
 from data_gen_scenes import glass
 from unbiased import REFERENCES, load, render_ours, render_references
@@ -55,167 +56,9 @@ def test_spectral_and_monochromatic_variants(renderer):
         use_variant()
 
 
-class Ends:
-    """Paths from either end of a scene, one from each a lane, and the densities of all strategies in float64."""
-
-    LENGTH = 4
-
-    def __init__(self, mi, scene):
-        import drjit as dr
-
-        from data_gen.paths.camera import CameraSamples
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.lights import LightEnds
-        from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, cosine
-
-        self.mi, self.dr, self.scene = mi, dr, scene
-        camera = CameraSamples(scene.sensors()[0], 1, 16)
-        self.sensor, self.lens = camera.sensor, camera.lens
-        ray, _, _ = camera.rays()
-        self.random, self.lights = camera.random.clone(), LightEnds(scene)
-        self.start = start = self.lights.sample(scene, self.random, ray.time, ray.wavelengths)
-        y = scene.ray_intersect(start.ray)
-        e, p = self.lights.densities(scene, start, y)
-        self.from_light = self.walk(IMPORTANCE, y, mis.begin_light(e, p, start.delta, cosine(y, start.ray.d)))
-        z = scene.ray_intersect(mi.Ray3f(ray))
-        _, e = self.sensor.sample_direction(z, self.lens)
-        self.from_camera = self.walk(RADIANCE, z, mis.begin_camera(e[0], cosine(z, ray.d)))
-
-    def walk(self, mode, si, end):
-        """The vertices of one end: (Vertex, whether it is there, its material, whether its event is not smooth)."""
-        from data_gen.paths.vertex import SMOOTH, event_kind
-        from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.vertex import Vertex, context, cosine, leave
-
-        mi, dr, random = self.mi, self.dr, self.random
-        found, there = [], si.is_valid()
-        for depth in range(1, self.LENGTH + 1):
-            vertex, bsdf = Vertex(si, mi.Spectrum(1), end, mi.UInt32(depth)), si.bsdf()
-            sample, _ = bsdf.sample(context(mode), si, random.next_1d(), random.next_2d(), there)
-            d, end = leave(vertex, bsdf, sample, there)
-            found.append((vertex, there, bsdf, event_kind(sample.sampled_type) != SMOOTH))
-            there = there & (sample.pdf > 0)
-            si = self.scene.ray_intersect(si.spawn_ray(d), there)
-            there &= si.is_valid()
-            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-            dr.eval(found, si, end, there)
-        return found
-
-    def densities(self, t, s, lamp_area):
-        """Those of all strategies for the paths of ``t`` vertices from the camera joined to ``s`` from the light.
-
-        By the number of vertices that come from the light, its own point included; per area, of a rectangular lamp.
-        """
-        mi, dr = self.mi, self.dr
-        path = self.from_camera[:t] + self.from_light[:s][::-1]
-        points = [v.si.p for v, *_ in path] + [self.start.end.p]
-        points = [np.array(p, np.float64).T for p in points]
-        points.insert(0, np.array(self.sensor.world_transform().translation(), np.float64).reshape(1, 3))
-        normals = [np.array(v.si.n, np.float64).T for v, *_ in path] + [np.array(self.start.end.n, np.float64).T]
-        normals.insert(0, None)
-        k = len(points) - 1
-        ends = (t, t + 1)
-        delta = [np.zeros(len(points[1]), bool) for _ in range(k + 1)]
-        for i, (*_, sharp) in enumerate(path, 1):
-            if i not in ends:
-                delta[i] = np.array(sharp)
-
-        def per_area(i, j):
-            d = points[j] - points[i]
-            return np.abs((normals[j] * d).sum(axis=1)) / (d**2).sum(axis=1) ** 1.5
-
-        def density(i, come_from, go_to):
-            vertex, _, bsdf, _ = path[i - 1]
-            si = mi.SurfaceInteraction3f(vertex.si)
-            wi, wo = (
-                si.to_local(dr.normalize(mi.Vector3f(*(points[j] - points[i]).T.astype(np.float32))))
-                for j in (come_from, go_to)
-            )
-            si.wi = wi
-            p = np.array(bsdf.pdf(mi.BSDFContext(), si, wo), np.float64)
-            return np.where(delta[i], 1, p) * per_area(i, go_to)
-
-        forward = {i: density(i, i - 1, i + 1) for i in range(1, k)}
-        backward = {i: density(i, i + 1, i - 1) for i in range(2, k)}
-        _, importance = self.sensor.sample_direction(path[0][0].si, self.lens)
-        d = points[1] - points[0]
-        first = np.array(importance[0], np.float64) * np.abs((normals[1] * d).sum(axis=1)) / np.linalg.norm(d, axis=1)
-        d = points[k - 1] - points[k]
-        cos_lamp = np.abs((normals[k] * d).sum(axis=1)) / np.linalg.norm(d, axis=1)
-        found = []
-        for from_light in range(k + 1):
-            last = k - from_light  # vertex of the camera path
-            p = np.ones(len(first))
-            if last > 0:
-                p = p * first
-            for i in range(1, last):
-                p = p * forward[i]
-            if from_light > 0:
-                p = p / lamp_area
-            if from_light > 1:
-                p = p * cos_lamp / np.pi * per_area(k, k - 1)
-            for i in range(k - 1, last + 1, -1):
-                p = p * backward[i]
-            for i in (last, last + 1):
-                if from_light and 0 < i < k:
-                    p = np.where(delta[i], 0, p)
-            found.append(p)
-        return found
-
-
 def test_weights_are_those_of_all_densities(renderer):
     """Brute force in float64, on stored paths: no z-test sees every wrong term."""
-    import drjit as dr
-
-    from data_gen.samplers.bdpt.strategies import connected, to_camera, to_light
-    from data_gen.samplers.bdpt.vertex import RADIANCE, evaluate, scatters_smoothly
-
-    def scene_without_hole():
-        scene = glass()
-        del scene["hole"]
-        return scene
-
-    mi = renderer
-    ends = Ends(mi, load(mi, scene_without_hole, (24, 24)))
-    scene, area = ends.scene, 2.6**2
-
-    def compare(others, densities, s, good, vertices):
-        good = np.array(good & dr.all([there for _, there, *_ in vertices]))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            brute = sum(p for i, p in enumerate(densities) if i != s) / densities[s]
-        # Of directions that graze rough glass, positions in float32 may lie on the other side: density 0 there.
-        assert good.sum() > 100 and np.isfinite(brute[good]).mean() > 0.9
-        good &= np.isfinite(brute)
-        error = np.abs(np.array(others) - brute)[good] / (1 + brute[good])
-        # Of grazing directions float32 leaves a part in a thousand.
-        assert np.median(error) < 1e-4 and np.quantile(error, 0.99) < 0.01, (len(vertices), s)
-
-    for t in range(1, 4):
-        for s in range(1, 4):
-            (z, _, z_bsdf, _), (y, _, y_bsdf, _) = ends.from_camera[t - 1], ends.from_light[s - 1]
-            smooth = scatters_smoothly(z_bsdf) & scatters_smoothly(y_bsdf)
-            vertices = ends.from_camera[:t] + ends.from_light[:s]
-            C, others = connected(scene, z, z_bsdf, y, smooth)
-            compare(others, ends.densities(t, s, area), s + 1, smooth & (dr.max(C) > 0), vertices)
-    for t in range(1, 4):
-        # To the light's own point, as if it had been sampled from there
-        z, _, z_bsdf, _ = ends.from_camera[t - 1]
-        light = mi.DirectionSample3f(ends.start.end)
-        to = mi.Vector3f(light.p - z.si.p)
-        light.dist = dr.norm(to)
-        light.d = to / light.dist
-        light.emitter, light.delta = ends.start.emitter, False
-        light.pdf = scene.pdf_emitter_direction(z.si, light)
-        f, p, q = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(light.d))
-        C, others = to_light(ends.lights, z, light, mi.Spectrum(1), f, p, q)
-        good = scatters_smoothly(z_bsdf) & (dr.max(C) > 0) & (light.pdf > 0)
-        compare(others, ends.densities(t, 0, area), 1, good, ends.from_camera[:t])
-    for s in range(1, 4):
-        y, _, y_bsdf, _ = ends.from_light[s - 1]
-        C, others, _ = to_camera(
-            ends.sensor, ends.lens, y, y_bsdf, scatters_smoothly(y_bsdf), lambda si, toward, active: mi.Bool(False)
-        )
-        compare(others, ends.densities(0, s, area), s + 1, dr.max(C) > 0, ends.from_light[:s])
+    check_weights(Ends(renderer, load(renderer, without_hole, (24, 24))))
 
 
 def light_vertices(mi, scene, spp):

@@ -111,7 +111,7 @@ class Paths:
     """
 
     SHIFT = (3, 2)
-    LENGTH = 3
+    LENGTH = 4
 
     def __init__(self, mi):
         import drjit as dr
@@ -246,7 +246,7 @@ class Paths:
                 # Of grazing directions float32 leaves little: some densities are 0 by one way and not by the other.
                 assert np.isfinite(error).mean() > 0.97, number
                 error = error[np.isfinite(error)]
-                assert np.median(error) < 5e-4 and np.quantile(error, 0.97) < 0.02, (number, np.median(error))
+                assert np.median(error) < 1e-3 and np.quantile(error, 0.97) < 0.02, (number, np.median(error))
 
 
 @pytest.fixture(scope="module")
@@ -266,8 +266,9 @@ def vertices_of(paths, t):
     return base, [own_vertex(paths.offsets[0], base[0]), *base[1:]], good
 
 
-@pytest.mark.parametrize("t", [1, 2, 3])
+@pytest.mark.parametrize("t", [1, 2, 3, 4])
 def test_copies_of_paths_to_a_light(paths, t):
+    """The fourth vertex is one step behind what both have in common: an error of that step shows there alone."""
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.vertex import cosine
     from data_gen.samplers.gbdpt.offset_path import own_vertex, to_same_light
@@ -314,8 +315,7 @@ def joined(paths, t, s, end=None):
     return C, (offset.β * g, offset.r, others), *brute, s + 1, good
 
 
-@pytest.mark.parametrize("s", [1, 2])
-@pytest.mark.parametrize("t", [1, 2, 3])
+@pytest.mark.parametrize(("t", "s"), [(1, 1), (2, 1), (3, 1), (4, 1), (1, 2), (2, 2), (3, 2)])
 def test_copies_of_paths_joined_to_light_paths(paths, t, s):
     paths.compare(*joined(paths, t, s))
 
@@ -491,6 +491,47 @@ def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, modules, fu
     tests = gradient_tests(render_ours(scene, "gbdpt", 16, 64, FAR), references, pixels=FAR)
     passed = {name: result.passed for name, result in tests}
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+@pytest.mark.parametrize("name", ["lens", "glossy"])
+def test_what_the_camera_has_seen_is_found_again(renderer, name):
+    """The second kernel splats what the first one has splatted, and never a vertex that was not seen."""
+    import drjit as dr
+
+    from data_gen.film.splats import Splats
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.samplers.bdpt.light_path import Seen, pixel_at
+    from data_gen.samplers.bdpt.lights import LightEnds
+    from data_gen.samplers.bdpt.strategies import to_camera
+    from data_gen.samplers.common import like_path
+    from data_gen.samplers.gbdpt.light_again import Marker, light_again, marked
+
+    mi, scene = renderer, load(renderer, name, (32, 24))
+    lights, camera = LightEnds(scene), CameraSamples(scene.sensors()[0], 5, 64)
+    integrator, longest = like_path(scene, "gbdpt", rr_depth=3), 7
+    ray, importance, _ = camera.rays()
+    first, second = Splats(camera.pixels, 3), Splats(camera.pixels, 3)
+    marker = Marker(first, ray, importance)
+    *_, state = integrator.light_path(scene, lights, camera, camera.random.clone(), ray, longest, marker)
+    lanes, depths = marked(state, longest)
+    assert set(np.array(depths)) == set(range(1, longest)) and np.all(np.diff(np.array(depths).astype(int)) >= 0)
+    some = camera.at(lanes)
+    ray, importance, _ = some.rays()
+    again = light_again(scene, lights, some, some.random.clone(), ray, depths, integrator.rr_depth)
+    _, end, link, left, lens, there = again
+    seen = lambda *_: mi.Bool(False)  # noqa: E731
+    C, others, uv = to_camera(camera.sensor, lens, end.y, end.y.si.bsdf(), there, seen)
+    marker = Marker(second, ray, importance)
+    marker.sees(mi.UInt64(0), Seen(end.y, C, others, pixel_at(uv, camera.size), None))
+    smooth = link.depth + 1 == end.y.depth
+    before = dr.select(link.depth > 0, left.o + left.d * left.t, end.ray.o)
+    beside = dr.select(smooth & (link.depth > 0), dr.norm(mi.Vector3f(before - end.ray.o)), 0)
+    found, theirs = (np.array(splats.totals()) for splats in (first, second))
+    assert np.array(there & (dr.max(C) > 0)).mean() > 0.999
+    assert np.allclose(found.sum(axis=1), theirs.sum(axis=1), rtol=1e-3)
+    assert np.isclose(found, theirs, rtol=1e-3, atol=1e-6).mean() > 0.99
+    # What is kept of the vertex before is where the last edge begins.
+    assert np.quantile(np.array(beside), 0.99) < 1e-3
 
 
 def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monkeypatch):

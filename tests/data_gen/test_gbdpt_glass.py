@@ -54,7 +54,8 @@ class Caustics:
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves, scatters_smoothly
         from data_gen.samplers.common import like_path
         from data_gen.samplers.gbdpt.base_path import Plan
-        from data_gen.samplers.gbdpt.light_shift import Link, Splatted, next_link
+        from data_gen.samplers.gbdpt.light_again import first_link, next_link
+        from data_gen.samplers.gbdpt.light_shift import Splatted
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, description, (32, 32))
@@ -68,7 +69,7 @@ class Caustics:
         si, d, β = scene.ray_intersect(start.ray), start.ray.d, start.β
         e, p = lights.densities(scene, start, si)
         end, there = mis.begin_light(e, p, start.delta, cosine(si, d)), si.is_valid()
-        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
+        link = first_link()
         kept = Vertex(si, β, end, mi.UInt32(0))
         found = (Vertex(si, β, end, mi.UInt32(0)), mi.Vector3f(d), link, kept, mi.Bool(False))
         for depth in range(1, self.LENGTH + 1):
@@ -230,7 +231,7 @@ def test_copies_are_paths_that_light_could_have_found(paths):
     close(C_back * r, paths.path.C, back, median=1e-2, most=0.1)
 
 
-def test_what_is_bent_is_shifted_by_the_second_kernel(renderer, monkeypatch):
+def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
     """All of it, and from the vertex that light has left: Dr.Jit 1.5 (LLVM) once read another lane's."""
     import drjit as dr
 

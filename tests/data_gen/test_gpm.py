@@ -189,14 +189,14 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     assert np.median(away) < 2e-5 and np.quantile(away, 0.95) < 1e-3
 
 
-def passes(scene, n, pixels=1, **options):
+def passes(scene, n, pixels=1, sampler="gpm", **options):
     """The layers of ``n`` first passes, each of another seed: what ``render_ours`` has, prepared once."""
     from data_gen.film import GradientFilm
     from data_gen.passes import recording
     from data_gen.paths.camera import CameraSamples
     from data_gen.samplers import find
 
-    sample, sensor = find("gpm").make(scene, **options), scene.sensors()[0]
+    sample, sensor = find(sampler).make(scene, **options), scene.sensors()[0]
     stacks = []
     with far_shifts(pixels), recording():
         for seed in range(n):

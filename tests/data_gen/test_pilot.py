@@ -7,75 +7,99 @@ from unbiased import load
 SHAPE = (32, 48, 3)
 
 
-def trial(sampler_noise, seconds, error=None, bias=0.0):
-    """Of an image that is 1: what a sampler with that relative variance, and that error behind ``wcv``, would show."""
-    from data_gen.pilot import Trial
-
-    rng = np.random.default_rng(int(1e6 * (sampler_noise + seconds)))
-    primals = tuple(1 + rng.normal(0, sampler_noise**0.5, SHAPE) for _ in range(2))
-    images = primals
-    if error is not None:
-        images = tuple(1 + bias + rng.normal(0, error**0.5, SHAPE) for _ in range(2))
-    return Trial(images, primals, seconds)
+def images(rng, noise, n=4, bias=0.0):
+    """Of an image that is 1: with that relative variance."""
+    return [1 + bias + rng.normal(0, noise**0.5, SHAPE) for _ in range(n)]
 
 
-def test_the_least_time_to_an_error_is_chosen(renderer):
-    from data_gen.pilot import judge, times_to_an_error
+def witnesses(rng, **noise):
+    """Primals of samplers by name, and their relative variances."""
+    from data_gen.trials import Witnesses
 
-    trials = {"gpt": trial(0.2, 2.0, error=0.01), "bdpt": trial(0.1, 4.0), "primal": trial(0.2, 1.0)}
-    times = times_to_an_error(trials)
-    assert times["gpt"] == pytest.approx(0.02, rel=0.3)
-    assert times["bdpt"] == pytest.approx(0.4, rel=0.1) and times["primal"] == pytest.approx(0.2, rel=0.1)
-    best, why = judge("gpt", times)
-    assert best == "gpt" and "times as long by 'bdpt'" in why and "times as long by 'primal'" in why
+    return Witnesses({name: images(rng, n) for name, n in noise.items()}, noise, np.ones(SHAPE))
 
 
-def test_light_that_a_reconstruction_has_lost_counts(renderer):
-    """Both of its images agree: only those of others show what both lack."""
-    from data_gen.pilot import judge, times_to_an_error
+def seen(sampler, error, seconds, step=None, **more):
+    """What a pilot says of a sampler and its simple method, at 16 samples."""
+    from data_gen.pilot import simple
+    from data_gen.pipelines import Pipeline, usual_fall
 
-    trials = {"gpt": trial(0.2, 1.0, error=0.001, bias=-0.7), "bdpt": trial(0.1, 2.0)}
-    times = times_to_an_error(trials)
-    assert times["gpt"] == pytest.approx(0.49, rel=0.1)
-    assert judge("gpt", times)[0] == "bdpt"
+    method = simple(sampler)
+    step = usual_fall(sampler, method) if step is None else step
+    return Pipeline(sampler, method, 16, error, step, seconds, 0.0, **more)
 
 
-def test_an_error_is_no_less_than_what_two_images_differ_by(renderer):
+def test_the_least_time_to_the_end_is_chosen(renderer):
+    from data_gen.pilot import best_of, times_to_the_end
+
+    pipelines = [seen("gpt", 0.01, 2.0), seen("bdpt", 0.1, 4.0), seen("primal", 0.2, 1.0)]
+    times = times_to_the_end(pipelines, 32.0)
+    assert times["gpt"] == pytest.approx(32)
+    assert times["bdpt"] == pytest.approx(10 * 16 * 4) and times["primal"] == pytest.approx(20 * 16)
+    best, why = best_of(pipelines, 32.0)
+    assert best == "gpt" and "20 times as long by 'bdpt'" in why and "10 times as long by 'primal'" in why
+
+
+def test_errors_that_fall_slowly_lose_in_long_renders(renderer):
+    """With the power that a pilot saw, as in scenes whose light paths from the camera hardly find."""
+    from data_gen.pilot import best_of
+
+    slow, usual = seen("gpt", 0.07, 1.0, step=-0.55), seen("gpt", 0.07, 1.0)
+    rival = seen("gbdpt", 0.01, 8.0)
+    assert best_of([slow, rival], 100.0)[0] == best_of([usual, rival], 100.0)[0] == "gpt"
+    assert best_of([slow, rival], 5000.0)[0] == "gbdpt" and best_of([usual, rival], 5000.0)[0] == "gpt"
+
+
+def test_light_that_a_reconstruction_has_lost_counts(rng):
+    """All of its images agree: only those of others, and its own primals, show what they lack."""
+    error = witnesses(rng, gpt=0.2, bdpt=0.1).error("gpt", [images(rng, 0.001, 2, -0.7) for _ in range(2)])
+    assert error == pytest.approx(0.49, rel=0.1)
+
+
+def test_an_error_is_no_less_than_what_two_images_differ_by(rng):
     """Where noise of the others says that there is none, or less than none."""
-    from data_gen.pilot import times_to_an_error
-
     for noise in np.linspace(8, 12, 9):
-        trials = {"gpt": trial(noise, 1.0, error=0.01), "primal": trial(noise, 1.0)}
-        assert times_to_an_error(trials)["gpt"] > 0.009
+        judges = witnesses(rng, gpt=noise, primal=noise)
+        assert judges.error("gpt", [images(rng, 0.01, 2) for _ in range(2)]) > 0.009
+        assert judges.error("gpt", [images(rng, 0.01, 1) for _ in range(2)]) > 0.009
 
 
-def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer):
-    """Their blur counts, and falls slower than noise; a witness they are not."""
-    from data_gen.pilot import doubtful, judge, times_to_an_error
+def test_no_photons_are_witnesses(rng):
+    """However little noise they have: they blur."""
+    from data_gen.trials import Witnesses
 
-    others = {"gpt": trial(2.0, 1.0, error=0.5), "primal": trial(1.0, 1.0)}
-    trials = others | {"ppm": trial(0.001, 1.0, error=0.001, bias=0.1)}
-    short, long = (times_to_an_error(trials, seconds) for seconds in (100.0, 1e6))
-    assert judge("gpt", short)[0] == "ppm" and judge("gpt", long)[0] == "gpt"
-    # Errors of others fall by 10,000 meanwhile, so it needs 10,000^1.5 times as long in 10,000 times the time.
-    assert long["ppm"] / long["gpt"] == pytest.approx(100 * short["ppm"] / short["gpt"])
-    # The mean of those who find the light is not sure of it.
-    dark = {"gpt": trial(900.0, 1.0, error=0.02), "primal": trial(900.0, 1.0), "ppm": trials["ppm"]}
-    assert judge("gpt", times_to_an_error(dark, 100.0))[0] == "gpt" and doubtful(dark) == ["ppm"]
-    clear = {"gpt": trial(0.01, 1.0, error=0.001), "primal": trial(0.01, 1.0), "ppm": trials["ppm"]}
-    assert doubtful(clear) == [] and doubtful(others) == []
+    primals = {"gpt": images(rng, 0.1), "ppm": images(rng, 1e-6, bias=0.5)}
+    judges = Witnesses(primals, {"gpt": 0.1, "ppm": 1e-6}, np.ones(SHAPE))
+    assert judges.error("gpt", [images(rng, 0.01, 2) for _ in range(2)]) == pytest.approx(0.01, rel=0.5)
+    assert judges.error("ppm", [primals["ppm"][:2], primals["ppm"][2:]]) == pytest.approx(0.25, rel=0.2)
+
+
+def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
+    """Their errors fall slower than noise, and where others hardly find the light nobody is sure of them."""
+    from data_gen.pilot import best_of, times_to_the_end
+
+    pipelines = [seen("gpt", 0.5, 1.0), seen("primal", 1.0, 1.0), seen("ppm", 0.01, 1.0, doubt=0.002)]
+    assert best_of(pipelines, 100.0)[0] == "ppm" and best_of(pipelines, 1e7)[0] == "gpt"
+    times = times_to_the_end([seen("primal", 1.0, 1.0), seen("ppm", 0.01, 1.0)], 16e3)
+    assert times["primal"] == pytest.approx(16e3) and times["ppm"] == pytest.approx(16 * (0.001 / 0.01) ** -1.5)
+    unsure = [*pipelines[:2], seen("ppm", 0.5, 1.0, doubt=5.0)]
+    best, why = best_of(unsure, 100.0)
+    assert best == "gpt" and "too little of the light to judge 'ppm'" in why
+    image = images(rng, 0.001, 1, 0.1)[0]
+    assert witnesses(rng, gpt=900.0, primal=900.0, ppm=1e-3).doubt("ppm", image) > 1
+    assert witnesses(rng, gpt=0.01, primal=0.01, ppm=1e-3).doubt("ppm", image) < 0.001
 
 
 def test_a_choice_needs_a_margin():
     from data_gen.pilot import judge
 
-    assert judge("gpt", {"gpt": 1.0, "bdpt": 0.9})[0] == "gpt"
+    assert judge("gpt", {"gpt": 1.0, "bdpt": 0.95})[0] == "gpt"
     assert judge("gpt", {"gpt": 1.0, "bdpt": 0.7})[0] == "bdpt"
     assert "no other" in judge("gpt", {"gpt": 1.0})[1]
 
 
 def test_candidates_are_those_of_the_registry(renderer):
-    from data_gen.pilot import candidates
+    from data_gen.trials import candidates
 
     names = candidates(load(renderer, "diffuse", (48, 32)))
     assert names[0] == "gpt" and {"bdpt", "primal"} <= set(names)
@@ -90,14 +114,14 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
     from data_gen import pilot
 
     scene = load(renderer, "diffuse", (48, 32))
-    monkeypatch.setattr(pilot, "try_out", None)
+    monkeypatch.setattr(pilot, "try_all", None)
     for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
         choice = pilot.choose_by_pilot(scene, spp, seconds)
         assert choice.sampler == "gpt" and "too short" in choice.reason and choice.seconds == 0
 
 
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen import pilot
+    from data_gen import pilot, trials
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (48, 32))
@@ -105,10 +129,13 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     monkeypatch.setattr(pilot, "PIXELS", 24 * 16)
     monkeypatch.setattr(pilot, "candidates", lambda scene, biased: ["gpt", "primal"])
     sizes = []
-    tried = pilot.try_out
-    monkeypatch.setattr(
-        pilot, "try_out", lambda scene, *a: (sizes.append(tuple(scene.sensors()[0].film().size())), tried(scene, *a))[1]
-    )
+    tried = trials.try_out
+
+    def try_out(scene, *args):
+        sizes.append(tuple(scene.sensors()[0].film().size()))
+        return tried(scene, *args)
+
+    monkeypatch.setattr(trials, "try_out", try_out)
     choice = pilot.choose_by_pilot(scene, 1 << 30, 1e6)
     assert choice.sampler in ("gpt", "primal") and choice.reason.startswith("chosen by a pilot: to a given error")
     assert len(sizes) == 2 and {tuple(map(int, size)) for size in sizes} == {(24, 16)}

@@ -45,7 +45,7 @@ def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
 
 
 def trials(rng):
-    from data_gen.pipelines import Trial
+    from data_gen.trials import Trial
 
     return {
         "gpt": Trial([stack(rng, i, of_gradients=0.01) for i in range(4)], 0.02),
@@ -136,21 +136,21 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
 
 def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     """The first two always; and the less time there is, the smaller the images."""
-    from data_gen import pipelines
+    from data_gen import pipelines, trials
 
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
     monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
     tried, sizes = [], []
 
-    def try_out(scene, name, seed, clock, limit):
+    def try_out(scene, name, clock, limit):
         assert limit == (math.inf if len(tried) < 2 else 0.2 * seconds)
         for _ in range(8):
             clock()
         tried.append(name)
         sizes.append(tuple(int(n) for n in scene.sensors()[0].film().size()))
 
-    monkeypatch.setattr(pipelines, "try_out", try_out)
+    monkeypatch.setattr(trials, "try_out", try_out)
     for seconds, names, size in ((20.0, 2, (8, 5)), (250.0, 3, (24, 16)), (300.0, 4, (24, 16))):
         tried.clear()
         with pytest.raises(NgptError, match="none of the samplers"):
@@ -159,12 +159,13 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
 
 
 def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
-    from data_gen.pipelines import try_out
+    from data_gen.trials import try_out
 
     scene = load(renderer, "diffuse", (16, 12))
-    # One look at the clock before a render of a sample, one after it: four renders of 8 and of 1 take 36 times that.
-    assert try_out(scene, "primal", 0, ticking(1.0), 35.0) is None
-    assert len(try_out(scene, "primal", 0, ticking(1.0), 37.0).stacks) == 4
+    # One look at the clock before a render of a sample, one after it: four renders of 8 and two of 16 take 64 times
+    # that.
+    assert try_out(scene, "primal", ticking(1.0), 63.0) is None
+    assert len(try_out(scene, "primal", ticking(1.0), 65.0).stacks) == 4
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):

@@ -187,11 +187,23 @@ def test_the_table_that_ships():
     assert set(table["methods"]) >= {"primal", "wcv", "ngpt-fast", "oidn"}
 
 
-def test_the_command(renderer, table, tmp_path, capsys):
+def test_the_command(renderer, table, tmp_path, capsys, monkeypatch):
+    from data_gen import costs
+    from data_gen.pilot import Choice
+
+    def timed(scene, options, spp, seed):
+        """As on a machine where samples cost COST: by the law of ``primal`` a faster one has others ahead."""
+        kind = "gradients" if options["sampler"] != "primal" else "features"
+        kind = kind if options.get("with_features", True) else "path"
+        return costs.render_stack(scene, spp, seed, **options), 48 * 32 * spp * COST[kind]
+
+    monkeypatch.setattr(costs, "timed", timed)
+    # Samplers are chosen by the clock too, so another one where the machine is busy (tests/data_gen/test_pilot.py).
+    monkeypatch.setattr("ngpt.cli.advise.choose_sampler", lambda *_: Choice("gpt", "as its description says"))
     path = tmp_path / "table.json"
     path.write_text(json.dumps(table))
     arguments = ["advise", "diffuse", "--size", "48x32", "--table", str(path), "--json", "-q"]
-    assert main([*arguments, "--seconds", "60"]) == 0
+    assert main([*arguments, "--seconds", "2"]) == 0
     found = json.loads(capsys.readouterr().out)["advice"]
     assert found[0]["method"] == "l1" and found[0]["spp"] > 10 and 0 <= found[0]["sure"] <= 1
     assert main([*arguments, "--seconds", "1e-9"]) == 2

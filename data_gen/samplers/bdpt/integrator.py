@@ -69,9 +69,6 @@ class Splatter:
         light = to_rgb(seen.C * self.importance / (1 + seen.others), self.ray.wavelengths)
         self.splats.add(seen.pixel, list(light), dr.max(seen.C) > 0)
 
-    def leaves(self, state: None, *_) -> None:
-        return None
-
 
 class BDPT(GradientIntegrator):
     """Bidirectional path tracing, for surfaces; no gradients.
@@ -87,12 +84,15 @@ class BDPT(GradientIntegrator):
     areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
     """
 
+    # Of ``joined_depth``, where the user gives none
+    usually_joined = 10
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         max_depth = props.get("max_depth", -1)
         self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
         self.rr_depth = props.get("rr_depth", 5)
-        self.joined_depth = props.get("joined_depth", 10)
+        self.joined_depth = props.get("joined_depth", self.usually_joined)
         if not 1 <= self.joined_depth <= 64:
             raise NgptError(f"bdpt: joined_depth {self.joined_depth} is out of range; use 1 .. 64")
 
@@ -117,14 +117,18 @@ class BDPT(GradientIntegrator):
         dr.eval(values)
         film.put_all(values)
 
-    def light_path(self, scene, lights, camera, random, camera_ray, longest, visitor: Visitor, lanes=True):
+    def light_path(self, scene, lights, camera, random, camera_ray, longest, visitor: Visitor, **more):
         """``light_path.light_path`` with these parameters."""
         occluded = partial(self.hidden_from_camera, scene)
-        return light_path(scene, lights, camera, random, camera_ray, longest, self.rr_depth, occluded, visitor, lanes)
+        depths = longest, self.rr_depth
+        return light_path(scene, lights, camera, random, camera_ray, *depths, occluded, visitor, **more)
 
     @dr.syntax
-    def camera_path(self, scene, lights, camera, random, ray, importance, kept, count, longest):
-        """L and Le of a path from the camera, joined to the light path's vertices ``kept``."""
+    def camera_path(self, scene, lights, camera, random, ray, importance, kept, count, longest, merging=None):
+        """L and Le of a path from the camera, joined to the light path's vertices ``kept``.
+
+        ``merging`` gathers photons too (``vcm.merging.Merging``), if it is not None.
+        """
         ray = mi.Ray3f(ray)
         si = self.first_hit(scene, ray).compute_surface_interaction(ray)
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
@@ -135,7 +139,7 @@ class BDPT(GradientIntegrator):
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
         active = si.is_valid() & (depth < self.max_depth)
         _, density = camera.sensor.sample_direction(si, camera.lens, active)
-        end = mis.begin_camera(density[0], cosine(si, ray.d))
+        end, waiting = mis.begin_camera(density[0], cosine(si, ray.d)), mi.Float(0)
         while dr.hint(active, label="camera path"):
             z = Vertex(si, β, end, depth)
             bsdf = si.bsdf()
@@ -162,11 +166,17 @@ class BDPT(GradientIntegrator):
                 u_connection = random.next_1d()
                 L += self.connection(scene, z, bsdf, smooth & joined, kept, count, longest, ray, u_connection)
 
+            # ------------------- To photons near by -------------------
+            if dr.hint(merging is not None, mode="scalar"):
+                L += merging.light(z, bsdf, smooth & joined)
+
             # -------------------- Next vertex ------------------------
             found = active & (sample.pdf > 0)
             sky_seen |= found & (event_kind(sample.sampled_type) != NULL)
             η = dr.select(found, η * sample.eta, η)
             d, end = leave(z, bsdf, sample, found)
+            if dr.hint(merging is not None, mode="scalar"):
+                end, waiting = merging.leaves(z, bsdf, sample, end, waiting, joined)
             β *= f_p
             # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
@@ -185,6 +195,8 @@ class BDPT(GradientIntegrator):
             si = reached
             active &= si.is_valid() & (depth < self.max_depth)
             end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+            if dr.hint(merging is not None, mode="scalar"):
+                waiting /= cosine(si, d)
         return L, Le
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:

@@ -6,7 +6,7 @@ from the camera. With p_s the density of strategy s, its weight is p_s / Σ p_j 
     others = Σ_{j≠s} p_j / p_s = the strategies with a longer light path + those with a longer camera path.
 
 Either sum is a number that its end carries from vertex to vertex, without the densities themselves (Georgiev 2012,
-"Implementing Vertex Connection and Merging", with no merging):
+"Implementing Vertex Connection and Merging"):
 
     vcm   1 / the density of the last vertex, the first summand without what is still unknown of it
     vc    the sum of all further summands, likewise
@@ -15,6 +15,12 @@ Densities are those before Russian roulette: weights are then a function of the 
 alike. ``e`` stands for both: p_emit / (p_connect cos), the density of sampling the first edge outward, over that of
 choosing the end to connect to, per unit area facing the end. Delta events cannot be met by a connection: their
 summands are 0, and the densities of both directions cancel in what is behind them.
+
+Both ends may also come to one vertex, and merge: η = π r² N times as many such pairs of N light paths lie within the
+radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
+there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
+at once, its ``vcm`` is 0 there, and ``gathered`` adds η to it as one more summand; a camera path knows when it leaves
+the next vertex, and η waits in ``pending`` until then. Where nothing merges all is as without.
 
 ``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
 the geometric normal. All quotients are taken one by one: squares of densities would leave float32.
@@ -55,6 +61,29 @@ def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool)
 def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
     """At the next vertex."""
     return Partial(end.vcm * distance2 / cos, end.vc / cos)
+
+
+def gathered(y: Partial, η: mi.Float) -> Partial:
+    """At a vertex of a light path; η is 0 where no photons are gathered."""
+    return Partial(dr.select(y.vcm > 0, y.vcm, η), y.vc)
+
+
+def pending(η: mi.Float, cos: mi.Float, p: mi.Float, delta: mi.Bool) -> mi.Float:
+    """Behind an event of a camera path, as ``leave``: what is added to ``vc`` if the next event is a delta."""
+    return dr.select(delta, 0, cos / p * η)
+
+
+def settled(end: Partial, waiting: mi.Float, cos: mi.Float, delta: mi.Bool) -> Partial:
+    """Behind that next event: with what has been ``waiting`` since the last vertex, converted as ``vc`` is."""
+    return Partial(end.vcm, end.vc + dr.select(delta, waiting * cos, 0))
+
+
+def others_merged(z: Partial, q_z: mi.Float, y: Partial, q_y: mi.Float, η: mi.Float) -> mi.Float:
+    """Of a camera path and a light path that merge: ``z`` and ``y`` are their last vertices, with η in that of y.
+
+    ``q_y`` is the density of the direction to the light, ``q_z`` of that to the camera.
+    """
+    return dr.maximum((z.vcm + z.vc * q_z + y.vcm + y.vc * q_y) / η - 1, 0)
 
 
 def others_emitted(end: Partial, e: mi.Float, p: mi.Float) -> mi.Float:

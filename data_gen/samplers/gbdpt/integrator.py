@@ -27,11 +27,10 @@ from __future__ import annotations
 
 import drjit as dr
 import mitsuba as mi
-import numpy as np
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples, in_packets
+from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
@@ -48,7 +47,8 @@ from data_gen.samplers.bdpt.vertex import (
 )
 from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan, base_step
-from data_gen.samplers.gbdpt.light_shift import Shifter
+from data_gen.samplers.gbdpt.light_again import Marker, marked
+from data_gen.samplers.gbdpt.light_shift import splat_differences
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -79,40 +79,37 @@ class GBDPT(BDPT):
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         random = camera.random.clone()
-        kept, count, bent = None, mi.UInt32(0), mi.Bool(False)
+        kept, count, marks = None, mi.UInt32(0), mi.UInt64(0)
         if plan.longest > 1 and plan.lights.emitters is not None:
             splats = {name: film.splats(name) for name in ("primal", *SHIFTS)}
-            shifter = Shifter(scene, plan, camera, ray, importance, self.first_hit, splats)
-            kept, count, random, (*_, bent) = self.light_path(
-                scene, plan.lights, camera, random, ray, plan.longest, shifter
-            )
+            marker = Marker(splats["primal"], ray, importance)
+            kept, count, random, marks = self.light_path(scene, plan.lights, camera, random, ray, plan.longest, marker)
         L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         Δ, inside = [to_rgb(one, ray.wavelengths) for one in Δ], [inside for _, _, inside in shifted]
         # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside, bent)
-        if kept is not None and not plan.materials.all_connectable:
-            self.follow_bent(scene, plan, camera, splats, bent)
+        dr.eval(values, Δ, inside, marks)
+        if kept is not None:
+            self.shift_splats(scene, plan, camera, splats, marks)
         film.put_all(values)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
-    def follow_bent(self, scene, plan, camera, splats, bent: mi.Bool) -> None:
-        """Splats the differences of light paths that end behind mirrors or glass: those of the ``bent`` lanes.
+    def shift_splats(self, scene, plan: Plan, camera: CameraSamples, splats, marks: mi.UInt64) -> None:
+        """Splats the differences of light paths that end at ``marked`` vertices.
 
-        They are few, and their walks long: in the kernel of all lanes most of these would wait for them.
+        Those behind mirrors or glass are few, and their walks long: in the kernel of all most lanes would wait.
         """
-        lanes, exists = in_packets(np.array(dr.compress(bent)), camera)
-        if not len(lanes):
+        lanes, depths = marked(marks, plan.longest)
+        if not dr.width(lanes):
             return
-        some = camera.at(mi.UInt32(lanes))
-        ray, importance, _ = some.rays()
-        importance = dr.select(mi.Bool(exists), importance, 0)
-        shifter = Shifter(scene, plan, some, ray, importance, self.first_hit, splats, again=True)
-        random = some.random.clone()
-        *_, state = self.light_path(scene, plan.lights, some, random, ray, plan.longest, shifter, mi.Bool(exists))
-        dr.eval(state)
+        bent = splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats)
+        dr.eval(bent)
+        if plan.materials.all_connectable or not dr.width(few := dr.compress(bent)):
+            return
+        lanes, depths = dr.gather(mi.UInt32, lanes, few), dr.gather(mi.UInt32, depths, few)
+        dr.eval(splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats, bent=True))
 
     @dr.syntax
     def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):

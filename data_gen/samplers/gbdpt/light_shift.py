@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -16,16 +15,17 @@ import mitsuba as mi
 from data_gen.film import SHIFTS
 from data_gen.film.splats import Splats
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.manifold import Target, event, follow, prepend_event, walk
+from data_gen.paths.manifold import Target, follow, walk
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.light_path import Seen
+from data_gen.samplers.bdpt.light_path import pixel_at
 from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.bdpt.mis import Partial
-from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, record_class
+from data_gen.samplers.bdpt.strategies import to_camera
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, scatters_smoothly
 from data_gen.samplers.gbdpt.base_path import Plan
-from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
+from data_gen.samplers.gbdpt.light_again import light_again
+from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
 
 
 @dataclass
@@ -47,79 +47,43 @@ class Splatted:
     allowed: mi.Bool  # both vertices are connectable, and ``before`` was left by a smooth event
 
 
-@dataclass
-class Link:
-    """What lies between the last vertex of a light path and the one that light has left smoothly before it."""
+def splat_differences(
+    scene,
+    plan: Plan,
+    camera: CameraSamples,
+    depth: mi.UInt32,
+    first_hit: Callable,
+    splats: dict[str, Splats],
+    bent: bool = False,
+) -> mi.Bool:
+    """Splats the differences of light paths that end at vertices that the camera sees, one for each of its samples.
 
-    depth: mi.UInt32  # of that one; 0 is the light's end
-    p: mi.Float  # density with which it was left
-    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
-    events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
-    whole: mi.Bool  # there is room for all of them
-
-
-def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float) -> Link:
-    """That of the next vertex, where the one at ``depth`` is left by a sampled event."""
-    smooth = event_kind(sample.sampled_type) == SMOOTH
-    code = event(sample.sampled_type)
-    events, fits = prepend_event(link.events, code)
-    return Link(
-        dr.select(smooth, depth, link.depth),
-        dr.select(smooth, sample.pdf, link.p),
-        dr.select(smooth, 1, link.survival) * survival,
-        dr.select(smooth, 0, dr.select(fits, events, link.events)),
-        smooth | (link.whole & fits & (code != 0)),
-    )
-
-
-@dataclass
-class Shifter:
-    """Splats what light paths bring to the camera, and the differences of that.
-
-    Bent is what ends behind mirrors or glass. Its differences alone are splatted where the lanes are traced ``again``,
-    and all others in the first place. The state is the ``Link`` to the vertex that light has left smoothly last, what
-    is kept of that vertex, and which lanes are bent.
+    Those at ``depth`` edges from the light. Bent is what ends behind mirrors or glass: with ``bent`` its differences
+    alone are splatted, else all others. Returns which are bent.
     """
+    ray, importance, _ = camera.rays()
+    random = camera.random.clone()
+    start, end, link, left, lens, there = light_again(scene, plan.lights, camera, random, ray, depth, plan.rr_depth)
+    y = end.y
+    bsdf = y.si.bsdf()
+    # It has been seen: nothing is in between.
+    C, others, uv = to_camera(camera.sensor, lens, y, bsdf, there & scatters_smoothly(bsdf), lambda *_: mi.Bool(False))
+    lit = dr.max(C) > 0
 
-    scene: mi.Scene
-    plan: Plan
-    camera: CameraSamples
-    ray: mi.Ray3f
-    importance: mi.Spectrum
-    first_hit: Callable
-    splats: dict[str, Splats]
-    again: bool = False
-
-    def start(self) -> tuple[Link, Any, mi.Bool]:
-        link = Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
-        return link, dr.zeros(record_class(mi.variant())), mi.Bool(False)
-
-    def sees(self, state: tuple, seen: Seen) -> tuple[Link, Any, mi.Bool]:
-        link, left, any_bent = state
-        wavelengths, lit = self.ray.wavelengths, dr.max(seen.C) > 0
-        if not self.again:
-            light = to_rgb(weighted(seen.C, seen.others) * self.importance, wavelengths)
-            self.splats["primal"].add(seen.pixel, list(light), lit)
-
-        # --------------------- Its four shifts -----------------------
-        first, before = link.depth == 0, recall(left, self.ray.time, wavelengths)
-        connectable = self.plan.materials.connectable
-        allowed = link.whole & connectable(seen.y.si.bsdf()) & (first | connectable(before.si.bsdf()))
-        path = Splatted(
-            *(seen.y, seen.d, seen.uv, seen.lens, seen.C, seen.others, first, seen.start, before),
-            *(link.p, link.survival, link.events, allowed),
-        )
-        bent = lit & allowed & (link.events != 0)
-        now = bent if self.again else lit & ~bent
-        Δ = differences(self.scene, self.plan, self.camera, path, self.first_hit, now, self.again)
-        for name, (one, on_film) in Δ.items():
-            self.splats[name].add(seen.pixel, list(to_rgb(one * self.importance, wavelengths)), on_film)
-        return link, left, any_bent | bent
-
-    def leaves(self, state: tuple, depth: mi.UInt32, kept: Any, sample, survival: mi.Float) -> tuple:
-        link, left, any_bent = state
-        link = next_link(link, depth, sample, survival)
-        return link, dr.select(link.depth == depth, kept, left), any_bent
+    # --------------------- Its four shifts -----------------------
+    first, before = link.depth == 0, recall(left, ray.time, ray.wavelengths)
+    connectable = plan.materials.connectable
+    allowed = link.whole & connectable(bsdf) & (first | connectable(before.si.bsdf()))
+    path = Splatted(
+        *(y, end.ray.d, uv, lens, C, others, first, start, before),
+        *(link.p, link.survival, link.events, allowed),
+    )
+    is_bent = lit & allowed & (link.events != 0)
+    Δ = differences(scene, plan, camera, path, first_hit, is_bent if bent else lit & ~is_bent, bent)
+    pixel = pixel_at(uv, camera.size)
+    for name, (one, on_film) in Δ.items():
+        splats[name].add(pixel, list(to_rgb(one * importance, ray.wavelengths)), on_film)
+    return is_bent
 
 
 def differences(

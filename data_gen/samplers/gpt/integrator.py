@@ -112,12 +112,17 @@ class GPT(GradientIntegrator):
         return path.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
+        plan = self.plan(scene)
+        return lambda camera, film: self.sample_pass(scene, plan, camera, film)
+
+    def plan(self, scene) -> Plan:
+        """What the kernel contains for a scene. Raises NgptError for polarised variants."""
         if mi.is_polarized:
             raise NgptError(
                 f"sampler 'gpt' does not follow polarised light (variant '{mi.variant()}'); "
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
-        plan = make_plan(
+        return make_plan(
             scene,
             roughness_threshold=self.roughness_threshold,
             max_depth=self.max_depth,
@@ -127,7 +132,6 @@ class GPT(GradientIntegrator):
             caustic=self.caustic,
             volumes=self.volumes and bool(media_of(scene)),
         )
-        return lambda camera, film: self.sample_pass(scene, plan, camera, film)
 
     def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""

@@ -59,9 +59,7 @@ class AlongRays:
         """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
-        seen = dr.zeros(mi.MediumInteraction3f, dr.width(length))
-        seen.p, seen.time, seen.wavelengths, seen.medium = ray.o, ray.time, ray.wavelengths, medium
-        seen.wi, seen.sh_frame = -ray.d, mi.Frame3f(-ray.d)
+        seen = seen_along(ray, medium)
 
         def add(sums, i, near):
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
@@ -76,12 +74,20 @@ class AlongRays:
         return self.K * self.grid.along(ray, length, self.radius2, active, add, (zero,))[0]
 
 
+def seen_along(ray, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
+    """Places in a ``medium`` as its phase function knows them, for light that is scattered against the ray."""
+    seen = dr.zeros(mi.MediumInteraction3f, dr.width(ray.d))
+    seen.p, seen.time, seen.wavelengths, seen.medium = ray.o, ray.time, ray.wavelengths, medium
+    seen.wi, seen.sh_frame = -ray.d, mi.Frame3f(-ray.d)
+    return seen
+
+
 @dataclass
 class Both:
     """Photons on surfaces, and photons in media."""
 
-    on_surfaces: Gathering
-    in_media: AlongRays
+    on_surfaces: Gathering | None
+    in_media: Any
 
 
 class BRE(VPM):
@@ -102,7 +108,8 @@ class BRE(VPM):
     def light(self, scene, materials, random, ray, importance, near, emission: bool):
         if self.fog is None:
             return super().light(scene, materials, random, ray, importance, near, emission)
-        gather = (near.on_surfaces.light, near.in_media.light) if near is not None else (None, None)
+        parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
+        gather = (None if part is None else part.light for part in parts)
         return self.path_in_media(scene, materials, random.clone(), ray, importance, *gather, emission)
 
     @dr.syntax

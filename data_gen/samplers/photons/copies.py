@@ -8,6 +8,9 @@
 A photon that came from a by a mirror, or through glass, has no copy: light goes there in one direction. Nor is there
 one where anything is in the way, or where the copy lies outside the radius or on a surface that faces another way. What
 a photon must fulfil the copy must, too, so that both directions of a difference reject alike.
+
+In media a may be where light was scattered. Distances have densities, in the colour c of the light path: T' is in Φ',
+and T'_c / T_c in r. Boundaries that bend nothing may lie between a and b, or b'. There b' must be in the medium of b.
 """
 
 from __future__ import annotations
@@ -17,10 +20,11 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths import media, segments
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, context, evaluate
 from data_gen.samplers.photons import shift
-from data_gen.samplers.photons.trace import vertex_of
+from data_gen.samplers.photons.trace import vertex_in_media_of, vertex_of
 
 # Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
 NORMAL_COSINE = 0.7
@@ -28,12 +32,17 @@ NORMAL_COSINE = 0.7
 
 @dataclass
 class Photon:
-    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings."""
+    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings.
+
+    ``medium`` is that around it, ``channel`` the colour of its light path; None in scenes without media.
+    """
 
     p: mi.Point3f
     n: mi.Normal3f
     d: mi.Vector3f
     Φ: mi.Spectrum
+    medium: mi.MediumPtr | None = None
+    channel: mi.UInt32 | None = None
 
 
 @dataclass
@@ -45,6 +54,16 @@ class Way:
     ratio: mi.Float  # p' / p
     length2: mi.Float  # squared, from a to the target; 1 from infinity
     base_length2: mi.Float  # from a to b̂
+    through: Through | None = None  # what of media is known; None without media
+
+
+@dataclass
+class Through:
+    """Media along the way from a, and along that of the photon itself."""
+
+    medium: mi.MediumPtr  # at a
+    τ_c: mi.Float  # of the photon's way, in colour c
+    channel: mi.UInt32  # c
 
 
 def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi.Bool:
@@ -68,36 +87,70 @@ def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) 
 def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
     """The photon of that place in the map."""
     n, d = dr.gather(mi.Normal3f, photons.n, j, active), dr.gather(mi.Vector3f, photons.d, j, active)
-    return Photon(dr.gather(mi.Point3f, photons.p, j, active), n, d, dr.gather(mi.Spectrum, photons.β, j, active))
+    found = Photon(dr.gather(mi.Point3f, photons.p, j, active), n, d, dr.gather(mi.Spectrum, photons.β, j, active))
+    if hasattr(photons, "medium"):
+        found.medium = dr.gather(mi.MediumPtr, photons.medium, j, active)
+        found.channel = dr.gather(mi.UInt32, photons.channel, j, active)
+    return found
 
 
-def copy(scene, lights: LightEnds, connectable, starts: LightRay, photons, j, photon: Photon, x, y, radius2, active):
+def copy(
+    scene, lights: LightEnds, connectable, starts: LightRay, photons, j, photon: Photon, x, y, radius2, active, fog=None
+):
     """(copy, r, whether it exists) of the ``photon`` of place ``j`` that is gathered at ``x`` and not at ``y``, for y.
 
     ``starts`` are the light's ends of all light paths, ``connectable`` (material) says where photons are gathered.
     """
     foot = shift.on_plane(photon.p, photon.d, x.p, x.n)
     target = shift.moved(foot, x.p, x.n, y.p, y.n)
-    way = redirected(scene, lights, starts, photons, j, photon, foot, target, active)
+    way = redirected(scene, lights, starts, photons, j, photon, foot, target, active, fog)
     J = shift.jacobian(photon.d, x.n, way.base_length2, way.ray.d, y.n, way.length2)
     r = way.ratio * J
     # In front of a
     good = active & (dr.dot(target - way.ray.o, way.ray.d) > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
-    hit = scene.ray_intersect(way.ray, good)
-    moved = Photon(hit.p, hit.n, way.ray.d, way.Φ * J)
+    if fog is None:
+        hit, Φ = scene.ray_intersect(way.ray, good), way.Φ * J
+    else:
+        T, T_c, met, ray, _ = let_through(scene, fog, way, mi.Float(dr.inf), good)
+        hit, Φ, r = met.compute_surface_interaction(ray, active=good), way.Φ * (J * T), r * T_c
+    moved = Photon(hit.p, hit.n, way.ray.d, Φ)
     good &= hit.is_valid() & connectable(hit.bsdf())
     # At x it would be gathered as it is, not as a copy: the shift back would be another.
     return moved, r, good & is_near(moved, y, radius2) & ~is_near(moved, x, radius2)
 
 
-def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, foot, target, active) -> Way:
-    """From the photon's predecessor to ``target`` instead of ``foot``. Φ is 0 where that is not possible."""
+def copy_in_medium(scene, fog, lights: LightEnds, starts: LightRay, photons, j, photon: Photon, target, active):
+    """(copy, r, whether it exists) of the ``photon`` of place ``j``, in a medium, at the ``target``."""
+    way = redirected(scene, lights, starts, photons, j, photon, photon.p, target, active, fog)
+    J = shift.jacobian_in_medium(way.base_length2, way.length2)
+    r = way.ratio * J
+    good = active & (dr.dot(target - way.ray.o, way.ray.d) > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
+    reach = dr.norm(target - way.ray.o)
+    T, T_c, met, _, medium = let_through(scene, fog, way, reach, good)
+    good &= ~met.is_valid() & (medium == photon.medium)
+    here = dr.zeros(mi.MediumInteraction3f, dr.width(reach))
+    here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, medium
+    σs, _, σ = medium.get_scattering_coefficients(here, good)
+    albedo = dr.select(good, σs / media.pick(σ, way.through.channel), 0)
+    return Photon(target, photon.n, way.ray.d, way.Φ * (J * T * albedo)), r * T_c, good
+
+
+def let_through(scene, fog, way: Way, reach: mi.Float, active) -> tuple:
+    """T' / T_c and T'_c / T_c of the way, over a distance or up to a surface; the surface, last piece, and medium."""
+    ray, through = media.shortened(way.ray, reach), way.through
+    trace = segments.next_surface(scene)
+    τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
+    return dr.exp(through.τ_c - τ), dr.exp(through.τ_c - media.pick(τ, through.channel)), met, ray, medium
+
+
+def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, foot, target, active, fog=None) -> Way:
+    """From the photon's predecessor to ``target`` instead of ``foot``. Φ is 0 where that is not possible.
+
+    In media it is without their T: see ``let_through``.
+    """
     parent = dr.gather(mi.UInt32, photons.parent, j, active)
     density = dr.gather(mi.Float, photons.density, j, active)
-    t = dr.gather(mi.Float, photons.t, j, active)
-    # Along the photon's line, b̂ may lie behind a.
-    base_length = t + dr.dot(foot - photon.p, photon.d)
-    first, known = density == 0, dr.isfinite(density) & (base_length > 0)
+    first = density == 0
 
     # ------------------------ From a lamp ------------------------
     start = start_of(starts, parent, active & first)
@@ -112,15 +165,32 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
     beyond &= first
 
     # ------------------------ From a vertex ----------------------
-    a = vertex_of(photons, parent, active & ~first)
+    if fog is None:
+        a, scatters = vertex_of(photons, parent, active & ~first), mi.Bool(False)
+    else:
+        a, place = vertex_in_media_of(photons, parent, active & ~first)
+        scatters = place.scatters
     origin = a.spawn_ray(target - a.p).o
     to = mi.Vector3f(target - origin)
     length2 = dr.squared_norm(to)
     d = to * dr.rsqrt(length2)
-    f, p, _ = evaluate(IMPORTANCE, a, a.bsdf(), a.to_local(d), active & ~first & known)
+    f, p, _ = evaluate(IMPORTANCE, a, a.bsdf(), a.to_local(d), active & ~first & ~scatters)
+    if fog is not None:
+        phase = place.medium.phase_function()
+        of_phase = phase.eval_pdf(mi.PhaseFunctionContext(), media.in_medium(a, place), d, scatters)
+        f, p = (dr.select(scatters, new, old) for new, old in zip(of_phase, (f, p), strict=True))
     survival = dr.gather(mi.Float, photons.survival, j, active)
     Φ = dr.gather(mi.Spectrum, photons.β, parent, active) * f / (density * survival)
 
+    # Along the photon's line, b̂ may lie behind a.
+    if fog is None:
+        through, base_length = None, dr.gather(mi.Float, photons.t, j, active) + dr.dot(foot - photon.p, photon.d)
+    else:
+        # The record knows the last piece alone.
+        origin_of_photon = dr.select(first, start.ray.o, origin)
+        base_length = dr.dot(foot - origin_of_photon, photon.d)
+        through = known_of_media(scene, fog, photon, origin_of_photon)
+    known = dr.isfinite(density) & (base_length > 0)
     Φ = dr.select(first, moved.β, Φ)
     origin = dr.select(first, dr.select(beyond, aside, moved.ray.o), origin)
     return Way(
@@ -129,7 +199,22 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
         ratio=dr.select(first, lamp_ratio, p / density),
         length2=dr.select(first, dr.rcp(per_length2), length2),
         base_length2=dr.select(beyond, 1, dr.square(base_length)),
+        through=through,
     )
+
+
+def known_of_media(scene, fog, photon: Photon, origin) -> Through:
+    """Media between the ``photon`` and the ``origin`` of its last edge."""
+    b = dr.zeros(mi.SurfaceInteraction3f, dr.width(photon.p))
+    b.p, b.n = photon.p, photon.n
+    back, medium = b.spawn_ray(-photon.d), photon.medium
+    reach = dr.dot(back.o - origin, photon.d)
+    if not fog.media.boundaries:
+        τ = media.depth(media.extinction(medium, back), reach)
+    else:
+        trace, back = segments.next_surface(scene), media.shortened(back, reach)
+        τ, _, _, medium = segments.cross(fog.media.passes, trace, back, medium, reach, True)
+    return Through(medium, media.pick(τ, photon.channel), photon.channel)
 
 
 def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:

@@ -134,6 +134,7 @@ class PPM(GradientIntegrator):
     name = "ppm"
     camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
     fog: Fog | None = None
+    edges = False  # whether photon maps have the edges of light paths, too
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -186,7 +187,8 @@ class PPM(GradientIntegrator):
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
         receives, depths = passes.materials.connectable, (self.max_depth - 1, self.rr_depth)
-        return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen)
+        edges = self.edges and self.fog is not None
+        return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen, edges)
 
     def light(self, scene, materials, random, ray, importance, near, emission: bool):
         """L and Le of camera paths, with what is gathered from photons ``near``, and with ``emission`` or without."""

@@ -12,7 +12,13 @@ to y and not to x. Surfaces are curved, and photons lie on them, not on a plane;
     J           dω'/dω, the ratio of the solid angles of a piece of either plane
 
 The map from b̂ to ĉ is a rigid one, and its inverse is the same with x and y in each other's place. So shifting the
-copy back gives b, on curved surfaces too. [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 4.3; the
+copy back gives b, on curved surfaces too.
+
+In a medium there is no surface, so b and b' themselves are moved. Beside a camera ray x and y are the points of both
+rays at the same distance, n and m the directions of the rays: distance, and place beside the ray, have the volume for
+their product, and the map keeps the one and turns or mirrors the other. So it keeps volumes, whatever the rays.
+
+[Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 4.3; the
 mirror image: Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 4]
 """
 
@@ -48,10 +54,28 @@ def rotate(v, n, m):
     return v * cos + dr.cross(axis, v) + axis * (dr.dot(axis, v) / (1 + cos))
 
 
+def past(a, e, x, d, u, far):
+    """Where a line from ``a`` passes the ray through ``x`` along ``d``, there, at the signed distance ``u``.
+
+    ``e`` is a direction near to that of the line, or, where it comes from infinitely ``far`` away, its own.
+    """
+    target = x
+    # The line's direction turns the place by a little: each step is better by u over the length.
+    for _ in range(6):
+        target = x + dr.normalize(dr.cross(d, e)) * u
+        e = dr.select(far, e, dr.normalize(target - a))
+    return target
+
+
 def jacobian(d, n, length2, d1, m, length2_1):
     """J of the way from a, along ``d``, to b̂ (normal ``n``), which becomes that along ``d1`` to ĉ (normal ``m``).
 
     ``length2``, ``length2_1``: squared distances of b̂ and ĉ from a. Of light from infinitely far away, whose origins
     move and not the directions, they are 1.
     """
-    return dr.abs(dr.dot(m, d1) / dr.dot(n, d)) * (length2 / length2_1)
+    return dr.abs(dr.dot(m, d1) / dr.dot(n, d)) * jacobian_in_medium(length2, length2_1)
+
+
+def jacobian_in_medium(length2, length2_1):
+    """J of the way from a to b, whose distance has a density of its own, which becomes that to b', of equal volumes."""
+    return length2 / length2_1

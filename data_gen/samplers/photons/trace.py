@@ -31,6 +31,8 @@ if TYPE_CHECKING:
 VERTICES_PER_PATH = 8
 # Bytes of a vertex: 22 words of a record, as much again in the map before, and 9 words of a grid that is made.
 VERTEX_BYTES = (22 + 22 + 9) * 4
+# And those of an edge, twice
+EDGE_BYTES = 12 * 4 * 2
 # Bytes of a light path beside that: rays, throughput and random numbers, twice, and its start.
 PATH_BYTES = 512
 # Bytes that a map takes for each light path.
@@ -71,11 +73,30 @@ def vertices_in_media_class(variant: str) -> type:
 
     @dataclass
     class VerticesInMedia(vertices_class(variant)):  # type: ignore[misc]
-        """23 words a vertex."""
+        """24 words a vertex."""
 
         medium: mi.MediumPtr  # around it
+        channel: mi.UInt32  # the colour by which the light path samples its distances
 
     return VerticesInMedia
+
+
+@cache
+def vertices_and_edges_class(variant: str) -> type:
+    """The same where the edges of light paths are kept, too."""
+
+    @dataclass
+    class VerticesAndEdges(vertices_in_media_class(variant)):  # type: ignore[misc]
+        """The edge that leads to a vertex, in the same place, or to nothing: 12 words more."""
+
+        o: mi.Point3f  # where it begins
+        e: mi.Vector3f  # its direction
+        power: mi.Spectrum  # there, times the number of light paths
+        begins: mi.MediumPtr  # there
+        colour: mi.UInt32  # ``channel``
+        bounce: mi.UInt32  # its number; 0 where there is none
+
+    return VerticesAndEdges
 
 
 @dataclass
@@ -102,12 +123,14 @@ def trace(
     rr_depth: int,
     fog: Fog | None = None,
     frozen: Callable = call,
+    edges: bool = False,
 ) -> tuple[LightRay, Iterator[Any]]:
     """One light path for each lane of ``random``, of at most ``max_depth`` edges, as maps of vertices.
 
     Light is gathered at materials that it ``receives``, and within the media of ``fog``. A map has VERTICES_PER_PATH
     places for each path; further maps are of those paths alone that go on, and begin with their last vertex, as parent.
-    ``frozen`` calls the functions that make kernels. Returns the light's end of all paths, and the maps.
+    ``frozen`` calls the functions that make kernels; with ``edges`` maps have those, too. Returns the light's end of
+    all paths, and the maps.
     """
     start, within, numbers = frozen(_start, scene, lights, random, fog, fixed=True)
     dr.eval(start, within, numbers)
@@ -120,7 +143,7 @@ def trace(
     )
     depths = dr.opaque(mi.UInt32, min(max(max_depth, 0), 0xFFFFFFFF)), dr.opaque(mi.UInt32, rr_depth)
     paths.alive &= paths.bounce <= depths[0]
-    return start, _maps(scene, paths, random, receives, depths, fog, frozen)
+    return start, _maps(scene, paths, random, receives, depths, fog, frozen, edges)
 
 
 def _start(scene, lights: LightEnds, random, fog) -> tuple:
@@ -131,8 +154,9 @@ def _start(scene, lights: LightEnds, random, fog) -> tuple:
     return start, within, random.random
 
 
-def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen) -> Iterator[Any]:
-    kind = (vertices_in_media_class if fog else vertices_class)(mi.variant())
+def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen, edges: bool) -> Iterator[Any]:
+    vertices = vertices_and_edges_class if edges else vertices_in_media_class if fog else vertices_class
+    kind = vertices(mi.variant())
     map_before = None
     while dr.width(lanes := dr.compress(paths.alive)):
         paths, random = _at(paths, lanes), random.at(lanes)
@@ -141,13 +165,17 @@ def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen) ->
         n = dr.width(lanes) * VERTICES_PER_PATH
         photons = kind(*(dr.empty(t, n) for t in get_type_hints(kind).values()))
         photons.t, photons.depth = dr.zeros(mi.Float, n), dr.zeros(mi.UInt32, n)
+        if edges:
+            photons.bounce = dr.zeros(mi.UInt32, n)
         place = dr.arange(mi.UInt32, dr.width(lanes)) * dr.opaque(mi.UInt32, VERTICES_PER_PATH)
         end = place + dr.opaque(mi.UInt32, VERTICES_PER_PATH)
         if map_before is not None:
             # What has been gathered of it is not gathered again.
             vertex = _at(map_before, paths.parent)
             vertex.depth = dr.zeros(mi.UInt32, len(vertex))
-            _put(photons, vertex, place, True)
+            if edges:
+                vertex.bounce = vertex.depth
+            put(photons, vertex, place, True)
             paths.parent, place = place, place + 1
         paths, numbers, photons = frozen(_walk, scene, paths, random, receives, depths, fog, photons, place, end)
         dr.eval(paths, numbers, photons)
@@ -163,23 +191,27 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
     ray, β, density, survival = mi.Ray3f(paths.ray), paths.β, paths.density, paths.survival
     parent, bounce, alive, within = mi.UInt32(paths.parent), mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.within
     brightest, (max_depth, rr_depth) = paths.brightest, depths
+    kind = (vertices_in_media_class if fog else vertices_class)(mi.variant())
     while dr.hint(alive & (place < end), label="light paths"):
         if dr.hint(fog is not None, mode="scalar"):
             channel, medium = within
+            if dr.hint(hasattr(photons, "bounce"), mode="scalar"):
+                _begin(photons, place, alive, ray, β, medium, channel, bounce, density, survival, parent)
             segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, alive)
             hit, where, β = segment.hit, segment.place, β * segment.weight
-            exists, scatters, around = alive & si.is_valid() & (dr.max(β) > 0), where.scatters, (where.medium,)
+            exists, scatters = alive & si.is_valid() & (dr.max(β) > 0), where.scatters
+            around = where.medium, channel
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
             si = hit.compute_surface_interaction(ray, active=alive)
             exists, scatters, around = alive & si.is_valid(), mi.Bool(False), ()
         bsdf = si.bsdf()
         depth = dr.select(receives(bsdf) | scatters, bounce, 0)
-        vertex = type(photons)(
+        vertex = kind(
             *(si.p, si.n, ray.d, β, density, survival, depth, parent, hit.t, hit.prim_uv, hit.prim_index),
             *(hit.shape, hit.instance, *around),
         )
-        _put(photons, vertex, place, exists)
+        put(photons, vertex, place, exists)
         parent, place = dr.select(exists, place, parent), place + 1
         u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
         sample, f_p = bsdf.sample(context(IMPORTANCE), si, u_lobe, u_direction, exists & ~scatters)
@@ -204,7 +236,21 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
 
 
 def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f:
-    """A vertex of a map, as the light path has come to it."""
+    """A vertex of a map on a surface, as the light path has come to it."""
+    ray, hit = _met(photons, index, active)
+    return hit.compute_surface_interaction(ray, active=active)
+
+
+def vertex_in_media_of(photons, index: mi.UInt32, active=True) -> tuple[mi.SurfaceInteraction3f, media.Place]:
+    """A vertex of a map of a scene with media, and its place."""
+    ray, hit = _met(photons, index, active)
+    scatters = active & (dr.squared_norm(dr.gather(mi.Normal3f, photons.n, index, active)) == 0)
+    place = media.Place(dr.gather(mi.MediumPtr, photons.medium, index, active), scatters)
+    return media.vertex(ray, hit, place), place
+
+
+def _met(photons, index: mi.UInt32, active) -> tuple[mi.Ray3f, mi.PreliminaryIntersection3f]:
+    """The last piece of the ray that led to a vertex, and what it met there."""
     fields_of_hit = ("t", "prim_uv", "prim_index", "shape", "instance")
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(index))
     for name in fields_of_hit:
@@ -213,12 +259,19 @@ def vertex_of(photons, index: mi.UInt32, active=True) -> mi.SurfaceInteraction3f
     # Not told by any other field: without it the vertex would be void.
     hit.valid = mi.Bool(active)
     p, d = dr.gather(mi.Point3f, photons.p, index, active), dr.gather(mi.Vector3f, photons.d, index, active)
-    return hit.compute_surface_interaction(mi.Ray3f(p - d * hit.t, d), active=active)
+    return mi.Ray3f(p - d * hit.t, d), hit
 
 
-def _put(photons, vertex, place: mi.UInt32, active) -> None:
+def _begin(photons, place, active, ray, β, medium, channel, bounce, density, survival, parent) -> None:
+    """Enters edges at these places of a map, with what is known of them before they lead anywhere."""
+    edge = {"o": ray.o, "e": ray.d, "power": β, "begins": medium, "colour": channel, "bounce": bounce}
+    for name, value in (edge | {"density": density, "survival": survival, "parent": parent}).items():
+        dr.scatter(getattr(photons, name), value, place, active)
+
+
+def put(photons, vertex, place: mi.UInt32, active) -> None:
     """Enters vertices at these places of a map."""
-    for f in fields(photons):
+    for f in fields(vertex):
         dr.scatter(getattr(photons, f.name), getattr(vertex, f.name), place, active)
 
 

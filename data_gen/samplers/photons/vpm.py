@@ -94,8 +94,8 @@ class VPM(PPM):
     """
 
     name = "vpm"
-    # A word more for each vertex; and two for each light path
-    map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 4 + 2 * 8
+    # Two words more for each vertex; and two for each light path
+    map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)

@@ -1,0 +1,149 @@
+"""How a shot of a training set moves: its camera, one thing in it, its light. All of it comes from random numbers.
+
+Each of the three moves or rests for itself, at a speed that is even over the frames and, from shot to shot, uniform in
+its logarithm. So there are slow shots and fast ones, and shots of which only the light changes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.dataset.cameras import Surroundings, View
+from data_gen.frames.motion import seen
+
+# Shares of shots of which the camera moves, a thing does, the light does; and of the latter, of which a lamp moves,
+# where there is one, rather than shines differently.
+CAMERA, THING, LIGHT, LAMP = 0.8, 0.35, 0.35, 0.5
+# Pixels a frame of what is seen at the median distance, of the image's width: 0.1 to 9.6 of 96 pixels.
+SPEEDS = 0.001, 0.1
+# A thing that is moved fills this share of the pixels: smaller ones are not seen, larger ones are walls.
+SIZES = 0.01, 0.3
+# Of the lamp's way in the median distance, and of the logarithm of its radiance, a frame.
+LAMP_WAYS, GAINS = (0.005, 0.08), (0.01, 0.3)
+# Of the way to what is in the way that a camera may go, all frames together.
+CLEAR = 0.6
+RADIANCE = (".radiance.value", ".intensity.value", ".irradiance.value")
+
+
+@dataclass
+class Movement:
+    """What changes from frame to frame; without anything but a view, nothing does.
+
+    ``way``, ``turn``  of the camera, and of its target beside it, world units a frame
+    ``shape``, ``shift``  the parameter that places a shape, and its way a frame
+    ``light``, ``gain``   the parameter of a light, and its factor a frame
+    """
+
+    view: View
+    way: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    shape: str = ""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    light: str = ""
+    gain: float = 1.0
+    _start: dict = field(default_factory=dict, repr=False)
+
+    def view_at(self, frame: int) -> View:
+        origin = np.add(self.view.origin, frame * np.array(self.way))
+        target = np.add(self.view.target, frame * (np.array(self.way) + self.turn))
+        origin, target = (tuple(float(x) for x in point) for point in (origin, target))
+        return replace(self.view, origin=origin, target=target)
+
+    def apply(self, scene: mi.Scene, frame: int) -> None:
+        """Brings ``scene`` into the state of a frame; that of frame 0 is the scene's own, seen by the view."""
+        self.view_at(frame).apply(scene)
+        if not self.shape and not self.light:
+            return
+        params = mi.traverse(scene)
+        if self.shape:
+            self._move(params, np.array(self.shift) * frame)
+        if self.light:
+            start = self._start.setdefault(self.light, type(params[self.light])(params[self.light]))
+            value = start * self.gain**frame
+            dr.make_opaque(value)  # as a literal it would be compiled into the kernels
+            params[self.light] = value
+        params.update()
+
+    def _move(self, params: mi.SceneParameters, far: np.ndarray) -> None:
+        if self.shape.endswith(".to_world"):
+            start = self._start.setdefault(self.shape, mi.Transform4f(params[self.shape]))
+            params[self.shape] = mi.Transform4f(mi.ScalarTransform4f().translate(list(map(float, far)))) @ start
+            return
+        start = self._start.setdefault(self.shape, np.array(params[self.shape]).reshape(-1, 3))
+        params[self.shape] = mi.Float((start + far).astype(np.float32).ravel())
+
+    def record(self) -> dict:
+        told = {"way": self.way, "turn": self.turn, "shape": self.shape, "shift": self.shift}
+        return told | {"light": self.light, "gain": self.gain}
+
+
+def random_movement(around: Surroundings, view: View, rng: np.random.Generator, frames: int) -> Movement:
+    """How a shot of so many frames goes on from ``view``, which is applied to the scene."""
+    scene = around.scene
+    view.apply(scene)
+    what = seen(scene)
+    shapes = what.shape[what.shape >= 0]
+    eye, target = np.array(view.origin), np.array(view.target)
+    hits = what.points[what.shape >= 0, :3] - eye
+    distance = float(np.median(np.linalg.norm(hits, axis=1))) if len(hits) else around.scale
+    forward = (target - eye) / np.linalg.norm(target - eye)
+    right = np.cross(forward, view.up)
+    right /= max(np.linalg.norm(right), 1e-9)
+    axes = np.stack([right, np.cross(right, forward), forward])
+    # The width of what is seen at that distance.
+    width = 2 * distance * np.tan(np.radians(view.fov) / 2) * view.size / view.film[0]
+
+    def speed(low: float, high: float) -> float:
+        return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+    made = Movement(view)
+    if rng.random() < CAMERA:
+        # Forward and back changes the image less than sideways.
+        way = rng.normal(size=3) * (1, 0.5, 2) @ axes
+        way *= speed(*SPEEDS) * width / np.linalg.norm(way)
+        free = float(around.cast(eye[None], (way / np.linalg.norm(way))[None])[0][0])
+        way *= min(1.0, CLEAR * free / (frames * float(np.linalg.norm(way))))
+        turn = rng.normal(size=2) * (1, 0.5) @ axes[:2]
+        turn *= rng.integers(2) * speed(*SPEEDS) * width / max(np.linalg.norm(turn), 1e-9)
+        turn *= np.linalg.norm(target - eye) / distance
+        made.way, made.turn = _floats(way), _floats(turn)
+    movable = _movable(scene)
+    if rng.random() < THING:
+        share = np.bincount(shapes, minlength=len(scene.shapes())) / len(what.shape)
+        things = [i for i in movable if SIZES[0] < share[i] < SIZES[1]]
+        if things:
+            way = rng.normal(size=3) @ axes
+            made.shape = movable[things[int(rng.integers(len(things)))]]
+            made.shift = _floats(way * speed(*SPEEDS) * width / np.linalg.norm(way))
+    if rng.random() < LIGHT:
+        lamps = [i for i in movable if scene.shapes()[i].is_emitter()]
+        lights = sorted(name for name in mi.traverse(scene).keys() if name.endswith(RADIANCE))  # noqa: SIM118
+        if lamps and not made.shape and rng.random() < LAMP:
+            way = rng.normal(size=3)
+            made.shape = movable[lamps[int(rng.integers(len(lamps)))]]
+            made.shift = _floats(way * speed(*LAMP_WAYS) * around.scale / np.linalg.norm(way))
+        elif lights:
+            made.light = lights[int(rng.integers(len(lights)))]
+            made.gain = float(np.exp(rng.choice([-1, 1]) * speed(*GAINS)))
+    return made
+
+
+def _movable(scene: mi.Scene) -> dict[int, str]:
+    """The shapes that can be placed, by their numbers: the parameter that places each of them."""
+    places: dict[int, str] = {}
+    numbers = {shape: number for number, shape in enumerate(scene.shapes())}
+    # Not by names of shapes, which they need not have.
+    for name, (_, _, node, _) in mi.traverse(scene).properties.items():
+        kind = name.rpartition(".")[2]
+        if node in numbers and (kind == "to_world" or (kind == "vertex_positions" and numbers[node] not in places)):
+            places[numbers[node]] = name
+    return places
+
+
+def _floats(vector: np.ndarray) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in vector)
+    return x, y, z

@@ -1,0 +1,104 @@
+"""Light paths once more, up to a vertex that the camera has seen: what a shift needs of them.
+
+The kernel that finds light paths only marks which vertices are seen. These are few, scattered over lanes and steps, and
+a shift is eight rays: so each seen vertex has a lane of its own in a second kernel, which traces its path anew.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film.splats import Splats
+from data_gen.paths.manifold import event, prepend_event
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import SMOOTH, event_kind
+from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on
+from data_gen.samplers.bdpt.lights import LightEnds, LightRay
+from data_gen.samplers.bdpt.vertex import record, record_class
+from data_gen.samplers.gbdpt.pairs import weighted
+
+
+@dataclass
+class Marker:
+    """Splats what light paths bring to the camera, and marks the vertices that it sees: its state is a bit for each."""
+
+    splats: Splats
+    ray: mi.Ray3f
+    importance: mi.Spectrum
+
+    def start(self) -> mi.UInt64:
+        return mi.UInt64(0)
+
+    def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
+        lit = dr.max(seen.C) > 0
+        light = to_rgb(weighted(seen.C, seen.others) * self.importance, self.ray.wavelengths)
+        self.splats.add(seen.pixel, list(light), lit)
+        return state | dr.select(lit, mi.UInt64(1) << mi.UInt64(seen.y.depth), 0)
+
+
+def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
+    """The lane and the depth of each vertex that is marked, by depth: lanes side by side trace as many edges."""
+    lanes = [dr.compress((state >> mi.UInt64(depth)) & 1 != 0) for depth in range(1, longest)]
+    depths = [dr.full(mi.UInt32, depth, dr.width(some)) for depth, some in enumerate(lanes, 1)]
+    found = [(some, depth) for some, depth in zip(lanes, depths, strict=True) if dr.width(some)]
+    if not found:
+        return mi.UInt32(), mi.UInt32()
+    return dr.concat([some for some, _ in found]), dr.concat([depth for _, depth in found])
+
+
+@dataclass
+class Link:
+    """What lies between the last vertex of a light path and the one that light has left smoothly before it."""
+
+    depth: mi.UInt32  # of that one; 0 is the light's end
+    p: mi.Float  # density with which it was left
+    survival: mi.Float  # 1 / probability to survive Russian roulette from there on
+    events: mi.UInt32  # mirrors and glass between the two, of ``manifold``, the last one first
+    whole: mi.Bool  # there is room for all of them
+
+
+def first_link() -> Link:
+    """That of the vertex that a light's end lights."""
+    return Link(mi.UInt32(0), mi.Float(1), mi.Float(1), mi.UInt32(0), mi.Bool(True))
+
+
+def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: mi.Float) -> Link:
+    """That of the next vertex, where the one at ``depth`` is left by a sampled event."""
+    smooth = event_kind(sample.sampled_type) == SMOOTH
+    code = event(sample.sampled_type)
+    events, fits = prepend_event(link.events, code)
+    return Link(
+        dr.select(smooth, depth, link.depth),
+        dr.select(smooth, sample.pdf, link.p),
+        dr.select(smooth, 1, link.survival) * survival,
+        dr.select(smooth, 0, dr.select(fits, events, link.events)),
+        smooth | (link.whole & fits & (code != 0)),
+    )
+
+
+@dr.syntax
+def light_again(
+    scene, lights: LightEnds, camera, random, camera_ray: mi.Ray3f, depth: mi.UInt32, rr_depth: int
+) -> tuple[LightRay, End, Link, Any, mi.Point2f, mi.Bool]:
+    """Traces light paths up to the vertex at ``depth``; all that ``light_path`` has sampled is sampled again.
+
+    Returned are where light begins, the vertex, its ``Link``, what is kept of the vertex at the other end of that, the
+    place on the lens, and whether it is there.
+    """
+    lens = camera.sensor.needs_aperture_sample()
+    start, end, active = begin(scene, lights, random, camera_ray)
+    link, left = first_link(), dr.zeros(record_class(mi.variant()))
+    while dr.hint(active & (end.y.depth < depth), label="light path again"):
+        y = end.y
+        here = record(end.ray, end.hit, y, active)
+        if dr.hint(lens, mode="scalar"):
+            random.next_2d()
+        end, active, sample, survival = go_on(scene, random, start, y, y.si.bsdf(), rr_depth, active)
+        link = next_link(link, y.depth, sample, survival)
+        left = dr.select(link.depth == y.depth, here, left)
+    on_lens = random.next_2d() if lens else mi.Point2f(0.5)
+    return start, end, link, left, on_lens, active

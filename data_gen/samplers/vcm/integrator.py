@@ -1,0 +1,179 @@
+r"""Vertex connection and merging: ``bdpt`` and ``ppm`` in one, and every path of light under one weight.
+
+Connections find light from lamps and over rough surfaces; photons find what comes through glass and is seen in a mirror
+or through glass. Each fails where the other does well, and neither is told apart by the scene. Here both render it all,
+and each path counts for each of them by the balance heuristic: by how likely it is found so.
+
+    s, t        vertices of a path that come from the light, and from the camera
+    z, y        vertices of the camera path and of light paths
+    r, η        radius of a pass, and π r² N; N: light paths of the pass
+
+A pass has one camera sample and one light path for each pixel. Light paths are traced once: their vertices are
+connected to the camera (splats), kept in a map, connected to the camera path of the same sample (one of them,
+``bdpt.choice``), and gathered at all camera paths, within the radius, where materials scatter widely. The radius
+shrinks from pass to pass as that of ``ppm``.
+
+Photons are gathered only where light comes from mirrors, clear glass or holes. The papers gather all; but where it
+comes from a surface that scatters, a connection to that one finds the path without any blur.
+
+Merging finds paths of up to ``joined_depth`` edges, like connections; longer ones come from the camera alone.
+
+[Georgiev et al. 2012, "Light Transport Simulation with Vertex Connection and Merging"; Hachisuka et al. 2012, "A Path
+Space Extension for Robust Light Transport Simulation"]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from functools import partial
+from types import SimpleNamespace
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import GradientFilm
+from data_gen.film.splats import Splats
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
+from data_gen.samplers.bdpt.integrator import BDPT, Splatter
+from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.frozen import Frozen
+from data_gen.samplers.photons.ppm import refuse
+from data_gen.samplers.photons.radius import pixel_width, shrunk
+from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
+from ngpt.errors import NgptError
+
+# Of a camera sample, its features and its light path, beside the map: what was seen, and some more
+SAMPLE_BYTES = 1536
+
+
+@dataclass
+class Passes:
+    """The passes of a render, and the memory that one takes."""
+
+    integrator: VCM
+    scene: mi.Scene
+    lights: LightEnds
+    materials: Materials
+    width: float  # of a pixel
+    frozen: Frozen = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
+
+    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
+        self.integrator.sample_pass(self, camera, film)
+
+    @property
+    def lane_bytes(self) -> int:
+        """Of a camera sample, with all that its light path may leave in the map."""
+        # Dr.Jit gives each array the next power of two of bytes.
+        places = 1 << (self.integrator.vertices - 1).bit_length() if self.integrator.vertices else 0
+        return SAMPLE_BYTES + places * VERTEX_BYTES
+
+    def instead(self, lane_bytes: int) -> str:
+        """What else than a smaller image would fit into so many bytes for each camera sample."""
+        places = (lane_bytes - SAMPLE_BYTES) // VERTEX_BYTES
+        fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
+        return f", or no more than --option joined_depth={fits}" if fits else ""
+
+
+class VCM(BDPT):
+    """Vertex connection and merging, for surfaces; no gradients.
+
+    Plugin ``vcm``. Parameters, the first three as for Mitsuba's ``path``:
+
+    ``max_depth``            default -1: no limit
+    ``rr_depth``             5
+    ``hide_emitters``        false
+    ``joined_depth``         17, the number of edges up to which paths are found from both ends
+    ``radius``               2, of the first pass, in pixels where the camera sees something (the median)
+    ``roughness_threshold``  0.05, the microfacet roughness above which photons are gathered at a material
+
+    Biased, and consistent, as ``ppm``, but only where light comes through glass or by mirrors.
+
+    Not handled: media, polarised and spectral variants, cameras that are neither perspective nor thin lenses, emitters
+    other than areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
+    """
+
+    # Light through glass and back has long paths, which the camera finds by rare and bright ones alone. Of a light path
+    # 16 vertices are kept.
+    usually_joined = 17
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        self.radius = float(props.get("radius", 2.0))
+        self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+        if not 0 < self.radius < float("inf"):
+            raise NgptError(f"vcm: a radius of {self.radius:g} pixels; use one above 0")
+
+    @property
+    def longest(self) -> int:
+        """Edges of paths that are found from both ends."""
+        return min(self.max_depth, self.joined_depth)
+
+    @property
+    def vertices(self) -> int:
+        """The most that are kept of a light path."""
+        return max(self.longest - 1, 0)
+
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene, "vcm")
+        refuse_camera(scene, "vcm")
+        return Passes(self, scene, LightEnds(scene, "vcm"), Materials(scene, self.threshold), pixel_width(scene))
+
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        """One light path and one camera path for each camera sample, of which a pixel has one."""
+        scene, frozen = passes.scene, passes.frozen
+        (ray, importance, _), random = camera.rays(), camera.random.clone()
+        dr.eval(ray, importance)
+        values = frozen(features, scene, camera.sensor, camera.random, ray, fixed=True)
+        n, photons = dr.width(camera.pixel), None
+        ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        if self.vertices and passes.lights.emitters is not None:
+            radius, splats = self.radius * passes.width * shrunk(camera.first), film.splats("primal")
+            kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
+            sums = splats.sums, splats.lost
+            dr.make_opaque(sums)
+            numbers, sums, kept = frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
+            dr.eval(numbers, sums, kept)
+            splats.sums, splats.lost = sums
+            random, photons = type(random)(numbers), Photons(kept, radius, n)
+        L, Le = frozen(self.seen, *ends, random, ray, importance, photons, fixed=True)
+        values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
+        dr.eval(values)
+        film.put_all(values)
+
+    def lit(self, scene, lights, materials, sensor, lens, random, ray, importance, kept: Map, η, sums: tuple) -> tuple:
+        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; with the random numbers to go on by."""
+        size = mi.ScalarVector2u(sensor.film().crop_size())
+        camera = SimpleNamespace(sensor=sensor, lens=lens, size=size)
+        splats = Splats.__new__(Splats)
+        splats.pixels, splats.channels, (splats.sums, splats.lost) = int(dr.prod(size)), 3, sums
+        keeper = Keeper(Splatter(splats, ray, importance), η, kept)
+        at_vertices = partial(known, materials, η)
+        ends = scene, lights, camera, random.clone(), ray
+        _, count, random, _ = self.light_path(*ends, self.longest, keeper, known=at_vertices)
+        return random.random, sums, Map(kept.vertices, kept.photon, kept.first, count)
+
+    def seen(self, scene, lights, materials, sensor, lens, random, ray, importance, photons: Photons | None) -> tuple:
+        """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all."""
+        camera = SimpleNamespace(sensor=sensor, lens=lens)
+        ends = scene, lights, camera, random.clone(), ray, importance
+        if photons is None:
+            return self.camera_path(*ends, None, mi.UInt32(0), self.longest)
+        kept, merging = photons.kept, Merging(photons, materials, self.longest)
+        return self.camera_path(*ends, Reader(kept), kept.count, self.longest, merging)
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``vcm``, with the parameters of the scene's own ``path``."""
+    return like_path(scene, "vcm", **options).prepare(scene)
+
+
+mi.register_integrator("vcm", lambda props: VCM(props))

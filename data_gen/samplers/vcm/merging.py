@@ -1,0 +1,153 @@
+"""What is kept of the light paths of a pass, as a map; and merging: photons of it that are gathered at a camera path.
+
+The photons that are gathered at z, the last vertex of a camera path, are all that lie within the radius r, of whatever
+light path. Each ends a path of its own there, that of density η times as large as if z were connected to its light path
+at a given place; η = π r² N. So ``mis`` has a weight for it beside all connections of that path.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any, get_type_hints
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.vertex import SMOOTH, Materials, event_kind
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.integrator import Splatter
+from data_gen.samplers.bdpt.light_path import Seen
+from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, record_class
+from data_gen.samplers.photons.copies import Photon, faces
+from data_gen.samplers.photons.grid import Grid
+
+# Bytes of a vertex: 23 words of a record and whether it is a photon, and 12 words of a grid that is made.
+VERTEX_BYTES = (23 + 1 + 12) * 4
+
+
+@dataclass
+class Map:
+    """The vertices of light paths: that of depth d of path i has the place i ``size`` + d - 1."""
+
+    vertices: Any  # ``record_class``
+    photon: mi.UInt32  # 1 where photons are gathered
+    first: mi.UInt32  # the place of each path's first vertex
+    count: mi.UInt32  # how many vertices each path has
+
+    @classmethod
+    def empty(cls, paths: int, size: int) -> Map:
+        """Of so many light paths of at most ``size`` vertices."""
+        n, kind = paths * size, record_class(mi.variant())
+        vertices = kind(*(dr.empty(t, n) for t in get_type_hints(kind, {"mi": mi}).values()))
+        # Where nothing was kept
+        vertices.depth = dr.zeros(mi.UInt32, n)
+        first = dr.arange(mi.UInt32, paths) * dr.opaque(mi.UInt32, size)
+        found = cls(vertices, dr.zeros(mi.UInt32, n), first, dr.zeros(mi.UInt32, paths))
+        dr.make_opaque(found)
+        return found
+
+
+class Reader:
+    """The vertices of each lane's own light path, as ``bdpt`` reads them."""
+
+    def __init__(self, kept: Map):
+        self.kept = kept
+
+    def read(self, i: mi.UInt32):
+        """The record of vertex ``i``."""
+        vertices, place = self.kept.vertices, self.kept.first + i
+        return type(vertices)(*(dr.gather(type(v), v, place) for v in _values(vertices)))
+
+
+class Keeper:
+    """Splats what a light path brings to the camera, as ``bdpt`` does, and keeps its vertices in a map."""
+
+    def __init__(self, splatter: Splatter, η: mi.Float, kept: Map):
+        self.splatter, self.η, self.kept = splatter, η, kept
+
+    def start(self) -> None:
+        return None
+
+    def sees(self, state: None, seen: Seen) -> None:
+        self.splatter.sees(None, seen)
+        place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
+        for target, value in zip(_values(self.kept.vertices), _values(seen.kept), strict=True):
+            dr.scatter(target, value, place, here)
+        # As ``known`` has it
+        photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
+        dr.scatter(self.kept.photon, photon, place, here)
+
+
+@dataclass(init=False)
+class Photons:
+    """Those of a map where they are gathered within ``radius``; ``paths`` light paths have brought them."""
+
+    kept: Map
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float
+    η: mi.Float
+
+    def __init__(self, kept: Map, radius: float, paths: int):
+        self.kept, vertices = kept, kept.vertices
+        exist = (vertices.depth > 0) & (kept.photon > 0)
+        self.grid = Grid(mi.Point3f(vertices.o + vertices.d * vertices.t), exist, radius)
+        self.radius2, self.η = dr.opaque(mi.Float, radius**2), dr.opaque(mi.Float, eta(radius, paths))
+        self.K = dr.opaque(mi.Float, 1 / eta(radius, paths))
+
+
+class Merging:
+    """Merges camera paths of at most ``longest`` edges, photons and theirs together; as ``bdpt`` asks for it."""
+
+    def __init__(self, photons: Photons, materials: Materials, longest: int):
+        self.photons, self.materials, self.longest = photons, materials, longest
+
+    def leaves(self, z: Vertex, bsdf: mi.BSDFPtr, sample: mi.BSDFSample3f, end: Partial, waiting: mi.Float, joined):
+        """``end`` behind an event, with what has been ``waiting`` for a delta; and what waits for the next one."""
+        cos, delta = cosine(z.si, z.si.to_world(sample.wo)), event_kind(sample.sampled_type) != SMOOTH
+        η = dr.select(joined & self.materials.connectable(bsdf), self.photons.η, 0)
+        return mis.settled(end, waiting, cos, delta), mis.pending(η, cos, sample.pdf, delta)
+
+    def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
+        """That of the photons near to the vertex ``z``, weighted."""
+        photons, vertices = self.photons, self.photons.kept.vertices
+        active, longest = active & self.materials.connectable(bsdf), self.longest - z.depth
+
+        def one(i, near):
+            j = dr.gather(mi.UInt32, photons.grid.index, i, near)
+
+            def its(name):
+                value = getattr(vertices, name)
+                return dr.gather(type(value), value, j, near)
+
+            photon = Photon(dr.zeros(mi.Point3f), its("n"), its("d"), its("β"))
+            near = near & faces(photon, z.si) & (its("depth") <= longest)
+            C, others = self.merged(z, bsdf, photon, Partial(its("vcm"), its("vc")), near)
+            C /= 1 + others
+            return dr.select(near & dr.isfinite(dr.sum(C)), C, 0)
+
+        zero = dr.zeros(mi.Spectrum, dr.width(z.depth))
+        return photons.K * photons.grid.gather(z.si.p, photons.radius2, active, one, zero)
+
+    def merged(self, z: Vertex, bsdf: mi.BSDFPtr, photon: Photon, end: Partial, active) -> tuple[mi.Spectrum, mi.Float]:
+        """What a ``photon`` brings to the camera by ``z``, but for the kernel; ``end`` is its light path's."""
+        f, p, q = evaluate(RADIANCE, z.si, bsdf, z.si.to_local(-photon.d), active)
+        # f has a cosine; the photons lie as densely as the geometric one is large.
+        C = z.β * f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
+        return C, mis.others_merged(z.end, q, end, p, self.photons.η)
+
+
+def known(materials: Materials, η: mi.Float, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
+    """What a light path knows at a vertex of that material, where photons are gathered if it scatters widely."""
+    return mis.gathered(end, dr.select(materials.connectable(bsdf), η, 0))
+
+
+def eta(radius: float, paths: int) -> float:
+    """η of ``mis``."""
+    return float(np.pi * radius**2 * paths)
+
+
+def _values(record) -> list:
+    return [getattr(record, f.name) for f in fields(record)]

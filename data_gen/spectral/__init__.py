@@ -1,0 +1,1 @@
+"""Spectra, wavelength by wavelength: glass that disperses, and differences between neighbouring wavelengths."""

@@ -1,0 +1,207 @@
+"""Trials of samplers on a scene: small stacks, what a sample takes, and the error of an image without a reference.
+
+The error of an image x, which a bias may be part of, is the mean of (x - a)(x - b) / (m² + 1e-3), where a and b are two
+independent images that had no part in x: their noise has no mean, as in ``ngpt.measure.metrics``. They are primals of
+the sampler's other stacks and of all other unbiased samplers. The difference of two reconstructions would not do: light
+that a sampler finds in one pixel of a thousand is an outlier, which a method takes out of both.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import mitsuba as mi
+import numpy as np
+from scipy.ndimage import uniform_filter
+
+from data_gen.render import render_stack
+from data_gen.samplers import SAMPLERS, choose
+from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.load import set_film_size
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import EPSILON, trimmed_mean
+from ngpt.stack import GradientStack
+
+# Samples per pixel of each of a trial's stacks; of a sampler with batches at least two of those
+SPP = 8
+# Pixels of a pilot; larger images are rendered smaller. In images with fewer than the other, chance would choose.
+PIXELS, _LEAST_PIXELS = 1 << 16, 1 << 10
+# The worst pixels are left out, as ngpt.measure.metrics.relmse_trimmed does.
+_TRIM = 0.001
+# Seeds far from those that users take
+SEED = 0x9E3779B9
+
+
+@dataclass(frozen=True)
+class Trial:
+    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image."""
+
+    stacks: list[GradientStack]
+    seconds: float
+
+
+def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
+    """What could render the scene: the sampler that its description stands for, and then those to be compared with.
+
+    Those of them that are ``biased`` come last, if at all.
+    """
+    facts = scene_facts(scene)
+    first, _ = choose(facts)
+    if math.prod(int(n) for n in scene.sensors()[0].film().crop_size()) < _LEAST_PIXELS:
+        return [first]
+    able = [s for s in SAMPLERS.values() if s.name != first and s.tried and not s.refuses(facts)]
+    return [first] + [s.name for kind in (False, True)[: 1 + biased] for s in able if s.biased == kind]
+
+
+def try_all(
+    scene: mi.Scene,
+    samplers: Sequence[str],
+    goes_on: Callable[[], bool] = lambda: True,
+    limit: float = math.inf,
+    clock: Callable[[], float] = time.perf_counter,
+) -> dict[str, Trial]:
+    """Trials of those that can render the scene, by name, as far as there is time: each may take ``limit`` seconds of
+    the ``clock``."""
+    trials = {}
+    for name in samplers:
+        if not goes_on():
+            break
+        if (trial := try_out(scene, name, clock, limit)) is not None:
+            trials[name] = trial
+    return trials
+
+
+def try_out(
+    scene: mi.Scene, sampler: str, clock: Callable[[], float] = time.perf_counter, limit: float = math.inf
+) -> Trial | None:
+    """Four small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
+    expected to take longer than the ``limit``."""
+    batch = SAMPLERS[sampler].batch
+    spp, seed = max(SPP, 2 * batch), SEED + 8 * list(SAMPLERS).index(sampler)
+    # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
+    other = batch or 2 * SPP
+    try:
+        render_stack(scene, 1, seed, sampler)  # compiles
+    except NgptError:
+        return None
+    if limit < math.inf:
+        start = clock()
+        render_stack(scene, max(1, batch), seed, sampler)
+        if (4 * spp + 2 * other) / max(1, batch) * (clock() - start) > limit:
+            return None
+
+    def timed(n: int, seed: int) -> tuple[GradientStack, float]:
+        start = clock()
+        return render_stack(scene, n, seed, sampler), clock() - start
+
+    made, others = [], []
+    for i in range(4):
+        made.append(timed(spp, seed + i))
+        if i % 2:
+            others.append(timed(other, seed + 4 + i)[1])
+    seconds = statistics.median(took for _, took in made)
+    each = (statistics.median(others) - seconds) / (other - spp)
+    return Trial([stack for stack, _ in made], max(each, 0.2 * seconds / spp))
+
+
+@dataclass(frozen=True)
+class Witnesses:
+    """The primals of trials, by which images of each of the samplers are judged.
+
+    ``primals``  four of each sampler, by name
+    ``noise``    of one of them
+    ``scale``    what errors are relative to: of all samplers, those with little noise count most
+    """
+
+    primals: dict[str, list[np.ndarray]]
+    noise: dict[str, float]
+    scale: np.ndarray
+
+    @classmethod
+    def of(cls, trials: dict[str, Trial]) -> Witnesses:
+        primals = {name: [stack["primal"].astype(np.float64) for stack in t.stacks] for name, t in trials.items()}
+        middle = sum(sum(images) / 4 for images in primals.values()) / len(primals)
+        noise = {name: max(noise_of(*images[:2], middle), 1e-12) for name, images in primals.items()}
+        return cls(primals, noise, mean_of({name: sum(images) / 4 for name, images in primals.items()}, noise))
+
+    def against(self, sampler: str, half: int) -> tuple[np.ndarray, np.ndarray]:
+        """Two independent images that the sampler's other half has no part in: that ``half`` of its own, and all of
+        the others that are unbiased. Nothing but its own judges it where there are none."""
+        a, b = (self._side(sampler, half, i) for i in range(2))
+        return a, b
+
+    def _side(self, sampler: str, half: int, i: int) -> np.ndarray:
+        images = {n: (four[2 * i] + four[2 * i + 1]) / 2 for n, four in self.primals.items() if n != sampler}
+        weights = {n: self.noise[n] / 2 for n in images}
+        images[sampler], weights[sampler] = self.primals[sampler][2 * half + i], self.noise[sampler]
+        fair = [n for n in images if not SAMPLERS[n].biased] or list(images)
+        return mean_of({n: images[n] for n in fair}, weights)
+
+    def error(self, sampler: str, halves: Sequence[Sequence[np.ndarray]]) -> float:
+        """The error of independent images by ``sampler``, some of either of its halves: at least what those of one
+        differ by, which is sure, where noise of the witnesses hides the rest."""
+        judged = [
+            error_of(image, *self.against(sampler, 1 - half), self.scale)
+            for half, images in enumerate(halves)
+            for image in images
+        ]
+        pairs = halves if len(halves[0]) > 1 else [[images[0] for images in halves]]
+        return max(statistics.mean(judged), statistics.mean(noise_of(*p, self.scale) for p in pairs), 1e-9)
+
+    def doubt(self, sampler: str, image: np.ndarray) -> float:
+        """The standard error of the error of an ``image`` of the first half."""
+        return doubt_of(image, *self.against(sampler, 1), self.scale)
+
+
+def mean_of(images: dict[str, np.ndarray], noise: dict[str, float]) -> np.ndarray:
+    """Of images by name, weighted by 1 / their noise."""
+    weights = {name: 1 / noise[name] for name in images}
+    return sum(weights[name] * image for name, image in images.items()) / sum(weights.values())
+
+
+def noise_of(a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
+    """The relMSE of each of two independent unbiased images, by their difference; trimmed as the metric is."""
+    errors = np.square(a - b) / 2 / _denominator(scale)
+    return trimmed_mean(errors, errors, _TRIM)
+
+
+def error_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
+    """The relMSE of an image by two independent unbiased ones; trimmed as the metric is."""
+    under = _denominator(scale)
+    return trimmed_mean((x - a) * (x - b) / under, np.square(x - (a + b) / 2) / under, _TRIM)
+
+
+def doubt_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> float:
+    """The standard error of ``error_of``, by how much pixels differ."""
+    values = ((x - a) * (x - b) / _denominator(scale)).mean(axis=-1)
+    return float(values.std()) / math.sqrt(values.size)
+
+
+def _denominator(scale: np.ndarray) -> np.ndarray:
+    """m² + 1e-3 of an image that has noise itself, which the mean over 7x7 pixels lessens."""
+    return uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON
+
+
+@contextmanager
+def at_most(scene: mi.Scene, pixels: int):
+    """While in it, images of the scene have no more ``pixels``; yields how many times more they have without it.
+
+    A cropped film stays as it is: its window could not be set again.
+    """
+    film = scene.sensors()[0].film()
+    size, window = (tuple(int(n) for n in numbers) for numbers in (film.size(), film.crop_size()))
+    shrink = math.sqrt(pixels / (size[0] * size[1]))
+    if shrink >= 1 or size != window:
+        yield 1.0
+        return
+    small = tuple(max(1, round(n * shrink)) for n in size)
+    set_film_size(scene, small)
+    try:
+        yield size[0] * size[1] / (small[0] * small[1])
+    finally:
+        set_film_size(scene, size)
