@@ -226,7 +226,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     ]
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _GVPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -238,6 +238,7 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEA
         "photons.ppm",
         "photons.gpm",
         "photons.vpm",
+        "photons.gvpm",
         "photons.bre",
         "photons.gbre",
         "photons.beams",
@@ -359,6 +360,18 @@ for _sampler in (
         batch=1,
         biased=True,
         module=_VPM,
+    ),
+    Sampler(
+        "gvpm",
+        "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
+        _from_module(_GVPM),
+        lambda facts: _refused_but_for_media(facts, "gvpm"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVPM,
     ),
     Sampler(
         "bre",
