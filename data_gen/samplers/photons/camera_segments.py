@@ -17,7 +17,7 @@ import mitsuba as mi
 
 from data_gen.paths import media, segments
 from data_gen.paths.vertex import Materials
-from data_gen.samplers.photons.camera import Path, scattered
+from data_gen.samplers.photons.camera import Level, Path, scattered
 from data_gen.samplers.photons.fog import Fog
 
 
@@ -40,13 +40,9 @@ class Flight(Path):
 
 
 @dataclass
-class FlightLevel:
-    """Base paths behind ``depth`` segments, of the camera samples ``lanes``, and their offset paths."""
+class FlightLevel(Level):
+    """Paths behind ``depth`` segments."""
 
-    depth: int
-    lanes: mi.UInt32
-    base: Flight
-    offsets: list[Flight]
     camera: tuple  # the base paths' first rays, and their importance, of all camera samples
 
 
@@ -68,7 +64,8 @@ def levels_by_segments(
     paths, channel, numbers = frozen(begun, scene, fog, random, rays, first_surface, hide_emitters, fixed=True)
     while True:
         dr.eval(paths, channel, numbers, lanes, η)
-        yield FlightLevel(depth, lanes, paths[0], paths[1:], rays[0][:2])
+        depths = dr.opaque(mi.UInt32, depth, dr.width(lanes))
+        yield FlightLevel(depth == 1, lanes, depths, paths[0], paths[1:], rays[0][:2])
         if depth >= max_depth:
             return
         paths, η, numbers = frozen(onward, materials, paths, η, stream(numbers), depth >= rr_depth)

@@ -34,7 +34,8 @@ from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons import shift
 from data_gen.samplers.photons.bre import BALL, BRE, seen_along
-from data_gen.samplers.photons.camera_in_media import Piece, PieceLevel, ends, levels_in_media
+from data_gen.samplers.photons.camera import Level
+from data_gen.samplers.photons.camera_in_media import Piece, ends, levels_in_media
 from data_gen.samplers.photons.copies import Photon, copy_in_medium, photon_of
 from data_gen.samplers.photons.differences import (
     PAIR_BYTES,
@@ -53,8 +54,8 @@ from data_gen.samplers.photons.ppm import Passes
 from data_gen.samplers.photons.radius import shrunk
 from ngpt.errors import NgptError
 
-# Of a camera sample beside pairs: five pieces of paths and what they end at, and as many sums
-PATHS_BYTES = 2048
+# Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
+PATHS_BYTES = 4096
 
 
 @dataclass
@@ -216,7 +217,7 @@ class GBRE(BRE):
         paths = passes.materials, random, rays, self.first_surface, self.hide_emitters
         return levels_in_media(passes.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
-    def met(self, passes: Passes, level: PieceLevel, sums: list) -> mi.Spectrum:
+    def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
         if not level.first:
             pieces = level.depth, level.base, level.offsets
             add_to(sums, level.lanes, passes.frozen(emitted_later, passes.scene, self.fog, *pieces))
@@ -228,7 +229,7 @@ class GBRE(BRE):
         ray = mi.Ray3f(base.ray)
         return base.β * self.lamps_in_fog(scene, self.fog.media, ray, self.fog.within, mi.UInt32(0))
 
-    def parts(self, passes: Passes, near, level: PieceLevel, most: int) -> Iterator[list]:
+    def parts(self, passes: Passes, near, level: Level, most: int) -> Iterator[list]:
         longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
         base, *offsets = passes.frozen(ends, self.fog, level.base, level.offsets)
         dr.eval(longest, base, offsets)

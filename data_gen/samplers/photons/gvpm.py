@@ -137,7 +137,7 @@ class GVPM(VPM):
         return levels_by_segments(passes.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
     def met(self, passes: Passes, level: FlightLevel, sums: list) -> mi.Spectrum:
-        if level.depth > 1:
+        if not level.first:
             add_to(sums, level.lanes, passes.frozen(emitted, passes.scene, level.base, level.offsets))
             return mi.Spectrum(0)
         return passes.frozen(self.seen_directly, passes.scene, *level.camera, fixed=True)
@@ -147,13 +147,11 @@ class GVPM(VPM):
         return importance * self.lamps_in_fog(scene, self.fog.media, ray, self.fog.within, mi.UInt32(0))
 
     def parts(self, passes: Passes, near: Both, level: FlightLevel, most: int) -> Iterator[list]:
-        if level.depth < self.max_depth:
-            longest = min(self.max_depth - level.depth, 0xFFFFFFFF)
-            lengths = dr.opaque(mi.UInt32, longest, dr.width(level.lanes))
-            base, *offsets = passes.frozen(ends, level.base, level.offsets)
-            dr.eval(base, offsets)
-            yield from differences(passes, near.on_surfaces, base, offsets, lengths, most)
-            yield from differences(passes, near.in_media, level.base, level.offsets, lengths, most)
+        longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
+        base, *offsets = passes.frozen(ends, level.base, level.offsets)
+        dr.eval(longest, base, offsets)
+        yield from differences(passes, near.on_surfaces, base, offsets, longest, most)
+        yield from differences(passes, near.in_media, level.base, level.offsets, longest, most)
 
 
 def ends(base: Flight, offsets: list[Flight]) -> list[Path]:
