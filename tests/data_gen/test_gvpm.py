@@ -73,7 +73,8 @@ def test_a_wrong_jacobian_in_balls_is_found(renderer, monkeypatch):
         assert_no_bias(stacks, 4)
 
 
-@pytest.mark.parametrize("name", ["nested", pytest.param("milk", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nested", "milk"])
 def test_the_primal_is_that_of_vpm(renderer, name):
     """The same camera paths and photons; Russian roulette alone looks at five paths instead of one."""
 
