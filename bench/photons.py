@@ -188,7 +188,7 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
 
 
 def table(result: dict) -> str:
-    """Two tables in Markdown: errors at equal time, and what gradients and each of their samples are worth."""
+    """Two tables in Markdown: errors; and those of photons alone, in brackets with OIDN, over their twins'."""
     scenes = result["scenes"]
     lines = ["| method | " + " | ".join(scenes) + " |", "|---|" + "--:|" * len(scenes)]
     methods = dict.fromkeys([*METHODS_IN_MEDIA.items(), *METHODS.items()])
@@ -203,16 +203,23 @@ def table(result: dict) -> str:
         lines.append(f"| {title}{'' if method == 'primal' else f' and {TITLES[method]}'} | {' | '.join(cells)} |")
     halves = (f"{row['error of half a reference']:.2g}, `{row['reference']}`" for row in scenes.values())
     lines += ["| half a reference | " + " | ".join(halves) + " |", ""]
-    lines += ["| scene | photons | blurred in | passes | error over that of the twin and `l1` | with OIDN | cost |"]
-    lines += ["|---|---|--:|--:|--:|--:|--:|"]
+    lines += [
+        "| scene | photons | blurred in | passes | cost of a pass | `l1` | `wcv` |",
+        "|---|---|--:|--:|--:|--:|--:|",
+    ]
     for name, row in scenes.items():
         for sampler, (twin, dimensions) in TWINS.items():
             if sampler in row and twin in row:
                 one, other = row[sampler], row[twin]
-                ratios = (f"{one[m] / other['l1']:.2g}" for m in ("primal", "oidn"))
+                gains = (f"{one['primal'] / other[m]:.2g} ({one['oidn'] / other[m]:.2g})" for m in ("l1", "wcv"))
                 cost = other["milliseconds"] / one["milliseconds"]
-                counts = f"{one['spp']}, {other['spp']}"
-                cells = [f"`{sampler}`, `{twin}`", f"{dimensions}D", counts, *ratios, f"{cost:.2g}"]
+                cells = (
+                    f"`{sampler}`, `{twin}`",
+                    f"{dimensions}D",
+                    f"{one['spp']}, {other['spp']}",
+                    f"{cost:.2g}",
+                    *gains,
+                )
                 lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
 
