@@ -38,6 +38,7 @@ from data_gen.samplers.photons.gbre import Beside, Both, beside_of
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.pairs import Pairs
 from data_gen.samplers.photons.planes import (
+    PLANE_BYTES,
     AcrossPlanes,
     Crossing,
     crossing,
@@ -47,6 +48,7 @@ from data_gen.samplers.photons.planes import (
     scattered_of,
 )
 from data_gen.samplers.photons.ppm import Passes
+from data_gen.samplers.photons.trace import VERTICES_PER_PATH
 
 
 @dataclass
@@ -97,16 +99,9 @@ class NearPlanes:
         point, place = (dr.gather(mi.UInt32, index, some) for index in (pairs.point, pairs.place))
         A, B, plane = beside_of([base], None, point), beside_of(offsets, which, point), self.planes.plane(place)
         at = crossing(plane.a, plane.d, plane.e, A.o, A.d)
-        e, there = turned(plane.a, plane.d, plane.e, at, B.o, B.d)
-        good = (there.s > 0) & (there.s < plane.length) & (there.t > 0)
-        # The phase function where the edge scatters, from either direction to the other
-        phase, seen = plane.medium.phase_function(), seen_along(mi.Ray3f(plane.a, plane.d), plane.medium)
-        (f, p), (f1, p1) = (phase.eval_pdf(mi.PhaseFunctionContext(), seen, to, good) for to in (plane.e, e))
-        J = shift.jacobian_of_planes(at.t, at.volume, there.t, there.volume)
-        plane.Φ *= f1 / f
-        plane.e = e
-        C1 = self.light(plane, there, B, good) * (J / dr.abs(there.volume))
-        return difference(dr.gather(mi.Spectrum, C, some), C1, J * p1 / p)
+        moved, there, per_volume, r, good = copied(plane, at, B)
+        C1 = self.light(moved, there, B, good) * per_volume
+        return difference(dr.gather(mi.Spectrum, C, some), C1, r)
 
     def light(self, plane, at: Crossing, ray: Beside, active) -> mi.Spectrum:
         """What a plane brings to a ray, times |d · (e × w)|."""
@@ -116,11 +111,20 @@ class NearPlanes:
         return ray.light(photon, at.u, active)
 
 
-def turned(a, d, e, at: Crossing, o, w) -> tuple:
-    """(e', where the line from ``o`` along ``w`` meets the copy) of a plane that turns up to the distance u."""
-    y = o + w * at.u
-    e1, s, t = shift.about(a, d, e, y)
-    return e1, Crossing(s, t, at.u, dr.dot(d, dr.cross(e1, w)))
+def copied(plane, at: Crossing, B: Beside) -> tuple:
+    """The copy of a ``plane``, met ``at`` a place, where B meets it, J / |d · (e' × w')|, r, and whether it exists.
+
+    Whether anything is in its way is not known yet.
+    """
+    e, s, t = shift.about(plane.a, plane.d, plane.e, B.at(at.u))
+    there = Crossing(s, t, at.u, dr.dot(plane.d, dr.cross(e, B.d)))
+    J = shift.jacobian_of_planes(at.t, at.volume, t, there.volume)
+    # The phase function where the edge scatters, from either direction to the other
+    phase, seen = plane.medium.phase_function(), seen_along(mi.Ray3f(plane.a, plane.d), plane.medium)
+    (f, p), (f1, p1) = (phase.eval_pdf(mi.PhaseFunctionContext(), seen, to) for to in (plane.e, e))
+    known = plane.a, plane.d, e, plane.length, plane.Φ * (f1 / f), plane.σ, plane.medium, plane.depth
+    good = B.alive & (at.u < B.length) & (s > 0) & (s < plane.length) & (t > 0)
+    return type(plane)(*known), there, J / dr.abs(there.volume), J * p1 / p, good
 
 
 class GPLANES(GBEAMS):
@@ -130,6 +134,7 @@ class GPLANES(GBEAMS):
     """
 
     name = "gplanes"
+    map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)

@@ -45,6 +45,8 @@ from ngpt.errors import NgptError
 # Light paths of a map that are swept, and the most
 SWEPT = 64
 MOST = 1 << 16
+# Of a plane, and of the edge of a map that it may be swept from
+PLANE_BYTES = (18 + 3) * 4
 
 
 @cache
@@ -174,7 +176,7 @@ def planes_of(passes: Passes, photons, paths: int) -> AcrossPlanes:
     """
     integrator, kind = passes.integrator, planes_class(mi.variant())
     lanes = len(photons) // VERTICES_PER_PATH
-    k = max(lanes // integrator.planes, 1)
+    k = (lanes + integrator.planes - 1) // integrator.planes
     taken = (lanes + k - 1) // k
     slot = dr.arange(mi.UInt32, taken * VERTICES_PER_PATH)
     slot += (slot // VERTICES_PER_PATH) * ((k - 1) * VERTICES_PER_PATH)
@@ -229,6 +231,7 @@ class PLANES(BEAMS):
     """
 
     name = "planes"
+    map_bytes = BEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
