@@ -9,7 +9,7 @@ from functools import partial
 import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import _scale, fog
+from data_gen_scenes import fog
 from test_beams import alike
 from unbiased import REFERENCES, load, render_ours
 
@@ -33,8 +33,8 @@ def test_lines_meet_planes(renderer):
     assert known.sum() > 150 and np.allclose((a + d * s + e * t)[:, known], (o + w * u)[:, known], atol=1e-3)
 
 
-def open_air(max_depth=6):
-    """A lamp in a medium without end, around a denser one; and a black ball and a black board, to which no light ends.
+def black_room(max_depth=6):
+    """A lamp in a medium around a denser one, and a black ball, within black walls.
 
     What a lamp sends into media is swept by one edge, all else by planes.
     """
@@ -54,7 +54,7 @@ def open_air(max_depth=6):
         "lamp": {"type": "point", "position": [0.5, 0.8, -0.5], "intensity": _rgb(5, 5, 5)},
         "core": _sphere([-0.3, 0.0, 0.1], 0.5, {"type": "null"}) | {"interior": core, "exterior": mist},
         "ball": _sphere([0.5, 0.3, 0.2], 0.3, _diffuse(0, 0, 0)),
-        "board": {"type": "rectangle", "to_world": _scale(0.2), "bsdf": _diffuse(0, 0, 0)},
+        "walls": _sphere([0.0, 0.0, 0.0], 3.5, _diffuse(0, 0, 0)),
     }
 
 
@@ -63,10 +63,10 @@ def light_of_planes(renderer, monkeypatch, spp=4, batches=8, **options):
     from data_gen.samplers.photons.beams import BEAMS
 
     monkeypatch.setattr(BEAMS, "of_map", lambda *_: iter(()))
-    ours = render_ours(load(renderer, open_air, (16, 16)), "planes", batches=batches, spp=spp, photons=2, **options)
+    ours = render_ours(load(renderer, black_room, (16, 16)), "planes", batches=batches, spp=spp, photons=2, **options)
     long, short = (
         render_ours(
-            load(renderer, partial(open_air, depth), (16, 16)), "primal", 16, 128, seed=REFERENCES + 100 * depth
+            load(renderer, partial(black_room, depth), (16, 16)), "primal", 16, 128, seed=REFERENCES + 100 * depth
         )
         for depth in (6, 2)
     )
@@ -122,7 +122,7 @@ def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, monkeypatch
     from data_gen.samplers.photons.beams import BEAMS
 
     monkeypatch.setattr(BEAMS, "of_map", lambda *_: iter(()))
-    scenes = [load(renderer, partial(open_air, depth), (8, 8)) for depth in (2, 3)]
+    scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]
     light = [render_stack(scene, 1, 0, "planes")["primal"].sum() for scene in scenes]
     assert light[0] == 0 < light[1]
 
