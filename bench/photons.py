@@ -51,11 +51,13 @@ METHODS_IN_MEDIA = {
     "gbre": ("primal", "l1", "wcv"),
     "beams": ("primal", "oidn"),
     "gbeams": ("primal", "l1", "wcv"),
+    "planes": ("primal", "oidn"),
+    "gplanes": ("primal", "l1", "wcv"),
     "gpt": ("l1", "wcv"),
     "primal": ("primal", "oidn"),
 }
 # Each photon sampler, its gradient twin, and the dimensions in which it blurs, in media
-TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1)}
+TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1), "planes": ("gplanes", 0)}
 PHOTONS = (*TWINS, *(twin for twin, _ in TWINS.values()))
 # Samplers with one sample of each pixel in a pass, or a few
 IN_PASSES = (*PHOTONS, "bdpt", "vcm")
