@@ -18,10 +18,10 @@ So of the nearest pixel all is taken over, what lies beside it moved by a whole 
 found by this frame's candidate, then, straight, and wrapped: their MIS weights sum to 1, whatever m is. Confidence is
 handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; gradient-domain ReSTIR 2025, section 4.3.1]
 
-That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two scenes,
-and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains`` of a pixel
-know nothing of each other. One chain has no variance: its frames are correlated, over ``cap`` of them, and must
-not be put into a film as if they were samples. Several have the variance over chains.
+That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
+scenes, and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains``
+of a pixel know nothing of each other. One chain has no variance: its frames are correlated, over ``cap`` of them, and
+must not be put into a film as if they were samples. Several have the variance over chains.
 """
 
 from __future__ import annotations
@@ -118,8 +118,8 @@ class History:
     ) -> Frame:
         """Renders a frame.
 
-        ``stage`` is the scene as it is now, where more than the camera has changed: another scene than that of the frame
-        before, which is still as it was then. None: the same scene.
+        ``stage`` is the scene as it is now, where more than the camera has changed: another scene than that of the
+        frame before, which is still as it was then. None: the same scene.
 
         ``motion`` (H, W, 2) is that of ``data_gen.frames.motion``, NaN where there is no history; None: nothing moves.
         ``depth`` (H, W) tells which pixel of a pair is the nearer one, whose motion is that of both.
