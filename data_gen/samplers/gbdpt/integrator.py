@@ -12,12 +12,13 @@ its copy share one weight over all strategies of both: see ``pairs``.
 
 The map: mirrors, clear glass and holes in front of the camera are replayed; the first vertex behind them is the copy's
 own, and from there it goes straight to the next vertex of the path, which both share with all further ones. It is
-rejected, alike by all strategies, where one of these three vertices is not connectable, where a mirror leaves one of
-them, or where the copy is occluded or black. What is completed by connecting the camera path's first vertices is
+rejected, alike by all strategies, where one of these three vertices is not connectable, or where the copy is occluded
+or black. What is completed by connecting the camera path's first vertices is
 shifted in ``offset_path``; what ends by connecting a light path to the camera, in ``light_shift``.
 
-What reaches the first vertex through mirrors or glass is rejected, but for light paths that end there: of those the
-copies go through the same events to the vertex before them, in a kernel of their own.
+Between that first vertex and the next one mirrors and glass may lie: then the copy walks through the same events to the
+same next vertex. Camera paths do so in a second kernel (``chain_shift``), light paths that end at the first vertex in a
+third and fourth (``light_shift``), each strategy with weights of its own.
 
 [Manzi et al. 2015, "Gradient-Domain Bidirectional Path Tracing"; Hua et al. 2019, "A Survey on Gradient-Domain
 Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and Merging", eq. 14-15]
@@ -55,7 +56,7 @@ from data_gen.samplers.gbdpt.chain_shift import along, matters, no_chain, straig
 from data_gen.samplers.gbdpt.light_again import Marker, Unseen, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
-from data_gen.samplers.gbdpt.pairs import difference_of_one, weighted
+from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
 
 
 class GBDPT(BDPT):
@@ -77,7 +78,7 @@ class GBDPT(BDPT):
         materials = Materials(scene, self.roughness_threshold)
         longest = min(self.max_depth, self.joined_depth)
         lights = LightEnds(scene, "gbdpt")
-        plan = Plan(lights, materials, self.max_depth, self.rr_depth, longest)
+        plan = Plan(lights, materials, self.max_depth, self.rr_depth, longest, difference)
         return lambda camera, film: self.gradient_pass(scene, plan, camera, film)
 
     def gradient_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
