@@ -88,6 +88,7 @@ class GBDPT(BDPT):
         splats = {name: film.splats(name) for name in ("primal", *SHIFTS)} if plan.joins else {}
         marker = Marker(splats["primal"], ray, importance) if plan.joins else None
         L, Le, Δ, marks, bent = self.both_paths(scene, plan, camera, marker)
+        Le = self.emission_in_pixel(scene, camera, Le)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         # One kernel for all of it: each value read on its own would trace the paths again.
