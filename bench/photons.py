@@ -174,11 +174,12 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
     counts = {sampler: (3, 9) if sampler in IN_PASSES else (16, 64) for sampler in samplers}
     found: dict[str, tuple[float, float]] = {}
     for turn in range(1 + rounds):
-        for sampler, (few, many) in counts.items():
+        for sampler, (few, many) in list(counts.items()):
             try:
                 short = cost(sampler, few)
             except NgptError as refusal:
                 print(refusal)
+                del counts[sampler]
                 continue
             # The first turn compiles the kernels.
             if turn:
