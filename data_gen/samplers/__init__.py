@@ -236,6 +236,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _PPM,
     _GPM,
     _VPM,
+    _GVPM,
     _BRE,
     _GBRE,
     _BEAMS,
@@ -256,6 +257,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "photons.ppm",
         "photons.gpm",
         "photons.vpm",
+        "photons.gvpm",
         "photons.bre",
         "photons.gbre",
         "photons.beams",
@@ -382,6 +384,18 @@ for _sampler in (
         module=_VPM,
     ),
     Sampler(
+        "gvpm",
+        "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
+        _from_module(_GVPM),
+        lambda facts: _refused_but_for_media(facts, "gvpm"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVPM,
+    ),
+    Sampler(
         "bre",
         "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
         _from_module(_BRE),
@@ -485,7 +499,7 @@ for _sampler in (
 
 FRAME_SAMPLERS["restir"] = FrameSampler(
     "restir",
-    "gradients of paths that are reused from frame to frame (sequences whose camera alone moves)",
+    "gradients of paths that are reused from frame to frame (sequences)",
     _from_module("data_gen.samplers.restir.sampler"),
     lambda facts: _refused_but_for_surfaces(facts, "restir"),
     {

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.manifold import event
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
+from data_gen.samplers.gbdpt.pairs import difference
 
 
 @dataclass
@@ -24,6 +27,12 @@ class Plan:
     max_depth: int
     rr_depth: int
     longest: int  # the number of edges up to which paths are found from both ends
+    pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
+
+    @property
+    def joins(self) -> bool:
+        """Whether there are paths from lights."""
+        return self.longest > 1 and self.lights.emitters is not None
 
 
 @dataclass
@@ -35,6 +44,7 @@ class Step:
     # A sampled point of an emitter
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
+    shared: mi.Bool  # Δ has a share in what is completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
     e_light: mi.Float
@@ -48,6 +58,7 @@ class Step:
     wo: mi.Vector3f
     d: mi.Vector3f
     kind: mi.UInt32
+    event: mi.UInt32  # mirror, glass or hole, of ``manifold``
     p: mi.Float
     q: mi.Float
     f_p: mi.Spectrum  # f / p, survival included
@@ -122,6 +133,7 @@ def base_step(
         connectable=active & materials.connectable(bsdf),
         light=light,
         weight=weight,
+        shared=mi.Bool(True),
         C_light=C,
         others_light=others,
         e_light=e,
@@ -134,6 +146,7 @@ def base_step(
         wo=sample.wo,
         d=d,
         kind=kind,
+        event=event(sample.sampled_type),
         p=sample.pdf,
         q=q_next,
         f_p=f_p * survival,
