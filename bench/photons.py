@@ -39,6 +39,8 @@ METHODS = {
     "primal": ("oidn",),
     "bdpt": ("primal", "oidn"),
     "vcm": ("primal", "oidn"),
+    "gvcm": ("primal", "l1", "wcv"),
+    "gbdpt": ("l1", "wcv"),
 }
 METHODS_IN_MEDIA = {
     "bre": ("primal", "oidn"),
@@ -51,7 +53,7 @@ METHODS_IN_MEDIA = {
 }
 PHOTONS = ("ppm", "gpm", "vpm", "bre", "gbre", "beams", "gbeams")
 # Samplers with one sample of each pixel in a pass, or a few
-IN_PASSES = (*PHOTONS, "bdpt", "vcm")
+IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
 DEFAULT = (*PHOTONS, "gpt", "primal")
 SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
@@ -69,7 +71,7 @@ def main() -> None:
     parser.add_argument("--reference-by", metavar="SAMPLER", help="default: ppm, or bre in media")
     parser.add_argument("--samplers", nargs="+", default=DEFAULT, help="default: %(default)s")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
-    parser.add_argument("--vcm-radius", type=float, help="that of vcm (default: its own)")
+    parser.add_argument("--vcm-radius", type=float, help="that of vcm and gvcm (default: their own)")
     parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
     parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
@@ -121,7 +123,7 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
         if sampler not in args.samplers:
             continue
         options = {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
-        if sampler == "vcm" and args.vcm_radius:
+        if sampler in ("vcm", "gvcm") and args.vcm_radius:
             options = {"radius": args.vcm_radius}
         spp = samples_within(scene, sampler, args.seconds, options)
         stack = render_stack(scene, spp, 0, sampler, **options)

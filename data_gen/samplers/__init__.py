@@ -226,7 +226,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     ]
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _PRIMAL = (
+_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _GVCM, _PRIMAL = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -243,6 +243,7 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEA
         "photons.beams",
         "photons.gbeams",
         "vcm.integrator",
+        "vcm.gvcm",
         "primal",
     )
 )
@@ -250,6 +251,12 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEA
 _PHOTON_OPTIONS = {
     "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (3)",
     "photons": "light paths of a pass for each pixel (1)",
+    "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+}
+
+_VCM_OPTIONS = {
+    "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
+    "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
     "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
 }
 
@@ -416,16 +423,24 @@ for _sampler in (
         _from_module(_VCM),
         lambda facts: _refused_but_for_surfaces(facts, "vcm"),
         _notes_on_vcm,
-        {
-            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
-            "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
-            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
-        },
+        _VCM_OPTIONS,
         gradients=False,
         tried=False,
         batch=1,
         biased=True,
         module=_VCM,
+    ),
+    Sampler(
+        "gvcm",
+        "gradients of paths from both ends, joined and merged with photons (hidden lamps and all caustics)",
+        _from_module(_GVCM),
+        lambda facts: _refused_but_for_surfaces(facts, "gvcm"),
+        _notes_on_vcm,
+        _VCM_OPTIONS,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVCM,
     ),
     Sampler(
         "primal",

@@ -112,7 +112,7 @@ class GBDPT(BDPT):
         dr.eval(splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats, bent=True))
 
     @dr.syntax
-    def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count):
+    def shifted_camera_path(self, scene, plan, camera, random, ray, importance, shifted, kept, count, merging=None):
         """``BDPT.camera_path``, and Δ of its four offset paths."""
         ray = mi.Ray3f(ray)
         si = self.first_hit(scene, ray).compute_surface_interaction(ray)
@@ -138,6 +138,10 @@ class GBDPT(BDPT):
                 u = random.next_1d()
                 L, Δ = self.shifted_connection(scene, plan, step, joins, kept, count, ray, u, L, offsets)
                 offsets = with_differences(offsets, Δ)
+            if dr.hint(merging is not None, mode="scalar"):
+                gathers = active & scatters_smoothly(si.bsdf()) & step.joins
+                light, Δ = merging.differences(z, si.bsdf(), gathers, offsets)
+                L, offsets = L + light, with_differences(offsets, Δ)
             offsets = take_step(scene, plan, step, offsets)
             si, β, end = step.x1, step.β1, step.end1
             depth += 1
