@@ -97,12 +97,10 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             )
         if able := _commands(_JOINED, facts):
             lines.append(
-                f"glass in rooms where other light is hard to find, too: photons and paths from both ends in one: {able}"
+                f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
-        lines.append(
-            "small lights in media: paths find their beams with less noise than photons: `--sampler gpt`"
-        )
+        lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
         lines.append("holes: features are those of what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):

@@ -159,11 +159,11 @@ def taken_all(values, taken, dr):
     return found
 
 
+@np.errstate(divide="ignore", invalid="ignore")
 def check_pairs(copies, t):
     """Δ(y) = -Δ(x), where r r' = 1: at a vertex of the copy's own, and at the one where it joins."""
     import drjit as dr
 
-    from data_gen.samplers.bdpt.vertex import record_class
     from data_gen.samplers.vcm.differences import ShiftedMerging
     from data_gen.samplers.vcm.merging import Map, Photons
 

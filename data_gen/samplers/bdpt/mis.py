@@ -54,9 +54,7 @@ def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Part
     return Partial(dr.rcp(e * cos), dr.select(delta, 0, dr.rcp(e * p * cos)))
 
 
-def leave(
-    end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0
-) -> Partial:
+def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0) -> Partial:
     """Behind an event that was sampled with density ``p``; camera paths leave a vertex that merges with ``η``."""
     vc = dr.select(delta, (end.vc + end.waiting) * cos, cos / p * (end.vcm + end.vc * q))
     return Partial(dr.select(delta, 0, dr.rcp(p)), vc, dr.select(delta, 0, mi.Float(η) * (cos / p)))

@@ -31,12 +31,11 @@ from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.integrator import GBDPT
 from data_gen.samplers.gbdpt.light_again import Marker, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
-from data_gen.samplers.photons.radius import shrunk
 from data_gen.samplers.vcm.differences import ShiftedMerging
 from data_gen.samplers.vcm.integrator import VCM, Passes
-from data_gen.samplers.vcm.merging import Map, Photons, Reader, eta
+from data_gen.samplers.vcm.merging import Photons, Reader
 
-# Of a camera sample beside that of ``vcm``: the rays of five paths, four Δ, and what its light path leaves to be shifted
+# Of a camera sample beside that of ``vcm``: the rays of five paths, four Δ, and what of its light path is shifted
 OFFSETS_BYTES = 1024
 
 
@@ -63,10 +62,12 @@ class GVCM(VCM):
         dr.eval(rays)
         (ray, importance, _), *shifted = rays
         values = frozen(features, scene, camera.sensor, camera.random.clone(), ray, fixed=True)
-        photons, ends = None, (scene, passes.lights, passes.materials, camera.sensor)
+        ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        photons = None
         if self.vertices and passes.lights.emitters is not None:
-            random, photons = self.light_paths(passes, camera, random, ray, importance, film)
-        L, Le, Δ = frozen(self.seen_shifted, *ends, camera.lens, random, rays, photons, fixed=True)
+            random, photons, marks = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
+            self.shift_splats(passes, camera, film, marks, photons.η)
+        L, Le, Δ = frozen(self.seen_shifted, *ends, random, rays, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         Δ = [to_rgb(one, ray.wavelengths) for one in Δ]
         dr.eval(values, Δ)
@@ -74,38 +75,26 @@ class GVCM(VCM):
         for name, value, (_, _, inside) in zip(SHIFTS, Δ, shifted, strict=True):
             film.put(name, value, inside)
 
-    def light_paths(self, passes: Passes, camera: CameraSamples, random, ray, importance, film: GradientFilm) -> tuple:
-        """Light paths, and what of them ends at the camera, with its shifts; random numbers to go on by, and photons."""
-        frozen, n = passes.frozen, dr.width(camera.pixel)
-        ends = passes.scene, passes.lights, passes.materials, camera.sensor
-        radius, splats = self.radius * passes.width * shrunk(camera.first), film.splats("primal")
-        kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
-        sums = splats.sums, splats.lost
-        dr.make_opaque(sums)
-        numbers, sums, kept, marks = frozen(
-            self.lit, *ends, camera.lens, random, ray, importance, kept, η, sums, fixed=True
-        )
-        dr.eval(numbers, sums, kept, marks)
-        splats.sums, splats.lost = sums
+    def shift_splats(self, passes: Passes, camera: CameraSamples, film: GradientFilm, marks: mi.UInt64, η) -> None:
+        """Splats the differences of light paths that end at ``marked`` vertices, as ``gbdpt`` does."""
         lanes, depths = marked(marks, self.longest)
-        differences = {name: film.splats(name) for name in SHIFTS}
-        for bent in (False, True):
+        ends = passes.scene, passes.lights, passes.materials, camera.sensor
+        splats = [film.splats(name) for name in SHIFTS]
+        for shift in (self.straight_splats, self.bent_splats):
             if not dr.width(lanes):
-                break
-            some, sums = camera.at(lanes), [(splats.sums, splats.lost) for splats in differences.values()]
+                return
+            some, sums = camera.at(lanes), [(one.sums, one.lost) for one in splats]
             seen = some.lens, some.time, some.wavelength, some.random, some.rays()[:2], depths
             dr.eval(seen)
             dr.make_opaque(sums)
-            shift = self.bent_splats if bent else self.straight_splats
-            sums, is_bent = frozen(shift, *ends, *seen, η, sums)
+            sums, is_bent = passes.frozen(shift, *ends, *seen, η, sums)
             dr.eval(sums, is_bent)
-            for one, (total, lost) in zip(differences.values(), sums, strict=True):
+            for one, (total, lost) in zip(splats, sums, strict=True):
                 one.sums, one.lost = total, lost
             if passes.materials.all_connectable:
-                break
+                return
             few = dr.compress(is_bent)
             lanes, depths = dr.gather(mi.UInt32, lanes, few), dr.gather(mi.UInt32, depths, few)
-        return type(random)(numbers), Photons(kept, radius, n)
 
     def straight_splats(self, scene, lights, materials, sensor, *seen) -> tuple:
         """Splats differences of light paths that end at the camera without mirrors or glass in front of it."""

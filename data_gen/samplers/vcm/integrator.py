@@ -136,24 +136,28 @@ class VCM(BDPT):
         (ray, importance, _), random = camera.rays(), camera.random.clone()
         dr.eval(ray, importance)
         values = frozen(features, scene, camera.sensor, camera.random, ray, fixed=True)
-        n, photons = dr.width(camera.pixel), None
         ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        photons = None
         if self.vertices and passes.lights.emitters is not None:
-            radius, splats = self.radius * passes.width * shrunk(camera.first), film.splats("primal")
-            kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
-            sums = splats.sums, splats.lost
-            dr.make_opaque(sums)
-            numbers, sums, kept, _ = frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
-            dr.eval(numbers, sums, kept)
-            splats.sums, splats.lost = sums
-            random, photons = type(random)(numbers), Photons(kept, radius, n)
+            random, photons, _ = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
         L, Le = frozen(self.seen, *ends, random, ray, importance, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
         film.put_all(values)
 
+    def light_paths(self, passes: Passes, camera: CameraSamples, random, ray, importance, splats: Splats) -> tuple:
+        """Traces and splats them: random numbers to go on by, the photons, and the splatter's state."""
+        n, radius = dr.width(camera.pixel), self.radius * passes.width * shrunk(camera.first)
+        kept, η, sums = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n)), (splats.sums, splats.lost)
+        dr.make_opaque(sums)
+        ends = passes.scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        numbers, sums, kept, state = passes.frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
+        dr.eval(numbers, sums, kept, state)
+        splats.sums, splats.lost = sums
+        return type(random)(numbers), Photons(kept, radius, n), state
+
     def lit(self, scene, lights, materials, sensor, lens, random, ray, importance, kept: Map, η, sums: tuple) -> tuple:
-        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; with the random numbers to go on by, and the splatter's state."""
+        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; what ``light_paths`` goes on with."""
         size = mi.ScalarVector2u(sensor.film().crop_size())
         camera = SimpleNamespace(sensor=sensor, lens=lens, size=size)
         keeper = Keeper(self.splatter(Splats.on(int(dr.prod(size)), 3, sums), ray, importance), η, kept)
