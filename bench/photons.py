@@ -47,11 +47,13 @@ METHODS_IN_MEDIA = {
     "gbre": ("primal", "l1", "wcv"),
     "beams": ("primal", "oidn"),
     "gbeams": ("primal", "l1", "wcv"),
+    "planes": ("primal", "oidn"),
+    "gplanes": ("primal", "l1", "wcv"),
     "vpm": ("primal", "oidn"),
     "gpt": ("l1", "wcv"),
     "primal": ("primal", "oidn"),
 }
-PHOTONS = ("ppm", "gpm", "vpm", "bre", "gbre", "beams", "gbeams")
+PHOTONS = ("ppm", "gpm", "vpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes")
 # Samplers with one sample of each pixel in a pass, or a few
 IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
 DEFAULT = (*PHOTONS, "gpt", "primal")

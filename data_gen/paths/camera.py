@@ -100,6 +100,12 @@ class CameraSamples:
         ray, importance = self.sensor.sample_ray_differential(self.time, self.wavelength, uv, self.lens)
         return ray, importance, inside
 
+    def quarters(self) -> list[mi.Vector2f]:
+        """Three shifts by half a pixel, for each lane: with its own place, one in each quarter of its pixel."""
+        within = self.position - mi.Point2f(self.pixel % self.size.x, self.pixel // self.size.x)
+        half = dr.select(within < 0.5, mi.Vector2f(0.5), -0.5)
+        return [mi.Vector2f(half.x, 0), mi.Vector2f(0, half.y), half]
+
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:
     """The ``lanes`` with gaps, and which of them exist: so that no two blocks of samples share a packet of rays.

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+
+from data_gen.paths.camera import CameraSamples
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
@@ -112,5 +115,32 @@ def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) 
     """
     if integrator.hide_emitters or medium is not None:
         return dr.zeros(mi.Spectrum, dr.width(ray))
-    si = scene.ray_intersect(ray, mi.RayFlags.All, True, active)
-    return si.emitter(scene, active).eval(si, active)
+    ray = mi.Ray3f(ray)
+    hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+    # Most rays meet no lamp: nothing else is computed for them.
+    lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
+    shines = active & (lamp | ~hit.is_valid())
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.All, lamp)
+    return si.emitter(scene, shines).eval(si, shines)
+
+
+def emission_in_pixel(
+    scene: mi.Scene, camera: CameraSamples, Le: mi.Spectrum, emission: Callable[[mi.Ray3f], mi.Spectrum]
+) -> mi.Spectrum:
+    """The layer ``direct`` of camera samples that meet ``Le``: the mean over four rays, one in each quarter of a pixel.
+
+    Lamps and windows differ most from what is beside them: one of whose frame a pixel's few samples see too much is a
+    black dot, which no reconstruction fills, for this light is in no gradient. Rays cost little beside paths.
+    ``Le`` is weighted by the camera's importance; ``emission``, which tells what a ray meets, is not.
+    """
+    if not any(visible(emitter) for emitter in scene.emitters()):
+        return Le
+    for shift in camera.quarters():
+        ray, importance, _ = camera.rays(shift)
+        Le = Le + importance * emission(ray)
+    return Le / 4
+
+
+def visible(emitter: mi.Emitter) -> bool:
+    """Whether a camera may see it: points and single directions are met by no ray."""
+    return not mi.has_flag(emitter.flags(), mi.EmitterFlags.Delta)

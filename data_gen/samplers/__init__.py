@@ -226,7 +226,26 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     ]
 
 
-_GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEAMS, _GBEAMS, _VCM, _GVCM, _PRIMAL = (
+(
+    _GPT,
+    _BASIC,
+    _SIMPLE,
+    _BDPT,
+    _GBDPT,
+    _GMLT,
+    _PPM,
+    _GPM,
+    _VPM,
+    _BRE,
+    _GBRE,
+    _BEAMS,
+    _GBEAMS,
+    _PLANES,
+    _GPLANES,
+    _VCM,
+    _GVCM,
+    _PRIMAL,
+) = (
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
@@ -242,6 +261,8 @@ _GPT, _BASIC, _SIMPLE, _BDPT, _GBDPT, _GMLT, _PPM, _GPM, _VPM, _BRE, _GBRE, _BEA
         "photons.gbre",
         "photons.beams",
         "photons.gbeams",
+        "photons.planes",
+        "photons.gplanes",
         "vcm.integrator",
         "vcm.gvcm",
         "primal",
@@ -253,6 +274,7 @@ _PHOTON_OPTIONS = {
     "photons": "light paths of a pass for each pixel (1)",
     "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
 }
+_PLANE_OPTIONS = {"planes": "light paths of a photon map that planes are swept from (64)"}
 
 _VCM_OPTIONS = {
     "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
@@ -416,6 +438,31 @@ for _sampler in (
         batch=1,
         biased=True,
         module=_GBEAMS,
+    ),
+    Sampler(
+        "planes",
+        "photon planes: light scattered in media again and again without blur, without gradients (thin fog)",
+        _from_module(_PLANES),
+        lambda facts: _refused_but_for_media(facts, "planes"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | _PLANE_OPTIONS,
+        gradients=False,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_PLANES,
+    ),
+    Sampler(
+        "gplanes",
+        "gradients of photon planes (thin fog)",
+        _from_module(_GPLANES),
+        lambda facts: _refused_but_for_media(facts, "gplanes"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | _PLANE_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GPLANES,
     ),
     Sampler(
         "vcm",

@@ -12,6 +12,8 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
@@ -82,6 +84,16 @@ class GradientIntegrator(mi.SamplingIntegrator):
             found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
             hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
         return hit
+
+    def emission_in_pixel(self, scene, camera: CameraSamples, Le, media: Media | None = None, within=None):
+        """``lights.emission_in_pixel`` of what this integrator shows, through ``media`` around a camera ``within``."""
+        if self.hide_emitters or self.max_depth < 1:
+            return Le
+        if media:
+            emission = partial(self.lamps_in_fog, scene, media, within=within, channel=mi.UInt32(0))
+        else:
+            emission = partial(emission_seen, scene, self, None, active=mi.Bool(True))
+        return emission_in_pixel(scene, camera, Le, emission)
 
     def lamps_in_fog(self, scene, media: Media, ray, within, channel) -> mi.Spectrum:
         """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""

@@ -10,7 +10,7 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features as feature_layers
-from data_gen.paths.lights import emission_seen
+from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
@@ -23,11 +23,18 @@ def make(scene: mi.Scene, features: bool = True) -> SamplePass:
 
 
 def sample_pass(scene, integrator, radiance, features: bool, camera: CameraSamples, film: GradientFilm) -> None:
-    """One sample of radiance, and of features, for each camera sample, by Mitsuba's integrator alone."""
+    """One sample of radiance, and of features, for each camera sample, by Mitsuba's integrator alone.
+
+    Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
+    """
     ray, importance, _ = camera.rays()
-    L = radiance(camera.random.clone(), ray, camera.sensor.get_medium(), mi.Bool(True))
-    film.put("primal", to_rgb(L * importance, ray.wavelengths))
+    medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)
+    L = importance * radiance(camera.random.clone(), ray, medium, all_lanes)
     if features:
-        Le = emission_seen(scene, integrator, camera.sensor.get_medium(), ray, mi.Bool(True))
-        film.put("direct", to_rgb(Le * importance, ray.wavelengths))
+        seen = partial(emission_seen, scene, integrator, medium, active=all_lanes)
+        at_place = importance * seen(ray)
+        Le = emission_in_pixel(scene, camera, at_place, seen)
+        L = L + Le - at_place
+        film.put("direct", to_rgb(Le, ray.wavelengths))
         film.put_all(feature_layers(scene, camera.sensor, camera.random.clone(), ray))
+    film.put("primal", to_rgb(L, ray.wavelengths))

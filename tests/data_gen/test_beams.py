@@ -12,9 +12,9 @@ from test_photons import assert_alike
 from unbiased import REFERENCES, light_of_gradients, load, render_ours
 
 
-def alike(renderer, scene, radius=0.4, photons=24, block=4, batches=6):
+def alike(renderer, scene, radius=0.4, photons=24, block=4, batches=6, sampler="beams", **options):
     scene = load(renderer, scene, (16, 16))
-    ours = render_ours(scene, "beams", batches=batches, spp=1, radius=radius, photons=photons)
+    ours = render_ours(scene, sampler, batches=batches, spp=1, radius=radius, photons=photons, **options)
     theirs = render_ours(scene, "primal", batches=batches, spp=128, seed=REFERENCES)
     # Light that is seen directly is its expectation in ours, and has its own edges.
     images, references = (np.stack([light_of_gradients(s) for s in stacks]) for stacks in (ours, theirs))

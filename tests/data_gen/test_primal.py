@@ -48,3 +48,29 @@ def test_elsewhere_it_is_the_integrator_itself(renderer, more):
 
     with pytest.raises(Called):
         radiance(scene, Own())(None, None, None, True)
+
+
+@pytest.mark.parametrize("sampler", ["primal", "gpt", "bdpt", "gbdpt"])
+def test_lamps_seen_directly_are_seen_by_four_rays_a_sample(renderer, sampler):
+    """A lamp of radiance 2 over parts of pixels: one ray a sample would have variance m (2 - m) / spp."""
+    lamp = {"type": "sphere", "radius": 0.6, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2.0}}}
+
+    def lamps():
+        film = {"type": "hdrfilm", "width": 16, "height": 16}
+        look = renderer.ScalarTransform4f().look_at(origin=[0.1, 0.2, -4], target=[0, 0, 0], up=[0, 1, 0])
+        sensor = {"type": "perspective", "fov": 30, "to_world": look, "film": film}
+        return {"type": "scene", "integrator": {"type": "path"}, "sensor": sensor, "lamp": lamp}
+
+    spp = 16
+    stacks = render_ours(load(renderer, lamps, (16, 16)), sampler, batches=48, spp=spp)
+    direct = np.stack([stack["direct"][..., 0] for stack in stacks]).astype(np.float64)
+    np.testing.assert_allclose([stack["primal"] for stack in stacks], [stack["direct"] for stack in stacks], atol=1e-6)
+    m = direct.mean(axis=0)
+    edges = (m > 0.2) & (m < 1.8)
+    expected = m * (2 - m) / spp
+    assert edges.sum() > 10
+    # In quarters of a pixel on one edge: a fifth; independent rays would have a quarter.
+    assert direct.var(axis=0, ddof=1)[edges].mean() < 0.25 * expected[edges].mean()
+    # The mean is that of one ray a sample, whose noise is known.
+    alone = render_references(renderer, load(renderer, lamps, (16, 16)))
+    assert z_test(np.stack([stack["direct"] for stack in stacks]), alone).passed

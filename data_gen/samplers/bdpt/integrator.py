@@ -111,6 +111,7 @@ class BDPT(GradientIntegrator):
             splatter = Splatter(film.splats("primal"), ray, importance)
             kept, count, random, _ = self.light_path(scene, lights, camera, random, ray, longest, splatter)
         L, Le = self.camera_path(scene, lights, camera, random, ray, importance, kept, count, longest)
+        Le = self.emission_in_pixel(scene, camera, Le)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         # One kernel for all of it: each value read on its own would trace the paths again.

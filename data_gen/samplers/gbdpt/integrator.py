@@ -85,6 +85,7 @@ class GBDPT(BDPT):
             marker = Marker(splats["primal"], ray, importance)
             kept, count, random, marks = self.light_path(scene, plan.lights, camera, random, ray, plan.longest, marker)
         L, Le, Δ = self.shifted_camera_path(scene, plan, camera, random, ray, importance, shifted, kept, count)
+        Le = self.emission_in_pixel(scene, camera, Le)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         Δ, inside = [to_rgb(one, ray.wavelengths) for one in Δ], [inside for _, _, inside in shifted]

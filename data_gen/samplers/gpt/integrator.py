@@ -142,6 +142,7 @@ class GPT(GradientIntegrator):
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
         random = camera.random.clone()
         L, Le, L_caustic, offsets, chain = self.trace(scene, plan, random, ray, importance, shifted, within)
+        Le = self.emission_in_pixel(scene, camera, Le, plan.media, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (L, Le, L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
 

@@ -203,14 +203,18 @@ class BEAMS(BRE):
             yield from super().gatherings(passes, keys, number)
         elif passes.lights.emitters is not None and self.max_depth > 1:
             paths = self.photons * dr.width(keys[0])
-            radius = self.radius * passes.width
             _, maps = self.photon_maps(passes, keys)
             for photons in maps:
-                on_surfaces = Gathering(photons, radius * shrunk(number), paths, self.max_depth)
-                for parts in parts_of(passes, self.fog, photons, radius * shrunk(number, 1), PARTS * paths):
-                    beams = AlongBeams(parts, radius * shrunk(number, 1), paths, self.max_depth)
-                    yield Both(on_surfaces, beams)
-                    on_surfaces = None
+                yield from self.of_map(passes, photons, number, paths)
+
+    def of_map(self, passes: Passes, photons, number: int, paths: int) -> Iterator[Both]:
+        """What light is gathered from in one photon map of pass ``number``, with media."""
+        radius = self.radius * passes.width
+        on_surfaces = Gathering(photons, radius * shrunk(number), paths, self.max_depth)
+        for parts in parts_of(passes, self.fog, photons, radius * shrunk(number, 1), PARTS * paths):
+            beams = AlongBeams(parts, radius * shrunk(number, 1), paths, self.max_depth)
+            yield Both(on_surfaces, beams)
+            on_surfaces = None
 
 
 def parts_of(passes: Passes, fog: Fog, photons, radius: float, most: int) -> Iterator[Any]:

@@ -18,6 +18,9 @@ In a medium there is no surface, so b and b' themselves are moved. Beside a came
 rays at the same distance, n and m the directions of the rays: distance, and place beside the ray, have the volume for
 their product, and the map keeps the one and turns or mirrors the other. So it keeps volumes, whatever the rays.
 
+A plane of two edges, the first along d, turns about that edge, so that it goes through the point on the other ray: the
+angle between both edges stays, and both their lengths change (``about``).
+
 [Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 4.3; the
 mirror image: Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Estimation", section 4]
 """
@@ -65,6 +68,26 @@ def past(a, e, x, d, u, far):
         target = x + dr.normalize(dr.cross(d, e)) * u
         e = dr.select(far, e, dr.normalize(target - a))
     return target
+
+
+def about(a, d, e, y):
+    """(e', s', t') with y = a + s' d + t' e': ``e``, turned about ``d`` into the half-plane of ``y``."""
+    to = y - a
+    along = dr.dot(to, d)
+    aside = to - d * along
+    distance = dr.norm(aside)
+    cos = dr.dot(d, e)
+    sin = dr.norm(dr.cross(d, e))
+    t = distance / sin
+    return d * cos + aside * (sin / distance), along - t * cos, t
+
+
+def jacobian_of_planes(t, volume, t1, volume1):
+    """J of a plane's second direction, as ``about`` turns it; ``t``, ``t1``: the distances along it to rays.
+
+    ``volume``, ``volume1``: of edge, direction and ray, each of length 1.
+    """
+    return (t / t1) * dr.abs(volume1 / volume)
 
 
 def jacobian(d, n, length2, d1, m, length2_1):

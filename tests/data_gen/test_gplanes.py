@@ -1,0 +1,204 @@
+"""What is particular to ``gplanes``: how planes turn, and its differences against those of its own images.
+
+That it repeats its bits, says how noisy it is and stays within its memory is among the laws of all samplers; what it
+does on surfaces is that of ``gpm``, its beams are those of ``gbeams``.
+"""
+
+import media_scenes
+import numpy as np
+import pytest
+from test_gbre import rays  # noqa: F401 - a fixture
+from test_gpm import assert_no_bias, gain, largest, passes
+from unbiased import far_shifts, load, render_ours
+
+
+def turning(g):
+    """(a, d, e, where the first ray meets the plane) of planes that go well with pairs of rays, in double precision."""
+    from data_gen.samplers.photons.planes import crossing
+
+    dr = g.dr
+    a = g.b - g.Vector(0.5, 1.5, 0.2)
+    d = dr.normalize(g.Vector(0.3, 0.1, 0.2) + 0.2 * g.u)
+    e = dr.normalize(g.b - a - d * 0.4)
+    return a, d, e, crossing(a, d, e, g.o, g.d)
+
+
+def test_planes_turn_to_and_fro(rays):  # noqa: F811
+    """To where the other ray is as far along it, with the same angle between both edges; J J' = 1."""
+    from data_gen.samplers.photons.planes import crossing
+    from data_gen.samplers.photons.shift import about, jacobian_of_planes
+
+    g, dr = rays, rays.dr
+    a, d, e, at = turning(g)
+    assert np.array(at.t > 0).all() and np.array(at.u > 0).all()
+    e1, s1, t1 = about(a, d, e, g.u + g.e * at.u)
+    there = crossing(a, d, e1, g.u, g.e)
+    assert max(largest(there.u - at.u), largest(there.s - s1), largest(there.t - t1)) < 1e-8
+    assert largest(dr.dot(d, e1) - dr.dot(d, e)) < 1e-12 and largest(dr.norm(e1) - 1) < 1e-12
+    back, s, t = about(a, d, e1, g.o + g.d * there.u)
+    assert max(largest(dr.norm(back - e)), largest(s - at.s), largest(t - at.t)) < 1e-7
+    J, J1 = (
+        jacobian_of_planes(*x)
+        for x in (
+            (at.t, at.volume, t1, there.volume),
+            (there.t, there.volume, t, crossing(a, d, back, g.o, g.d).volume),
+        )
+    )
+    assert np.quantile(np.abs(np.array(J * J1) - 1), 0.99) < 1e-6 and np.std(np.log(np.array(J))) > 0.1
+
+
+def test_jacobians_of_planes_by_finite_differences(rays):  # noqa: F811
+    """Of the solid angles of the second edge: another one meets the ray at another distance along it."""
+    from data_gen.samplers.photons.planes import crossing
+    from data_gen.samplers.photons.shift import about, jacobian_of_planes
+
+    g, dr = rays, rays.dr
+    a, d, e, at = turning(g)
+    x = dr.normalize(dr.cross(e, g.Vector(0.3, 0.9, 0.1)))
+    y, h = dr.cross(e, x), 1e-6
+
+    def copied(i, j):
+        e2 = dr.normalize(e + x * i + y * j)
+        return about(a, d, e2, g.u + g.e * crossing(a, d, e2, g.o, g.d).u)[0]
+
+    columns = [(copied(h * i, h * j) - copied(-h * i, -h * j)) / (2 * h) for i, j in ((1, 0), (0, 1))]
+    measured = np.array(dr.norm(dr.cross(*columns)))
+    _, _, t1 = about(a, d, e, g.u + g.e * at.u)
+    told = np.array(jacobian_of_planes(at.t, at.volume, t1, dr.dot(d, dr.cross(copied(0, 0), g.e))))
+    assert np.quantile(np.abs(measured / told - 1), 0.95) < 1e-5 and np.std(np.log(told)) > 0.1
+
+
+@pytest.mark.parametrize("name", ["forward", *(pytest.param(n, marks=pytest.mark.slow) for n in ("haze", "nested"))])
+def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, name):
+    """Of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
+    import drjit as dr
+
+    from data_gen.paths.streams import sample_streams
+    from data_gen.samplers import find
+    from data_gen.samplers.photons.gbre import Beside
+    from data_gen.samplers.photons.gplanes import copied
+    from data_gen.samplers.photons.planes import crossing, planes_of
+
+    mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
+    made = find("gplanes").make(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
+    lane = dr.arange(mi.UInt32, n)
+    random = sample_streams(0, lane, mi.UInt32(0))
+    _, maps = made.integrator.photon_maps(made, (random.next_key(), random.next_key()))
+    planes = planes_of(made, next(maps), n).planes
+    k = len(planes)
+    eye = mi.Point3f(made.integrator.fog.eye)
+    middle = rng.normal(size=(3, k)) * 0.4 - np.array(eye)
+
+    def ray(spread):
+        d = middle + rng.normal(size=(3, k)) * spread
+        d = mi.Vector3f(d / np.linalg.norm(d, axis=0))
+        zero, everywhere = dr.zeros(mi.Spectrum, k), dr.full(mi.Bool, True, k)
+        return Beside(eye, d, dr.full(mi.Float, 100, k), planes.medium, zero, zero + 1, everywhere)
+
+    A, B = ray(0), ray(0.02)
+    at = crossing(planes.a, planes.d, planes.e, A.o, A.d)
+    met = (at.s > 0) & (at.s < planes.length) & (at.t > 0) & (at.u > 0) & (dr.abs(at.volume) > 1e-3)
+    moved, there, _, r, good = copied(planes, at, B)
+    back, again, _, r_back, good_back = copied(moved, there, A)
+    good &= met & (dr.abs(there.volume) > 1e-3)
+    assert np.array(good).sum() > 0.85 * np.array(met).sum() > 300
+    good, good_back = np.array(good), np.array(good_back)
+    assert (good & good_back).sum() > 0.99 * good.sum()
+    good &= good_back
+    error = np.abs(np.array(r * r_back, np.float64) - 1)[good]
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-2 and np.std(np.log(np.array(r)[good])) > 1e-2
+    away = np.linalg.norm(np.array(back.e) - np.array(planes.e), axis=0)[good]
+    assert np.median(away) < 1e-5 and np.quantile(away, 0.95) < 1e-3
+    s, was = np.array(again.s)[good], np.array(at.s)[good]
+    assert np.quantile(np.abs(s - was), 0.9) < 1e-3
+    assert np.allclose(np.array(back.Φ)[:, good], np.array(planes.Φ)[:, good], rtol=1e-2)
+
+
+def by_planes_alone(self, passes, starts, photons, number, paths):
+    """For ``GPLANES.gathered``."""
+    from data_gen.samplers.photons.gbre import Both
+    from data_gen.samplers.photons.gplanes import NearPlanes
+    from data_gen.samplers.photons.planes import planes_of
+
+    yield Both(None, NearPlanes(planes_of(passes, photons, paths)))
+
+
+CASES = [("colours", 4), ("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "pixels"), CASES)
+def test_differences_by_planes_are_those_of_the_image(renderer, name, pixels):
+    """In one pass after another: with the same light paths, so that the noise of both falls out in part."""
+    scene = load(renderer, getattr(media_scenes, name), (12, 12))
+    stacks = passes(scene, 32, pixels, "gplanes", radius=0.5)
+    assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
+    assert_no_bias(stacks, pixels)
+
+
+def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
+    from data_gen.samplers.photons import gplanes
+
+    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    stacks = passes(load(renderer, media_scenes.colours, (12, 12)), 32, 4, "gplanes", planes=144)
+    assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
+    assert_no_bias(stacks, 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wrong", [None, "volumes", "lengths", "one"])
+def test_wrong_jacobians_of_planes_are_found(renderer, monkeypatch, wrong):
+    """One without the volumes, without the lengths, or without both; and the right one is not."""
+    from data_gen.samplers.photons import gplanes, shift
+
+    right = shift.jacobian_of_planes
+    if wrong:
+        changed = {
+            "volumes": lambda t, volume, t1, volume1: t / t1,
+            "lengths": lambda t, volume, t1, volume1: right(t, volume, t1, volume1) * t1 / t,
+            "one": lambda t, volume, t1, volume1: 0 * t + 1,
+        }
+        monkeypatch.setattr(shift, "jacobian_of_planes", changed[wrong])
+    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 64, 4, "gplanes", planes=144)
+    if not wrong:
+        assert_no_bias(stacks, 4)
+        return
+    with pytest.raises(AssertionError):
+        assert_no_bias(stacks, 4)
+
+
+@pytest.mark.slow
+def test_the_primal_is_that_of_planes(renderer):
+    """The same camera paths, beams and planes; Russian roulette alone looks at five paths instead of one."""
+
+    def short():
+        return media_scenes.nested() | {"integrator": {"type": "volpath", "max_depth": 5, "rr_depth": 9}}
+
+    scene = load(renderer, short, (24, 16))
+    ours, theirs = (render_ours(scene, sampler, 1, 2, radius=1.0)[0] for sampler in ("gplanes", "planes"))
+    for layer in ("primal", "direct", "albedo", "normal", "depth"):
+        assert np.allclose(ours[layer], theirs[layer], rtol=1e-3, atol=1e-5), layer
+
+
+@pytest.mark.slow
+def test_planes_shifted_by_nothing_find_no_difference(renderer):
+    """But for the rounding of planes that turn by nothing."""
+    from data_gen.render import render_stack
+
+    with far_shifts(0):
+        layers = render_stack(load(renderer, media_scenes.milk, (16, 16)), 2, 0, "gplanes").layers
+    assert max(np.abs(layers["dx"]).max(), np.abs(layers["dy"]).max()) < 1e-4 * layers["primal"].max()
+
+
+def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):
+    """No z-test asks for that: a sampler that rejects every shift is unbiased. Measured, 48x48: 0.02, 66 and 106."""
+    from data_gen.render import render_stack
+    from data_gen.samplers.photons import gplanes
+    from ngpt.io.exr import pass_through
+
+    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    scene = load(renderer, media_scenes.haze, (32, 32))
+    failed = pass_through(render_stack(scene, 2, 0, "gplanes", diagnostics=True))["diagnostics.shiftFailures"]
+    mean, median = gain(passes(scene, 8, 1, "gplanes"))
+    assert failed.mean() < 0.1 and mean > 10 and median > 20, (failed.mean(), mean, median)
