@@ -124,13 +124,14 @@ class Paths:
         from data_gen.samplers.common import like_path
         from data_gen.samplers.gbdpt.base_path import Plan, base_step
         from data_gen.samplers.gbdpt.offset_path import start, take_step
+        from data_gen.samplers.gbdpt.pairs import difference
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, corner, (24, 24))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
         self.sensor, self.lens = camera.sensor, camera.lens
         self.integrator = like_path(scene, "gbdpt")
-        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8)
+        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, difference)
         ray, _, _ = camera.rays()
         self.random = camera.random.clone()
         self.first = plan.lights.sample(scene, self.random, ray.time, ray.wavelengths)
@@ -475,7 +476,7 @@ def splats_rejected(shifted):
 @pytest.mark.parametrize(
     ("modules", "function", "mutate"),
     [
-        (("offset_path", "light_shift"), "difference", dark_pairs_weighted),
+        (("integrator", "light_shift"), "difference", dark_pairs_weighted),
         (("light_shift",), "shifted", splats_rejected),
     ],
     ids=["dark pairs weighted", "splats rejected"],

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.manifold import event
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.lights import LightEnds
@@ -24,7 +26,14 @@ class Plan:
     max_depth: int
     rr_depth: int
     longest: int  # the number of edges up to which paths are found from both ends
+    pair: Callable  # Δ of a path and its copy, by one of the weights of ``pairs``
     η: mi.Float | None = None  # of ``mis``, where photons are gathered, too
+    bends: bool = True  # camera paths are walked through mirrors and glass, see ``chain_shift``
+
+    @property
+    def joins(self) -> bool:
+        """Whether there are paths from lights."""
+        return self.longest > 1 and self.lights.emitters is not None
 
     def merged(self, bsdf: mi.BSDFPtr, joins: mi.Bool | bool = True) -> mi.Float:
         """η at a vertex of that material; 0 where nothing merges."""
@@ -46,6 +55,7 @@ class Step:
     # A sampled point of an emitter
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
+    shared: mi.Bool  # Δ has a share in what is completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
     e_light: mi.Float
@@ -60,6 +70,7 @@ class Step:
     wo: mi.Vector3f
     d: mi.Vector3f
     kind: mi.UInt32
+    event: mi.UInt32  # mirror, glass or hole, of ``manifold``
     p: mi.Float
     q: mi.Float
     f_p: mi.Spectrum  # f / p, survival included
@@ -135,6 +146,7 @@ def base_step(
         connectable=active & materials.connectable(bsdf),
         light=light,
         weight=weight,
+        shared=mi.Bool(True),
         C_light=C,
         others_light=others,
         e_light=e,
@@ -148,6 +160,7 @@ def base_step(
         wo=sample.wo,
         d=d,
         kind=kind,
+        event=event(sample.sampled_type),
         p=sample.pdf,
         q=q_next,
         f_p=f_p * survival,

@@ -42,6 +42,16 @@ class Marker:
         return state | dr.select(lit, mi.UInt64(1) << mi.UInt64(seen.y.depth), 0)
 
 
+class Unseen:
+    """Where what light paths bring to the camera is of no matter."""
+
+    def start(self) -> None:
+        return None
+
+    def sees(self, state: None, seen: Seen) -> None:
+        return None
+
+
 def marked(state: mi.UInt64, longest: int) -> tuple[mi.UInt32, mi.UInt32]:
     """The lane and the depth of each vertex that is marked, by depth: lanes side by side trace as many edges."""
     lanes = [dr.compress((state >> mi.UInt64(depth)) & 1 != 0) for depth in range(1, longest)]

@@ -31,6 +31,7 @@ from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.integrator import GBDPT
 from data_gen.samplers.gbdpt.light_again import Marker, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
+from data_gen.samplers.gbdpt.pairs import difference
 from data_gen.samplers.vcm.differences import ShiftedMerging
 from data_gen.samplers.vcm.integrator import VCM, Passes
 from data_gen.samplers.vcm.merging import Photons, Reader
@@ -119,7 +120,9 @@ class GVCM(VCM):
 
     def plan(self, lights, materials, η: mi.Float | None) -> Plan:
         """That of ``gbdpt``."""
-        return Plan(lights, materials, self.max_depth, self.rr_depth, self.longest, η)
+        # Camera paths that go on through mirrors or glass are rejected: no lanes are walked here.
+        depths = self.max_depth, self.rr_depth, self.longest
+        return Plan(lights, materials, *depths, difference, η, bends=False)
 
     def seen_shifted(self, scene, lights, materials, sensor, lens, random, rays, photons: Photons | None) -> tuple:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all; and four Δ."""
@@ -127,10 +130,10 @@ class GVCM(VCM):
         camera, random = SimpleNamespace(sensor=sensor, lens=lens), random.clone()
         path = camera, random, ray, importance, shifted
         if photons is None:
-            return self.shifted_camera_path(scene, self.plan(lights, materials, None), *path, None, mi.UInt32(0))
+            return self.shifted_camera_path(scene, self.plan(lights, materials, None), *path, None, mi.UInt32(0))[:3]
         kept, merging = photons.kept, ShiftedMerging(photons, materials, self.longest)
         plan = self.plan(lights, materials, photons.η)
-        return self.shifted_camera_path(scene, plan, *path, Reader(kept), kept.count, merging)
+        return self.shifted_camera_path(scene, plan, *path, Reader(kept), kept.count, merging=merging)[:3]
 
 
 def make(scene: mi.Scene, **options):
