@@ -34,7 +34,7 @@ TOLERANCE = 1e-4
 RETURNS = 1e-3
 
 
-# Asked of each event: whether a chain would have ended there, whatever the event.
+# Asked of each event but the first: whether a chain would have ended there, whatever the event.
 Ends = Callable[[mi.SurfaceInteraction3f], mi.Bool]
 
 
@@ -134,7 +134,8 @@ def shoot(
         # The ends of the range of random numbers: reflections come first in all of Mitsuba's materials, holes last.
         u = dr.select(code == REFLECT, mi.Float(0), 1 - dr.epsilon(mi.Float))
         sample, f_P = si.bsdf().sample(mi.BSDFContext(), si, u, mi.Point2f(0.5), good)
-        good &= si.is_valid() & (sample.pdf > 0) & (event(sample.sampled_type) == code) & ~ends(si)
+        good &= si.is_valid() & (sample.pdf > 0) & (event(sample.sampled_type) == code)
+        good &= (left == events) | ~ends(si)
         # --------------------- Differentials ---------------------
         dp0, dn0 = on_surface(si, ray.d, dp0 + dd0 * si.t)
         dp1, dn1 = on_surface(si, ray.d, dp1 + dd1 * si.t)

@@ -124,14 +124,13 @@ class Paths:
         from data_gen.samplers.common import like_path
         from data_gen.samplers.gbdpt.base_path import Plan, base_step
         from data_gen.samplers.gbdpt.offset_path import start, take_step
-        from data_gen.samplers.gbdpt.pairs import difference
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, corner, (24, 24))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
         self.sensor, self.lens = camera.sensor, camera.lens
         self.integrator = like_path(scene, "gbdpt")
-        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, difference)
+        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8)
         ray, _, _ = camera.rays()
         self.random = camera.random.clone()
         self.first = plan.lights.sample(scene, self.random, ray.time, ray.wavelengths)

@@ -18,7 +18,15 @@ def under_a_sky():
     return scene | {"sky": {"type": "constant", "radiance": _rgb(1, 2, 3)}}
 
 
-ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass}
+def lacquered():
+    """A room with a ball of glass and a lacquered one: it mirrors, but paths may be joined at it too."""
+    scene = glass()
+    del scene["hole"]
+    scene["rough"]["bsdf"] = {"type": "plastic"}
+    return scene
+
+
+ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}
 
 
 class Bent:
@@ -40,7 +48,7 @@ class Bent:
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, description, (32, 32))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
-        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, difference_of_one)
+        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, pair=difference_of_one)
         ray, _, _ = camera.rays()
         random, x = camera.random.clone(), scene.ray_intersect(mi.Ray3f(ray))
         z = Vertex(x, mi.Spectrum(1), self.first_end(x, ray), mi.UInt32(1))
@@ -101,7 +109,7 @@ class Bent:
 
 @pytest.fixture(
     scope="module",
-    params=["sky", "room", pytest.param("lamp", marks=pytest.mark.slow), pytest.param("wall", marks=pytest.mark.slow)],
+    params=["sky", "lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room"))],
 )
 def bent(renderer, request):
     return Bent(renderer, ENDS[request.param])
@@ -199,7 +207,7 @@ def z_tests(mi, description, pixels):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("pixels", DISTANCES)
-@pytest.mark.parametrize("ends", [glass, under_a_sky, by_a_wall, "glossy"])
+@pytest.mark.parametrize("ends", [glass, lacquered, under_a_sky, by_a_wall, "glossy"])
 def test_unbiased(renderer, long_passes, ends, pixels):
     for name, result in z_tests(renderer, ends, pixels):
         assert result.passed, f"{name}: {result}"

@@ -56,14 +56,13 @@ class Caustics:
         from data_gen.samplers.gbdpt.base_path import Plan
         from data_gen.samplers.gbdpt.light_again import first_link, next_link
         from data_gen.samplers.gbdpt.light_shift import Splatted
-        from data_gen.samplers.gbdpt.pairs import difference
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, description, (32, 32))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
         self.first_hit = like_path(scene, "gbdpt").first_hit
         lights, materials = LightEnds(scene), Materials(scene, 0.05)
-        self.plan = Plan(lights, materials, 8, 100, 8, difference)
+        self.plan = Plan(lights, materials, 8, 100, 8)
         ray, _, _ = camera.rays()
         random = camera.random.clone()
         start = lights.sample(scene, random, ray.time, ray.wavelengths)

@@ -39,13 +39,12 @@ class Copies:
         from data_gen.samplers.bdpt.vertex import Vertex, cosine
         from data_gen.samplers.gbdpt.base_path import Plan, base_step
         from data_gen.samplers.gbdpt.offset_path import own_vertex, start, take_step
-        from data_gen.samplers.gbdpt.pairs import difference
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, without_hole, (24, 24))
         self.materials = Materials(scene, 0.05)
         self.base = Ends(mi, scene, ETA, self.materials.connectable, spp=64)
-        plan = self.plan = Plan(self.base.lights, self.materials, 12, 100, 12, difference, mi.Float(ETA))
+        plan = self.plan = Plan(self.base.lights, self.materials, 12, 100, 12, η=mi.Float(ETA))
         camera = CameraSamples(scene.sensors()[0], 1, 64)
         ray, _, _ = camera.rays()
         random = self.base.random

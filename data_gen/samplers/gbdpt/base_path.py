@@ -15,6 +15,7 @@ from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
+from data_gen.samplers.gbdpt.pairs import difference
 
 
 @dataclass
@@ -26,9 +27,8 @@ class Plan:
     max_depth: int
     rr_depth: int
     longest: int  # the number of edges up to which paths are found from both ends
-    pair: Callable  # Δ of a path and its copy, by one of the weights of ``pairs``
+    pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
     η: mi.Float | None = None  # of ``mis``, where photons are gathered, too
-    bends: bool = True  # camera paths are walked through mirrors and glass, see ``chain_shift``
 
     @property
     def joins(self) -> bool:

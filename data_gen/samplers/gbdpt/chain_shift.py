@@ -49,9 +49,9 @@ class Course:
     bent: mi.Bool  # all that it brings from here on is that of bent paths
 
 
-def straight() -> Course:
+def straight(exists: mi.Bool | bool = True) -> Course:
     """That of a path at the first vertex that the camera sees."""
-    return Course(mi.Bool(True), mi.Bool(False), mi.Bool(False))
+    return Course(mi.Bool(exists), mi.Bool(False), mi.Bool(False))
 
 
 def next_course(course: Course, step: Step) -> Course:
@@ -62,10 +62,12 @@ def next_course(course: Course, step: Step) -> Course:
     return Course(course.ahead & ~smooth, course.ahead & smooth & step.connectable, course.bent | bends)
 
 
-def along(scene, plan: Plan, step: Step, course: Course, chain: Chain | None) -> tuple[Step, Course, Chain | None]:
-    """The step that leads from ``course`` and ``chain`` to the next ones, with such light as Δ has a share in: bent
-    paths where there is a ``chain``, else all others."""
-    if plan.materials.all_connectable or not plan.bends:
+def along(
+    scene, plan: Plan, step: Step, course: Course | None, chain: Chain | None
+) -> tuple[Step, Course | None, Chain | None]:
+    """The step that leads from ``course`` and ``chain`` to the next ones, with such light as Δ has a share in: that of
+    bent paths where there is a ``chain``, else of all others; of all where there is no ``course``."""
+    if course is None or plan.materials.all_connectable:
         return step, course, chain
     behind = next_course(course, step)
     now, then = course.bent, behind.bent
@@ -77,9 +79,11 @@ def along(scene, plan: Plan, step: Step, course: Course, chain: Chain | None) ->
     return replace(step, shared=now, C_light=C_light, C_met=C_met), behind, chain
 
 
-def matters(course: Course, chain: Chain | None) -> mi.Bool:
+def matters(course: Course | None, chain: Chain | None) -> mi.Bool:
     """Whether a path that is here may have a share in Δ, or in the image, which it has where there is no ``chain``."""
-    return mi.Bool(True) if chain is None else course.ahead | course.second | course.bent
+    if course is None or chain is None:
+        return mi.Bool(True)
+    return course.ahead | course.second | course.bent
 
 
 @dataclass

@@ -78,7 +78,7 @@ class GBDPT(BDPT):
         materials = Materials(scene, self.roughness_threshold)
         longest = min(self.max_depth, self.joined_depth)
         lights = LightEnds(scene, "gbdpt")
-        plan = Plan(lights, materials, self.max_depth, self.rr_depth, longest, difference)
+        plan = Plan(lights, materials, self.max_depth, self.rr_depth, longest, pair=difference)
         return lambda camera, film: self.gradient_pass(scene, plan, camera, film)
 
     def gradient_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
@@ -101,33 +101,34 @@ class GBDPT(BDPT):
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
-    def both_paths(self, scene, plan: Plan, camera: CameraSamples, visitor: Visitor, follows=None):
+    def both_paths(self, scene, plan: Plan, camera: CameraSamples, visitor: Visitor, alone: mi.Bool | None = None):
         """L, Le, and for each of SHIFTS Δ, as colours, of the path from the camera, joined to one from a light; the
         state of the light path's ``visitor``, and whether the camera path is bent.
 
-        In Δ are all paths but bent ones, or, with ``follows``, bent ones alone, of the lanes where that is true.
+        In Δ are all paths but bent ones, or, with ``alone``, bent ones alone, of the lanes where that is true.
         """
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         random, kept, count, state = camera.random.clone(), None, mi.UInt32(0), mi.UInt64(0)
         if plan.joins:
             kept, count, random, state = self.light_path(scene, plan.lights, camera, random, ray, plan.longest, visitor)
-        paths = camera, random, ray, importance, shifted, kept, count, follows
-        L, Le, Δ, bent = self.shifted_camera_path(scene, plan, *paths)
-        return L, Le, [to_rgb(one, ray.wavelengths) for one in Δ], state, bent
+        course, chain = (straight(), None) if alone is None else (straight(alone), no_chain(dr.width(alone)))
+        paths = camera, random, ray, importance, shifted, kept, count, course, chain
+        L, Le, Δ, course = self.shifted_camera_path(scene, plan, *paths)
+        return L, Le, [to_rgb(one, ray.wavelengths) for one in Δ], state, course.bent
 
     def shift_bent(self, scene, plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
         """Adds to Δ the differences of ``bent`` camera paths, which are traced anew: see ``chain_shift``."""
         lanes, exists = map(mi.UInt32, in_packets(np.array(dr.compress(bent)), camera))
         if not dr.width(lanes):
             return
-        follows = exists != 0
-        alone = replace(plan, pair=difference_of_one)
-        _, _, few, _, _ = self.both_paths(scene, alone, camera.at(lanes), Unseen(), follows)
+        alone = exists != 0
+        plan = replace(plan, pair=difference_of_one)
+        _, _, few, _, _ = self.both_paths(scene, plan, camera.at(lanes), Unseen(), alone)
         dr.eval(few)
         for total, added in zip(Δ, few, strict=True):
             for channel, value in zip(total, added, strict=True):
-                dr.scatter_add(channel, value, lanes, follows)
+                dr.scatter_add(channel, value, lanes, alone)
 
     def shift_splats(self, scene, plan: Plan, camera: CameraSamples, splats, marks: mi.UInt64) -> None:
         """Splats the differences of light paths that end at ``marked`` vertices.
@@ -146,9 +147,25 @@ class GBDPT(BDPT):
 
     @dr.syntax
     def shifted_camera_path(
-        self, scene, plan, camera, random, ray, importance, shifted, kept, count, follows=None, merging=None
+        self,
+        scene,
+        plan,
+        camera,
+        random,
+        ray,
+        importance,
+        shifted,
+        kept,
+        count,
+        course=None,
+        chain=None,
+        merging=None,
     ):
-        """``BDPT.camera_path``, Δ of its four offset paths, and whether it is bent."""
+        """``BDPT.camera_path``, Δ of its four offset paths, and where its ``course`` has led.
+
+        Bent paths are rejected; where there is a ``course``, they are left out of Δ; where there is a ``chain`` as
+        well, all others are, and bent ones are followed.
+        """
         ray = mi.Ray3f(ray)
         si = self.first_hit(scene, ray).compute_surface_interaction(ray)
         offsets = []
@@ -161,13 +178,9 @@ class GBDPT(BDPT):
         Le = importance * si.emitter(scene).eval(si, shown)
         L = dr.zeros(mi.Spectrum, dr.width(ray))
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
-        active = si.is_valid() & (depth < plan.max_depth)
+        active = si.is_valid() & (depth < plan.max_depth) & matters(course, chain)
         _, density = camera.sensor.sample_direction(si, camera.lens, active)
         end = mis.begin_camera(density[0], cosine(si, ray.d))
-        course, chain = straight(), None
-        if follows is not None:
-            active &= follows
-            chain = no_chain(dr.width(ray))
         while dr.hint(active, label="camera path"):
             z = Vertex(si, β, end, depth)
             step, η, sky_seen = base_step(scene, plan, random, z, active, η, sky_seen, brightest(offsets))
@@ -186,7 +199,7 @@ class GBDPT(BDPT):
             si, β, end = step.x1, step.β1, step.end1
             depth += 1
             active = step.goes_on & si.is_valid() & (depth < plan.max_depth) & matters(course, chain)
-        return L, Le, [offset.Δ for offset in offsets], course.bent
+        return L, Le, [offset.Δ for offset in offsets], course
 
     @dr.syntax
     def shifted_connection(self, scene, plan, step, active, kept, count, ray, u, L, offsets):

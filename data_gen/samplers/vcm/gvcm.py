@@ -31,7 +31,6 @@ from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.integrator import GBDPT
 from data_gen.samplers.gbdpt.light_again import Marker, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
-from data_gen.samplers.gbdpt.pairs import difference
 from data_gen.samplers.vcm.differences import ShiftedMerging
 from data_gen.samplers.vcm.integrator import VCM, Passes
 from data_gen.samplers.vcm.merging import Photons, Reader
@@ -120,9 +119,7 @@ class GVCM(VCM):
 
     def plan(self, lights, materials, η: mi.Float | None) -> Plan:
         """That of ``gbdpt``."""
-        # Camera paths that go on through mirrors or glass are rejected: no lanes are walked here.
-        depths = self.max_depth, self.rr_depth, self.longest
-        return Plan(lights, materials, *depths, difference, η, bends=False)
+        return Plan(lights, materials, self.max_depth, self.rr_depth, self.longest, η=η)
 
     def seen_shifted(self, scene, lights, materials, sensor, lens, random, rays, photons: Photons | None) -> tuple:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all; and four Δ."""
