@@ -2,7 +2,7 @@
 
     python -m bench.restir --folder SCENES --scenes diffuse glossy cornell-box --out OUT
 
-The camera goes sideways as in ``bench.sequences``. Rivals:
+The camera goes sideways, or a shape or a lamp moves, as in ``bench.sequences``. Rivals:
 
     restir       reservoirs of pixels and of pairs
     after        reservoirs of pixels, differences taken of what they have kept: the paper's baseline
@@ -26,7 +26,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
-from bench.sequences import SPEEDS, measured, sideways
+from bench.sequences import MOVES, SPEEDS, measured, mover, sideways
 from ngpt.temporal import Temporal
 
 RIVALS = {
@@ -40,7 +40,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, help="folder of scenes: NAME/scene.xml")
     parser.add_argument("--scenes", nargs="*", default=["diffuse", "glossy"])
-    parser.add_argument("--shots", nargs="*", default=["slow"], choices=SPEEDS)
+    parser.add_argument("--shots", nargs="*", default=["slow"], choices=[*SPEEDS, "object", "light"])
     parser.add_argument("--methods", nargs="*", default=["wcv", "ngpt-fast", "oidn"])
     parser.add_argument("--frames", type=int, default=16)
     parser.add_argument("--skip", type=int, default=8)
@@ -56,25 +56,32 @@ def main() -> None:
     use_variant(DEFAULT_VARIANT)
     result: dict = {"metadata": metadata("mitsuba-oidn"), "scenes": []}
     for scene in args.scenes:
-        cost = costs(args, scene)
-        print(scene, {name: {k: round(v, 2) for k, v in row.items()} for name, row in cost.items()}, flush=True)
+        known = {}
         for shot in args.shots:
+            # What the camera's way takes is the same for all of its speeds.
+            changes = shot not in SPEEDS
+            cost = known[changes] = known.get(changes) or costs(args, scene, shot if changes else "slow")
+            print(
+                scene, shot, {name: {k: round(v, 2) for k, v in row.items()} for name, row in cost.items()}, flush=True
+            )
             found = {"scene": scene, "shot": shot, "cost": cost} | compare(args, scene, shot, cost)
             result["scenes"].append(found)
             save(args.out / "restir.json", result)
 
 
 def shot_of(args: argparse.Namespace, scene: str, shot: str, size: str):
-    """The scene with the moving camera of that shot."""
+    """The scene with what moves in that shot."""
     from data_gen.frames.sequence import Shot
 
     pixels = tuple(map(int, size.split("x")))
     name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
+    if shot not in SPEEDS:
+        return Shot(lambda frame: (name, {}), pixels, update=mover(*MOVES[scene, shot]))
     path = sideways(Shot(lambda frame: (name, {}), pixels).at(0), SPEEDS[shot])
     return Shot(lambda frame: (name, {}), pixels, path)
 
 
-def costs(args: argparse.Namespace, scene: str) -> dict[str, dict[str, float]]:
+def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str, float]]:
     """Of a frame, by the clock and in processor time, in samples of gpt; and how many kernels it launches."""
     import drjit as dr
 
@@ -82,30 +89,34 @@ def costs(args: argparse.Namespace, scene: str) -> dict[str, dict[str, float]]:
     from data_gen.samplers import SAMPLERS
     from data_gen.samplers.restir.sampler import Restir
 
-    camera = shot_of(args, scene, "slow", args.cost_size)
-    loaded = camera.at(0)
+    moving = shot_of(args, scene, shot, args.cost_size)
+    changes = shot not in SPEEDS
+    turns = [moving, moving.twin()] if changes else [moving]
+    loaded = moving.at(0)
     rivals = {
-        name: Restir(loaded, 1, args.chains, 6144, gradients=gradients)._history
+        name: Restir(loaded, 1, args.chains, 6144, gradients=gradients)
         for name, gradients in (("restir", "pairs"), ("after", "after"), ("primal", "after"))
     }
-    rivals["primal"].gradients = False
+    rivals["primal"]._history.gradients = False
     gpt = SAMPLERS["gpt"].make(loaded)
     # What the slow shot moves by, everywhere: for the time that it takes.
-    width, height = rivals["restir"].size
+    width, height = rivals["restir"]._history.size
     motion = np.full((height, width, 2), (0.5, 0.0))
     clock: dict[str, list[float]] = {}
     processor: dict[str, list[float]] = {}
     launches: dict[str, int] = {}
     dr.set_flag(dr.JitFlag.KernelHistory, True)
     for frame in range(args.repeats + 2):
-        camera.at(frame)
+        turn = turns[frame % len(turns)]
+        now, shapes = turn.at(frame), turn.snapshot(frame).shapes
         for name in (*rivals, "gpt"):
             dr.kernel_history_clear()
             start, work = time.perf_counter(), time.process_time()
             if name == "gpt":
                 render_passes(gpt, loaded.sensors()[0], frame, args.chains)
             else:
-                rivals[name].next_frame(motion)
+                stage = rivals[name]._stage(now, shapes) if changes else None
+                rivals[name]._history.next_frame(motion, None, stage)
             dr.sync_thread()
             seconds, work = time.perf_counter() - start, time.process_time() - work
             history = dr.kernel_history()

@@ -20,22 +20,11 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.features import first_nonspecular_vertex
+from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
 from ngpt.errors import NgptError
 
 # Of the path's length: where a hit lies off the straight ray by more, there was a mirror or a lens on the way.
 _OFF_RAY = 1e-3
-
-
-@dataclass(frozen=True)
-class Mesh:
-    """Vertices (V, 3) and triangles (F, 3) of a shape, in the world."""
-
-    vertices: np.ndarray
-    faces: np.ndarray
-
-
-# A matrix (4, 4) to the world, or a mesh; None for shapes that show neither.
-Geometry = np.ndarray | Mesh | None
 
 
 @dataclass(frozen=True)
@@ -53,23 +42,8 @@ class Snapshot:
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
     """The state of a scene; ``shapes`` where they are known to be those of an earlier snapshot."""
     if shapes is None:
-        shapes = tuple(_geometry(shape) for shape in scene.shapes())
+        shapes = tuple(geometry(shape) for shape in scene.shapes())
     return Snapshot(shapes, _film(scene.sensors()[0]))
-
-
-def _geometry(shape: mi.Shape) -> Geometry:
-    params = mi.traverse(shape)
-    if "to_world" in params:
-        return _matrix(params["to_world"])
-    if "vertex_positions" in params and "faces" in params:
-        # Copies, for a scene that is updated keeps its buffers.
-        vertices = np.array(params["vertex_positions"], np.float64).reshape(-1, 3)
-        return Mesh(vertices, np.array(params["faces"]).reshape(-1, 3))
-    return None
-
-
-def _matrix(transform) -> np.ndarray:
-    return np.array(transform.matrix, np.float64).reshape(4, 4, -1)[..., 0]
 
 
 def _film(sensor: mi.Sensor) -> np.ndarray:
@@ -84,7 +58,7 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     for axis, name in enumerate(("principal_point_offset_x", "principal_point_offset_y")):
         if name in params:
             pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * pixels[axis, axis]
-    return pixels @ _matrix(projection) @ np.linalg.inv(_matrix(params["to_world"]))
+    return pixels @ matrix(projection) @ np.linalg.inv(matrix(params["to_world"]))
 
 
 class _Middle:

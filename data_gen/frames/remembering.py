@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import mitsuba as mi
@@ -13,6 +13,7 @@ from data_gen.passes import DEFAULT_MEMORY
 from data_gen.render import stack_of
 from data_gen.samplers import FrameSampler
 from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.geometry import Geometry
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
@@ -20,7 +21,8 @@ from ngpt.stack import GradientStack
 class Remembering:
     """The frames of one shot; ``options`` are those of ``render_stack``.
 
-    Raises NgptError where anything but the camera ``changes`` from frame to frame, and for options that it has not.
+    ``changes``: whether more than the camera may change from frame to frame. Raises NgptError for options that the
+    sampler has not.
     """
 
     def __init__(
@@ -31,12 +33,7 @@ class Remembering:
         seed: int,
         options: dict[str, Any],
     ):
-        self.entry, self.seed, self.options = entry, seed, dict(options)
-        if changes:
-            raise NgptError(
-                f"sampler '{entry.name}' reuses paths of the frames before, which is right only while nothing but the "
-                "camera moves; this scene changes from frame to frame: use --sampler gpt"
-            )
+        self.entry, self.changes, self.seed, self.options = entry, changes, seed, dict(options)
         if self.options.pop("seconds", None) is not None:
             raise NgptError(f"sampler '{entry.name}' renders a number of samples, not for a time: use --spp")
         self.spp = spp or entry.spp
@@ -51,19 +48,23 @@ class Remembering:
     def render(
         self,
         scene: mi.Scene,
+        shapes: Sequence[Geometry],
         index: int,
         motion: np.ndarray,
         depth: np.ndarray | None,
         progress: Callable[[int, int], None],
     ) -> GradientStack:
-        """The stack of frame number ``index`` of the shot."""
+        """The stack of frame number ``index`` of the shot; the ``scene`` has its ``shapes`` there.
+
+        Where the shot ``changes``, it is not the scene of the frame before, which must be as it was then.
+        """
         start = time.perf_counter()
         progress(0, self.spp)
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             self._sampler = self.entry.make(scene, self.seed, self.spp, self.memory, **self.options)
-        film = self._sampler.film(index, motion, depth)
+        film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         more = {"ngpt:confidence": self._sampler.confidence}
         stack = stack_of(film, self.seed, self.entry.name, start, self.diagnostics, more)
         progress(self.spp, self.spp)

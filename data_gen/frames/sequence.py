@@ -11,11 +11,12 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.frames.camera_path import CameraPath, horizontal
-from data_gen.frames.motion import Geometry, Snapshot, depth, motion_vectors, seen, snapshot
+from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot
 from data_gen.frames.pairs import difference, light
 from data_gen.frames.remembering import Remembering
 from data_gen.render import render_stack
 from data_gen.samplers import FRAME_SAMPLERS
+from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
@@ -66,6 +67,10 @@ class Shot:
         self._shapes = taken.shapes
         return taken
 
+    def twin(self) -> Shot:
+        """The same shot, with a scene of its own."""
+        return Shot(self.describe, self.size, self.camera, self.update)
+
     def changes(self, frames: Sequence[int]) -> bool:
         """Whether anything but the camera may change in these frames."""
         return self.update is not None or any(self.describe(frame) != self.describe(frames[0]) for frame in frames)
@@ -107,7 +112,8 @@ def render_sequence(
     ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
 
     A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the frames before. Where frames are left out, up to its
-    ``warm_up`` of them are rendered nevertheless, and not given. Such a sampler has ``seed`` for all frames.
+    ``warm_up`` of them are rendered nevertheless, and not given. Such a sampler has ``seed`` for all frames. Where more
+    than the camera changes, it needs the scene of the frame before: two scenes are in memory, in turn.
 
     With ``dt`` pairs of samples a pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of samples of their own
     (``data_gen.frames.pairs``), by Mitsuba's integrator, without features. Each pair is two paths, one in the scene of
@@ -117,7 +123,11 @@ def render_sequence(
     last = None
     step = frames[1] - frames[0] if len(frames) > 1 else 1
     remembers = FRAME_SAMPLERS.get(sampler)
-    remembering = None if remembers is None else Remembering(remembers, shot.changes(frames), spp, seed, options)
+    remembering, turns = None, [shot]
+    if remembers is not None:
+        changes = shot.changes(frames)
+        remembering = Remembering(remembers, changes, spp, seed, options)
+        turns += [shot.twin()] if changes else []
     done = 0
     for i, wanted in enumerate(frames):
         if skip(wanted):
@@ -125,8 +135,9 @@ def render_sequence(
         # Frames before it, for their history alone
         for j in range(max(done, i - remembers.warm_up if remembers else i), i + 1):
             frame, previous = frames[j], frames[j - 1] if j else frames[0] - step
+            shot, other = turns[j % len(turns)], turns[(j - 1) % len(turns)]
             if last != previous:
-                before = _before(shot, previous, first=j == 0)
+                before = _before(other, previous, first=j == 0)
             now = shot.snapshot(frame)
             scene = shot.at(frame)
             width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
@@ -136,7 +147,7 @@ def render_sequence(
                 motion = motion_vectors(scene, now, before, what)
             if remembering is not None:
                 far = None if what is None else depth(scene, now, what)
-                stack = remembering.render(scene, j, motion, far, progress(frame))
+                stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
                 stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
             before, last = now, frame
@@ -144,18 +155,20 @@ def render_sequence(
         stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
         stack = stack.replace(motion=motion)
         del scene  # two scenes in memory would make kernels larger
-        yield frame, _with_dt(stack, shot, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
+        yield frame, _with_dt(stack, shot, other, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
 
 
-def _with_dt(stack: GradientStack, shot: Shot, frame: int, previous: int, pairs: int, seed: int) -> GradientStack:
-    """The stack with ``dt`` and ``dt_var``."""
+def _with_dt(
+    stack: GradientStack, shot: Shot, other: Shot, frame: int, previous: int, pairs: int, seed: int
+) -> GradientStack:
+    """The stack with ``dt`` and ``dt_var``; the ``other`` shot has the scene of the frame before."""
     motion = stack["motion"]
     mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
     if np.isfinite(motion).any():
         scene, begun = shot.at(frame), time.perf_counter()
         now, seconds = light(scene, seed, pairs), time.perf_counter() - begun
         del scene
-        scene, begun = shot.at(previous), time.perf_counter()
+        scene, begun = other.at(previous), time.perf_counter()
         mean, variance = difference(now, light(scene, seed, pairs, motion))
         stack.attributes["ngpt:seconds"] += seconds + time.perf_counter() - begun
     stack.attributes["ngpt:pairs"] = pairs

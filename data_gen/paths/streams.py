@@ -46,6 +46,10 @@ def _stream_class(variant: str) -> type:
             """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
             return self.random.next_uint32()
 
+        def skip(self, count):
+            """Leaves out so many numbers of each lane, UInt32."""
+            self.random += mi.Int64(count)
+
         def clone(self):
             return Stream(self.random)
 

@@ -515,7 +515,7 @@ for _sampler in (
 
 FRAME_SAMPLERS["restir"] = FrameSampler(
     "restir",
-    "gradients of paths that are reused from frame to frame (sequences whose camera alone moves)",
+    "gradients of paths that are reused from frame to frame (sequences)",
     _from_module("data_gen.samplers.restir.sampler"),
     lambda facts: _refused_but_for_surfaces(facts, "restir"),
     {

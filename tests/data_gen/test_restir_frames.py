@@ -89,8 +89,6 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"describe": lambda frame: ("diffuse", {"x": str(frame)})}, "nothing but the camera moves"),
-        ({"update": lambda params, frame: None}, "nothing but the camera moves"),
         ({"seconds": 2.0}, "--spp"),
         ({"history": 0}, "1 or more"),
         ({"gradients": "none"}, "pairs or after"),
@@ -101,9 +99,49 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
 def test_what_cannot_be_rendered_is_refused(renderer, options, message):
     from data_gen.frames.sequence import render_sequence
 
-    scene = shot(**{name: options.pop(name) for name in ("describe", "update") if name in options}, size=(32, 24))
     with pytest.raises(NgptError, match=message):
-        next(render_sequence(scene, range(3), 4, sampler="restir", **options))
+        next(render_sequence(shot((32, 24)), range(3), 4, sampler="restir", **options))
+
+
+def test_a_change_that_changes_nothing_gives_the_same_frames(renderer, frames):
+    """Two scenes in turn, and all records carried from one to the other."""
+    from data_gen.frames.sequence import render_sequence
+
+    changing = dict(render_sequence(shot(update=lambda params, frame: None), range(3), 2, 7, sampler="restir"))
+    for name in ("primal", "dx", "dy", "motion"):
+        same = np.isclose(changing[2][name], frames[2][name], rtol=1e-3, atol=1e-5, equal_nan=True).all(axis=-1)
+        assert same.mean() > 0.95, name
+    assert changing[2].attributes["ngpt:confidence"] == frames[2].attributes["ngpt:confidence"]
+
+
+SCENE = """<scene version="3.0.0"><default name="power" value="1"/>
+        <integrator type="path"><integer name="max_depth" value="4"/></integrator>
+        <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,4" target="0,1,0" up="0,1,0"/>
+        </transform><film type="hdrfilm"><rfilter type="box"/></film></sensor>
+        <shape type="rectangle"><transform name="to_world"><scale value="4"/><rotate x="1" angle="-90"/></transform>
+        <bsdf type="twosided"><bsdf type="diffuse"/></bsdf></shape>
+        <shape type="sphere"><point name="center" x="0" y="1" z="0"/><float name="radius" value="0.5"/></shape>
+        <emitter type="constant"><rgb name="radiance" value="$power"/></emitter></scene>"""
+
+
+def test_a_scene_that_is_loaded_anew_in_each_frame_keeps_its_history(renderer, tmp_path):
+    """Frames resumed are the same bits, and light that doubles is followed at once."""
+    from data_gen.frames.sequence import render_sequence
+
+    file = tmp_path / "scene.xml"
+    file.write_text(SCENE)
+    powers = ("1", "1", "2")
+
+    def found(**options):
+        scene = shot(describe=lambda frame: (str(file), {"power": powers[frame]}))
+        return dict(render_sequence(scene, range(3), 8, sampler="restir", **options))
+
+    stacks = found()
+    assert stacks[2].attributes["ngpt:confidence"] > 2
+    light = [(stack["primal"] - stack["direct"]).mean() for stack in stacks.values()]
+    assert light[2] / light[1] == pytest.approx(2, rel=0.05)
+    later = found(skip=lambda frame: frame < 2)
+    assert np.array_equal(later[2]["dx"], stacks[2]["dx"])
 
 
 def test_media_are_refused():

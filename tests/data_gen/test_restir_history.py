@@ -44,9 +44,10 @@ class Room:
     def frames(self, seed=5, chains=CHAINS, count=FRAMES, **options):
         """History, and for each frame its values, (chains, H, W, 3)."""
         from data_gen.frames.motion import motion_vectors
+        from data_gen.samplers.restir.carry import Stage
         from data_gen.samplers.restir.history import History
 
-        history = History(self.scene, self.plan, self.sensor, seed, chains, **options)
+        history = History(Stage(self.scene, self.plan, self.sensor), seed, chains, **options)
         before = None
         for frame in range(count):
             now = self.at(frame)

@@ -93,11 +93,17 @@ def test_a_record_takes_80_bytes(renderer):
 
 
 def test_kind_and_depth_share_a_word(renderer):
-    from data_gen.samplers.restir.record import MOST_REPLAYED, STUCK, empty, word_of
+    from data_gen.samplers.restir.record import MOST_VERTICES, STUCK, empty, word_of
 
-    for kind, replayed in ((STUCK, 0), (0, MOST_REPLAYED), (3, 7)):
-        record = replace(empty(1), word=word_of(renderer.UInt32(kind), renderer.UInt32(replayed)))
-        assert (record.kind[0], record.replayed[0]) == (kind, replayed)
+    for kind, replayed, behind, sampled in (
+        (STUCK, 0, 9, True),
+        (0, MOST_VERTICES, 0, False),
+        (3, 7, MOST_VERTICES, True),
+    ):
+        word = word_of(*(renderer.UInt32(n) for n in (kind, replayed, behind)), renderer.Bool(sampled))
+        record = replace(empty(1), word=word)
+        found = (record.kind[0], record.replayed[0], record.behind[0], record.sampled[0])
+        assert found == (kind, replayed, behind, sampled)
 
 
 def test_a_record_is_worth_in_its_own_pixel_what_was_recorded(paths):
@@ -188,6 +194,6 @@ def test_what_records_cannot_hold_is_refused(paths, option):
     from data_gen.samplers.restir.events import check
     from ngpt.errors import NgptError
 
-    check(paths.scene, paths.plan)
+    check(paths.plan)
     with pytest.raises(NgptError, match="restir"):
-        check(paths.scene, replace(paths.plan, **{option: True}))
+        check(replace(paths.plan, **{option: True}))

@@ -8,7 +8,8 @@ vertices that are replayed may be joined, and the one before rc must be connecta
 At its own place, by its own camera, E gives back the f that was recorded, to float32.
 
 Occlusion is tested by a shadow ray, whose ends are kept off surfaces by epsilons, and a walk by what its ray meets. Of
-90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record are those of a scene that does not move.
+90,000 paths in three scenes none differed. ``P`` and ``shape`` of a record are those of this scene: what was found in
+another is carried here first, see ``data_gen.samplers.restir.carry``.
 """
 
 from __future__ import annotations

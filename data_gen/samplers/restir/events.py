@@ -11,6 +11,9 @@ from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.samplers.gpt.plan import Plan
 from ngpt.errors import NgptError
 
+# Random numbers of a vertex, all told
+DRAWN = 6
+
 
 @dataclass
 class Numbers:
@@ -59,7 +62,7 @@ def sample_event(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, number
     return Event(found, kind, sample.wo, sample.pdf, sample.eta, dr.select(found, f_p, 0), ray, hit, x1, joined)
 
 
-def check(scene: mi.Scene, plan: Plan) -> None:
+def check(plan: Plan) -> None:
     """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera, media."""
     if not mi.is_rgb or mi.is_polarized:
         raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")

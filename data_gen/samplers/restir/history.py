@@ -1,4 +1,4 @@
-r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to frame while the camera moves.
+r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to frame.
 
     for each frame
         a candidate for each pixel                                             ``walk``
@@ -18,14 +18,17 @@ So of the nearest pixel all is taken over, what lies beside it moved by a whole 
 found by this frame's candidate, then, straight, and wrapped: their MIS weights sum to 1, whatever m is. Confidence is
 handed on in proportion to the areas. [Zhang et al. 2024, "Area ReSTIR"; gradient-domain ReSTIR 2025, section 4.3.1]
 
-That is unbiased as long as the camera alone moves, and motion depends on no random numbers. Lanes of ``chains`` of a
-pixel know nothing of each other. One chain has no variance: its frames are correlated, over ``cap`` of them, and must
-not be put into a film as if they were samples. Several have the variance over chains.
+That is unbiased as long as motion depends on no random numbers. Where more than the camera changes there are two
+scenes, and records are carried into the one that E is of: see ``data_gen.samplers.restir.carry``. Lanes of ``chains``
+of a pixel know nothing of each other. One chain has no variance: its frames are correlated, over ``cap`` of them, and
+must not be put into a film as if they were samples. Several have the variance over chains.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -33,7 +36,7 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
-from data_gen.samplers.gpt.plan import Plan
+from data_gen.samplers.restir.carry import Carry, Stage
 from data_gen.samplers.restir.evaluate import Shifted, evaluate_record
 from data_gen.samplers.restir.events import check
 from data_gen.samplers.restir.footprint import CORNERS, confidence_after, pair_motions
@@ -82,7 +85,7 @@ class _Offer:
 
 
 class History:
-    """The reservoirs of a scene whose camera moves, frame after frame.
+    """The reservoirs of a shot, frame after frame.
 
     Lanes are ordered pixel by pixel, within a pixel by chain. ``cap`` is the confidence that a reservoir can reach, in
     frames; 1: hardly any history. Without ``pairs``, differences have no reservoirs of their own: they are taken of the
@@ -92,46 +95,53 @@ class History:
 
     def __init__(
         self,
-        scene: mi.Scene,
-        plan: Plan,
-        sensor: mi.Sensor,
+        stage: Stage,
         seed: int,
         chains: int = 1,
         cap: float = 32,
         pairs: bool = True,
     ):
-        check(scene, plan)
-        self.scene, self.plan, self.sensor, self.seed = scene, plan, sensor, seed
+        check(stage.plan)
+        self.stage = self.before = stage
+        self.seed = seed
         self.chains, self.cap, self.pairs = chains, cap, pairs
         self.gradients = True
         self.frames = 0
         self.kept: Reservoir | None = None
         self.pose: Pose | None = None
-        width, height = (int(n) for n in sensor.film().crop_size())
+        width, height = (int(n) for n in stage.sensor.film().crop_size())
         self.size = (width, height)
         self.confidence = np.zeros((len(STEPS), height, width), np.float32)
 
-    def next_frame(self, motion: np.ndarray | None = None, depth: np.ndarray | None = None) -> Frame:
+    def next_frame(
+        self, motion: np.ndarray | None = None, depth: np.ndarray | None = None, stage: Stage | None = None
+    ) -> Frame:
         """Renders a frame.
+
+        ``stage`` is the scene as it is now, where more than the camera has changed: another scene than that of the
+        frame before, which is still as it was then. None: the same scene.
 
         ``motion`` (H, W, 2) is that of ``data_gen.frames.motion``, NaN where there is no history; None: nothing moves.
         ``depth`` (H, W) tells which pixel of a pair is the nearer one, whose motion is that of both.
         """
         width, height = self.size
+        self.before, self.stage = self.stage, stage or self.stage
+        if self.stage is not self.before:
+            check(self.stage.plan)
         motions = pair_motions(np.zeros((height, width, 2)) if motion is None else motion, depth, STEPS.values())
         with recording():
             self.at = Layout(self.size, self.chains, RESERVOIRS if self.pairs else 1, motions, self.confidence)
-            camera = CameraSamples(self.sensor, self.seed, self.chains, self.frames * self.chains)
+            camera = CameraSamples(self.stage.sensor, self.seed, self.chains, self.frames * self.chains)
             sample = (
                 dr.opaque(mi.UInt32, self.frames * self.chains) + dr.arange(mi.UInt32, self.at.lanes) % self.at.chains
             )
             choice = choices(self.seed, camera, sample)
-            found = walk(self.scene, self.plan, camera, sample, choice)
+            found = walk(self.stage.scene, self.stage.plan, camera, sample, choice)
             u = [choice.next_1d() for _ in range(self.at.reservoirs)]
             dr.eval(found, u)
             frame = self._resample(camera, found, dr.concat(u))
         self.confidence = confidence_after(self.confidence, motions, STEPS.values(), self.cap)
-        self.pose = Pose(self.sensor)
+        self.pose, self.before = Pose(self.stage.sensor), self.stage
         self.frames += 1
         return frame
 
@@ -140,21 +150,35 @@ class History:
         """Pixels that a value is of."""
         return 2 if self.pairs else 1
 
-    def _of(self, pool: Record, lanes: int, ends: int, active: mi.Bool, request: Request) -> Requests:
+    @contextmanager
+    def _then(self) -> Iterator[Stage]:
+        """The scene of the frame before, for a while."""
+        if self.before is not self.stage:
+            yield self.before
+            return
+        with self.pose.of(self.stage.sensor):
+            yield self.stage
+
+    def _carried(self, record: Record, source: Stage, target: Stage, active: mi.Bool) -> Record:
+        return record if source is target else Carry(source, target)(self.seed, record, active)
+
+    def _of(self, stage: Stage, pool: Record, lanes: int, ends: int, active: mi.Bool, request: Request) -> Requests:
         def evaluate(record: Record, place: mi.Point2f, exists: mi.Bool) -> Shifted:
-            return evaluate_record(self.scene, self.plan, self.sensor, self.seed, record, place, exists)
+            return evaluate_record(stage.scene, stage.plan, stage.sensor, self.seed, record, place, exists)
 
         return evaluate_some(evaluate, pool, lanes, ends, active, request)
 
     def _resample(self, camera: CameraSamples, found: Candidate, u: mi.Float) -> Frame:
-        e = _Evaluated()
-        if self.kept is not None:
-            e.here = self._here(self.kept)
-            with self.pose.of(self.sensor):
-                e.elsewhere, e.there = self._elsewhere(self.kept), self._there(found)
+        e, kept = _Evaluated(), self.kept
+        if kept is not None:
+            with self._then() as stage:
+                back = self._carried(found.record, self.stage, self.before, found.W > 0)
+                e.elsewhere, e.there = self._elsewhere(stage, kept), self._there(stage, replace(found, record=back))
+            kept = replace(kept, record=self._carried(kept.record, self.before, self.stage, kept.W > 0))
+            e.here = self._here(kept)
         if self.pairs:
             e.partners = self._partners(found.record, found.W)
-        kept = self._merged(found, self.kept, e, u)
+        kept = self._merged(found, kept, e, u)
         dr.eval(kept)
         self.kept = kept
         values = kept.estimate()
@@ -182,7 +206,9 @@ class History:
         lane = dr.arange(mi.UInt32, 4 * self.at.lanes)
         i, where = place(lane)
         active = (dr.gather(mi.Float, W, i) > 0) & self.at.on_film(mi.Point2i(dr.floor(where)))
-        return self._of(record, 4 * self.at.lanes, 1, active, lambda lane, end: (*place(lane), mi.Bool(True)))
+        return self._of(
+            self.stage, record, 4 * self.at.lanes, 1, active, lambda lane, end: (*place(lane), mi.Bool(True))
+        )
 
     def _here(self, kept: Reservoir) -> Requests:
         """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir."""
@@ -193,9 +219,9 @@ class History:
 
         lanes = self.at.total * len(CORNERS)
         good = self.at.corner(dr.arange(mi.UInt32, lanes), kept).good
-        return self._of(kept.record, lanes, self._ends, good, request)
+        return self._of(self.stage, kept.record, lanes, self._ends, good, request)
 
-    def _elsewhere(self, kept: Reservoir) -> Requests:
+    def _elsewhere(self, stage: Stage, kept: Reservoir) -> Requests:
         """The same in the frame before, where else the path could have been."""
 
         def request(lane: mi.UInt32, end: mi.UInt32):
@@ -205,9 +231,9 @@ class History:
         lanes = self.at.total * len(CORNERS)
         it = self.at.corner(dr.arange(mi.UInt32, lanes), kept)
         known = it.twice & (self.at.confidence(it.domain, it.other) > 0)
-        return self._of(kept.record, lanes, self._ends, known, request)
+        return self._of(stage, kept.record, lanes, self._ends, known, request)
 
-    def _there(self, found: Candidate) -> Requests:
+    def _there(self, stage: Stage, found: Candidate) -> Requests:
         """Each candidate in the frame before: requests of lane, of primal, dx and dy as side 0 and 1; all that twice,
         straight and wrapped."""
 
@@ -225,7 +251,7 @@ class History:
 
         _, _, i, _, good = where(dr.arange(mi.UInt32, 2 * self.at.total))
         good &= dr.gather(mi.Float, found.W, i) > 0
-        return self._of(found.record, 2 * self.at.total, self._ends, good, request)
+        return self._of(stage, found.record, 2 * self.at.total, self._ends, good, request)
 
     # ------------------------------ What is kept ------------------------------
 

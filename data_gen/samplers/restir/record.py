@@ -19,7 +19,7 @@ Kinds of paths, by what ends them:
     LIGHT       a sampled emitter, before there is an rc: its numbers are replayed as well, whatever kind of lamp it is
     HIT         rc is on a lamp, or the environment
     RC_LIGHT    an emitter sampled at rc; one that no direction meets (a point) counts as SUFFIX without ``p_light``
-    SUFFIX      anything behind the direction from rc on
+    SUFFIX      anything behind the direction from rc on: ``behind`` vertices, and a lamp, at the last or sampled there
     REPLAY      a lamp, without an rc: mirrors and glass all along
     STUCK       it leaves rc by a Dirac delta or a hole: a path that comes from elsewhere cannot follow, so no other
                 pixel has it, and ``evaluate`` gives 0
@@ -36,9 +36,11 @@ import mitsuba as mi
 
 LIGHT, HIT, RC_LIGHT, SUFFIX, REPLAY, STUCK = range(6)
 
-_KIND_BITS = 3
-# Vertices of a prefix that a record can count
-MOST_REPLAYED = (1 << 32 - _KIND_BITS) - 1
+# Of a word, from its lowest bits on: kind, whether the lamp was sampled, vertices behind rc, those that are replayed
+_KIND_BITS, _COUNT_BITS = 3, 14
+_BEHIND, _REPLAYED = _KIND_BITS + 1, _KIND_BITS + 1 + _COUNT_BITS
+# Vertices that a record can count. Russian roulette ends paths by then, for none survives a step for certain.
+MOST_VERTICES = (1 << _COUNT_BITS) - 1
 
 
 @dataclass
@@ -48,7 +50,7 @@ class Record:
     pixel: mi.UInt32  # whose numbers the path was sampled with; ``sample`` counts on over the frames of a sequence
     sample: mi.UInt32
     place: mi.Point2f  # on the film, in pixels: where the path lives now, at first where its camera sample fell
-    word: mi.UInt32  # kind, and how many vertices are left by replay
+    word: mi.UInt32  # kind, ``sampled``, ``behind``, and how many vertices are left by replay
     P: mi.Point3f  # rc, if it is on a surface
     shape: mi.ShapePtr  # there; none where rc is in the environment, and for paths without rc
     primitive: mi.UInt32
@@ -63,8 +65,18 @@ class Record:
         return self.word & ((1 << _KIND_BITS) - 1)
 
     @property
+    def sampled(self) -> mi.Bool:
+        """Whether the lamp was sampled: of what leaves rc along ``w``, from the last vertex behind it, or from rc."""
+        return (self.word >> _KIND_BITS) & 1 == 1
+
+    @property
+    def behind(self) -> mi.UInt32:
+        """Vertices after rc, the lamp's own among them if it was not sampled."""
+        return (self.word >> _BEHIND) & MOST_VERTICES
+
+    @property
     def replayed(self) -> mi.UInt32:
-        return self.word >> _KIND_BITS
+        return self.word >> _REPLAYED
 
     def hit(self, origin: mi.Point3f) -> tuple[mi.PreliminaryIntersection3f, mi.Ray3f]:
         """rc as what a ray from ``origin`` meets, and the ray."""
@@ -87,8 +99,9 @@ class Record:
         return replace(self, place=place, geometry=geometry)
 
 
-def word_of(kind: mi.UInt32, replayed: mi.UInt32) -> mi.UInt32:
-    return kind | (replayed << _KIND_BITS)
+def word_of(kind: mi.UInt32, replayed: mi.UInt32, behind: mi.UInt32, sampled: bool | mi.Bool) -> mi.UInt32:
+    flag = dr.select(sampled, mi.UInt32(1 << _KIND_BITS), 0)
+    return kind | flag | (behind << _BEHIND) | (replayed << _REPLAYED)
 
 
 def geometry_of(normal: mi.Normal3f, at: mi.Point3f, origin: mi.Point3f) -> mi.Float:

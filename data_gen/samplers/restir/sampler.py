@@ -1,6 +1,8 @@
-"""The sampler ``restir``: a film of each frame of a shot whose camera moves."""
+"""The sampler ``restir``: a film of each frame of a shot."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import mitsuba as mi
 import numpy as np
@@ -11,7 +13,9 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
 from data_gen.samplers.gpt.plan import make_plan
+from data_gen.samplers.restir.carry import Stage
 from data_gen.samplers.restir.history import Frame, History
+from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
 
@@ -41,29 +45,40 @@ class Restir:
             raise NgptError(f"restir: a history of {history:g} frames; give 1 or more")
         if gradients not in ("pairs", "after"):
             raise NgptError(f"restir: unknown gradients '{gradients}'; choose pairs or after")
-        self.scene, self.sensor, self.spp = scene, scene.sensors()[0], spp
-        self.path = reference_integrator(scene)
-        depths = path_depths(self.path)
-        if not depths:
-            raise NgptError(f"restir: cannot read max_depth and rr_depth from the integrator {str(self.path)!r}")
-        limit = depths["max_depth"] if depths["max_depth"] >= 0 else 0xFFFFFFFF
-        plan = make_plan(
-            scene, roughness_threshold, limit, depths["rr_depth"], "replay", self.path.hide_emitters, caustic=False
-        )
+        self.spp, self._roughness = spp, roughness_threshold
+        self.stage = self._stage(scene, ())
         film = self._film()
         lanes_within(memory, film, film.pixels * spp, LANE_BYTES)
-        self._new = lambda: History(scene, plan, self.sensor, seed, spp, history, gradients == "pairs")
+        self._new = lambda: History(self.stage, seed, spp, history, gradients == "pairs")
         self._history = self._new()
 
-    def film(self, index: int, motion: np.ndarray | None, depth: np.ndarray | None) -> GradientFilm:
+    def _stage(self, scene: mi.Scene, shapes: Sequence[Geometry]) -> Stage:
+        path = reference_integrator(scene)
+        depths = path_depths(path)
+        if not depths:
+            raise NgptError(f"restir: cannot read max_depth and rr_depth from the integrator {str(path)!r}")
+        limit = depths["max_depth"] if depths["max_depth"] >= 0 else 0xFFFFFFFF
+        plan = make_plan(scene, self._roughness, limit, depths["rr_depth"], "replay", path.hide_emitters, caustic=False)
+        return Stage(scene, plan, scene.sensors()[0], shapes)
+
+    def film(
+        self,
+        index: int,
+        motion: np.ndarray | None,
+        depth: np.ndarray | None,
+        changed: tuple[mi.Scene, Sequence[Geometry]] | None = None,
+    ) -> GradientFilm:
         """Frame number ``index`` of the shot; where it is not the one after the last, history begins anew.
 
-        ``motion`` and ``depth`` are those of ``History.next_frame``.
+        ``motion`` and ``depth`` are those of ``History.next_frame``. ``changed`` is the scene as it is now, and where
+        its shapes are; None where the camera alone has moved. Two frames in turn must be of two scenes, then.
         """
+        stage = None if changed is None else self._stage(*changed)
+        self.stage = stage or self.stage
         if index != self._history.frames:
             self._history = self._new()
             self._history.frames = index
-        frame = self._history.next_frame(motion, depth)
+        frame = self._history.next_frame(motion, depth, stage)
         film = self._film()
         with recording():
             self._put(film, frame)
@@ -76,19 +91,21 @@ class Restir:
         return float(self._history.confidence[0].mean())
 
     def _film(self) -> GradientFilm:
-        return GradientFilm(*(int(n) for n in self.sensor.film().crop_size()))
+        return GradientFilm(*(int(n) for n in self.stage.sensor.film().crop_size()))
 
     def _put(self, film: GradientFilm, frame: Frame) -> None:
         camera = frame.camera
         ray, importance, _ = camera.rays()
-        direct = importance * emission_seen(self.scene, self.path, None, ray, mi.Bool(True))
+        direct = importance * emission_seen(
+            self.stage.scene, reference_integrator(self.stage.scene), None, ray, mi.Bool(True)
+        )
         film.put("primal", mi.Color3f(frame.primal + direct))
         film.put("direct", mi.Color3f(direct))
         for name in ("dx", "dy"):
             # The film takes the mean of both directions of a difference. Here there is one for both.
             film.put(f"{name}+", mi.Color3f(2 * getattr(frame, name)))
             film.put(f"{name}-", mi.Color3f(0 * frame.primal))
-        film.put_all(features(self.scene, self.sensor, camera.random.clone(), ray))
+        film.put_all(features(self.stage.scene, self.stage.sensor, camera.random.clone(), ray))
 
 
 def make(scene: mi.Scene, seed: int, spp: int, memory: int, **options) -> Restir:

@@ -116,6 +116,8 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
             word_of(
                 dr.select(before, mi.UInt32(LIGHT), dr.select(at, at_rc, ends)),
                 dr.select(before, depth - 1, replayed),
+                dr.select(before, 0, depth - 2 - replayed),
+                True,
             ),
             dr.select(lit, F * B * fm * Le_p, 0),
             dr.select(behind, w, light.d),
@@ -140,7 +142,9 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
         density = joins | follows
         f_p = dr.select(density, f / p, event.f_p)
         η = dr.select(event.found, η * event.η, η)
-        survival, walks = roulette(plan, depth, F * W * B * f_p, f_p, η, numbers.survival, [])
+        # Behind rc it goes by what is behind rc alone, so that it can be played again from there.
+        β1 = dr.select(behind, B, F * W) * f_p
+        survival, walks = roulette(plan, depth, β1, f_p, η, numbers.survival, [])
         # Where a join has no density, after that correction, there is no such path.
         walks &= event.found & (~joins | (p > 0))
         survival = dr.select(walks, survival, 0)
@@ -164,6 +168,8 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
             word_of(
                 dr.select(joins, mi.UInt32(HIT), dr.select(before, mi.UInt32(REPLAY), ends)),
                 dr.select(before & ~joins, depth, replayed),
+                dr.select(before, 0, depth - 1 - replayed),
+                False,
             ),
             dr.select(walks, F * B * Le * m, 0),
             w,
@@ -173,6 +179,7 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
         L += dr.select(walks, met.f * W, 0)
         chosen, total = _stream(chosen, total, met, W, u_hit)
 
+        η = dr.select(at, 1, η)
         phase = dr.select(joins | at, phase + 1, phase)
         x = x1
         depth += 1

@@ -1,0 +1,184 @@
+r"""Records of one frame, carried into the scene of another: where things or lights move, what was found is found anew.
+
+A path is the same path in both scenes if its random numbers are, and rc is the same point of the same shape:
+
+| part of the path | in the other scene | Jacobian |
+|---|---|---|
+| prefix, choice of an emitter | the same random numbers; by ``evaluate``, as from pixel to pixel | 1 |
+| rc | the point moves as its shape does | the stretch of the surface there, put into ``geometry`` |
+| the direction from rc on | the same in the world | 1 |
+| what is behind it | the same random numbers: light, and Russian roulette, are found anew | 1 |
+
+Nothing of that depends on the pixel that a path is in. So a record is carried once, and everything else is E in either
+scene. The way back is the same, and what it cannot undo is never carried: rc on a shape that was not there, or that has
+other triangles. [Lin et al. 2022: shifts between domains of any kind, here those of two times]
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.lights import emission
+from data_gen.paths.shift import mis_weight
+from data_gen.paths.vertex import SMOOTH, evaluate
+from data_gen.samplers.gpt.base_path import light_mis, roulette
+from data_gen.samplers.gpt.plan import Plan
+from data_gen.samplers.restir.events import DRAWN, draw, sample_event
+from data_gen.samplers.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
+from data_gen.scenes.geometry import Geometry, Mesh
+
+
+@dataclass
+class Stage:
+    """A scene in the state of one frame; ``shapes`` are those of its shapes, in their order."""
+
+    scene: mi.Scene
+    plan: Plan
+    sensor: mi.Sensor
+    shapes: Sequence[Geometry] = ()
+
+
+class Carry:
+    """How the shapes of one scene lie in another: what takes records from ``source`` to ``target``."""
+
+    def __init__(self, source: Stage, target: Stage):
+        self.target = target
+        ids = np.array(dr.reinterpret_array(mi.UInt32, source.scene.shapes_dr()))
+        number = np.full(int(ids.max(initial=0)) + 1, -1, np.int32)
+        number[ids] = np.arange(len(ids))
+        count = min(len(source.shapes), len(target.shapes))
+        number[number >= count] = -1
+        moves, first, stretches = np.tile(np.eye(4)[:3], (max(count, 1), 1, 1)), np.zeros(max(count, 1), np.uint32), []
+        last, unit = 1, np.ones(1)
+        for i in range(count):
+            old, new = source.shapes[i], target.shapes[i]
+            if isinstance(old, np.ndarray) and isinstance(new, np.ndarray):
+                if not np.array_equal(old, new):
+                    moves[i] = (new @ np.linalg.inv(old))[:3]
+            elif isinstance(old, Mesh) and isinstance(new, Mesh) and old.faces.shape == new.faces.shape:
+                if not (np.array_equal(old.vertices, new.vertices) and np.array_equal(old.faces, new.faces)):
+                    first[i] = last
+                    stretches.append(_areas(new) / np.maximum(_areas(old), 1e-37))
+                    last += len(new.faces)
+            else:
+                number[number == i] = -1
+        self.number = mi.Int32(number)
+        self.size = dr.opaque(mi.UInt32, len(number))
+        self.shapes = target.scene.shapes_dr()
+        self.moves = [[mi.Float(np.ascontiguousarray(moves[:, i, j])) for j in range(4)] for i in range(3)]
+        self.first = mi.UInt32(first)
+        self.stretches = mi.Float(np.concatenate([unit, *stretches]).astype(np.float32))
+        self.stretched = mi.Bool(first > 0)
+
+    def __call__(self, seed: int, record: Record, active: mi.Bool) -> Record:
+        """The records in the other scene, evaluated; of those that are not ``active`` nothing is known."""
+        target = self.target
+        kind, far = record.kind, record.escapes()
+        joined = active & (kind != LIGHT) & (kind != REPLAY) & (kind != STUCK)
+        surface = joined & ~far
+        pointer = dr.reinterpret_array(mi.UInt32, record.shape)
+        at = dr.gather(mi.Int32, self.number, pointer, surface & (pointer < self.size))
+        known = surface & (pointer < self.size) & (at >= 0)
+        at = dr.select(known, mi.UInt32(at), 0)
+        shape = dr.gather(mi.ShapePtr, self.shapes, at, known)
+
+        # rc: of a mesh by its triangle, of other shapes by their motion
+        rows = [[dr.gather(mi.Float, value, at) for value in row] for row in self.moves]
+        A = mi.Matrix3f([row[:3] for row in rows])
+        P = mi.Point3f(A @ mi.Vector3f(record.P) + mi.Vector3f(*(row[3] for row in rows)))
+        moved = replace(record, P=P, shape=shape)
+        # Seen from anywhere: no farther off than it was from its predecessor, as rounding goes
+        hit, ray = moved.hit(P + record.w * dr.rsqrt(dr.maximum(record.geometry, 1e-20)))
+        x = hit.compute_surface_interaction(ray, active=known)
+        face = dr.gather(mi.Bool, self.stretched, at)
+        place = dr.gather(mi.UInt32, self.first, at) + dr.select(face, record.primitive, 0)
+        stretch = dr.gather(mi.Float, self.stretches, place)
+        # The normal of a plane that is moved by A is that of before, by the inverse transpose.
+        n = mi.Vector3f(x.n)
+        stretch *= dr.abs(dr.det(A)) / dr.norm(
+            sum((mi.Vector3f(*rows[i][:3]) * n[i] for i in range(3)), mi.Vector3f(0))
+        )
+        lost = surface & ~(known & x.is_valid() & (stretch > 0) & dr.isfinite(stretch))
+
+        behind = known & ~lost & ((kind == RC_LIGHT) | (kind == SUFFIX))
+        camera = CameraSamples.replayed(target.sensor, seed, record.pixel, record.sample, record.place)
+        # rc's own numbers come behind those of the vertices that are replayed and of the one before it.
+        random = camera.random
+        random.skip(mi.UInt32(DRAWN) * (record.replayed + 1))
+        w, L, p_light, delta = _behind(target.scene, target.plan, random, x, record, behind)
+        at_rc = behind & record.sampled & (record.behind == 0)
+        kind = dr.select(at_rc, dr.select(delta, mi.UInt32(SUFFIX), mi.UInt32(RC_LIGHT)), kind)
+        kind = dr.select(lost, mi.UInt32(STUCK), kind)
+        found = replace(
+            moved,
+            word=word_of(kind, record.replayed, record.behind, record.sampled),
+            P=dr.select(known, x.p, record.P),
+            w=dr.select(behind, w, record.w),
+            L=dr.select(behind, L, record.L),
+            p_light=dr.select(behind, p_light, record.p_light),
+            geometry=dr.select(known, record.geometry / stretch, record.geometry),
+        )
+        dr.eval(found)
+        return found
+
+
+def _areas(mesh: Mesh) -> np.ndarray:
+    a, b, c = (mesh.vertices[mesh.faces[:, i]] for i in range(3))
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1)
+
+
+def _behind(
+    scene: mi.Scene, plan: Plan, random, x: mi.SurfaceInteraction3f, record: Record, active: mi.Bool
+) -> tuple[mi.Vector3f, mi.Spectrum, mi.Float, mi.Bool]:
+    """What is behind rc, ``x``, by these random numbers: ``w``, ``L`` and ``p_light`` of a record; whether its lamp,
+    sampled at rc, is one that no direction meets."""
+    light, Le_p, lit = _sampled(scene, x, draw(random), active & record.sampled & (record.behind == 0))
+    w = dr.select(lit, light.d, record.w)
+    L = dr.select(lit, Le_p, 0)
+    p_light = dr.select(lit & ~light.delta, light.pdf, 0)
+
+    walks = active & (record.behind > 0)
+    x1 = scene.ray_intersect(x.spawn_ray(record.w), walks)
+    met = walks & (record.behind == 1) & ~record.sampled
+    Le, p = emission(scene, x1, x, met, met)
+    L = dr.select(met, Le, L)
+    p_light = dr.select(met, p, p_light)
+    return w, L + _further(scene, plan, random, x1, record, walks & ~met & x1.is_valid()), p_light, light.delta
+
+
+def _sampled(scene: mi.Scene, x: mi.SurfaceInteraction3f, numbers, active: mi.Bool):
+    """A sampled emitter, its Le V / p, and whether there is one."""
+    lit = active & mi.has_flag(x.bsdf().flags(), mi.BSDFFlags.Smooth)
+    light, Le_p = scene.sample_emitter_direction(x, numbers.light, True, lit)
+    return light, Le_p, lit & (light.pdf != 0)
+
+
+@dr.syntax
+def _further(scene, plan: Plan, random, x, record: Record, active):
+    """``L`` of what ends behind the first vertex after rc, which is ``x``: as in ``walk``, along the one path."""
+    L, B, η, i = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), mi.UInt32(1)
+    behind, sampled, depth = record.behind, record.sampled, record.replayed + 3
+    while active:
+        numbers = draw(random)
+        light, Le_p, lit = _sampled(scene, x, numbers, active & sampled & (i == behind))
+        f, p = evaluate(x.bsdf(), x, x.to_local(light.d), lit)
+        L = dr.select(lit, B * f * light_mis(light.delta, light.pdf, p) * Le_p, L)
+        event = sample_event(scene, plan, x, numbers, active & (i < behind))
+        η = dr.select(event.found, η * event.η, η)
+        survival, walks = roulette(plan, depth, B * event.f_p, event.f_p, η, numbers.survival, [])
+        walks &= event.found
+        B *= dr.select(walks, event.f_p * survival, 0)
+        met = walks & ~sampled & (i + 1 == behind)
+        Le, p_light = emission(scene, event.x1, x, met, met & (event.kind == SMOOTH))
+        L = dr.select(met, B * Le * mis_weight(event.p, p_light), L)
+        x = event.x1
+        i += 1
+        depth += 1
+        active = walks & ~met & x.is_valid() & (i <= behind)
+    return L
