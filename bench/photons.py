@@ -43,6 +43,8 @@ METHODS = {
     "primal": ("oidn",),
     "bdpt": ("primal", "oidn"),
     "vcm": ("primal", "oidn"),
+    "gvcm": ("primal", "l1", "wcv"),
+    "gbdpt": ("l1", "wcv"),
 }
 METHODS_IN_MEDIA = {
     "vpm": ("primal", "oidn"),
@@ -60,7 +62,7 @@ METHODS_IN_MEDIA = {
 TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1), "planes": ("gplanes", 0)}
 PHOTONS = (*TWINS, *(twin for twin, _ in TWINS.values()))
 # Samplers with one sample of each pixel in a pass, or a few
-IN_PASSES = (*PHOTONS, "bdpt", "vcm")
+IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
 DEFAULT = (*PHOTONS, "gpt", "primal")
 # Columns of the picture: samplers on surfaces and in media, and the method
 SHOWN = (
@@ -86,7 +88,7 @@ def main() -> None:
     parser.add_argument("--reference-by", metavar="SAMPLER", help="default: ppm, or bre in media")
     parser.add_argument("--samplers", nargs="+", default=DEFAULT, help="default: %(default)s")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
-    parser.add_argument("--vcm-radius", type=float, help="that of vcm (default: its own)")
+    parser.add_argument("--vcm-radius", type=float, help="that of vcm and gvcm (default: their own)")
     parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
     parser.add_argument("--cache", type=Path, default="out/photons", help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
@@ -145,8 +147,8 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
         for sampler in (METHODS_IN_MEDIA if foggy else METHODS)
         if sampler in args.samplers
     }
-    if "vcm" in wanted and args.vcm_radius:
-        wanted["vcm"] = {"radius": args.vcm_radius}
+    if args.vcm_radius:
+        wanted |= {sampler: {"radius": args.vcm_radius} for sampler in ("vcm", "gvcm") if sampler in wanted}
     shown = {}
     for sampler, (_, each) in costs_of(scene, wanted).items():
         spp = max(2, round(args.seconds / each))
