@@ -1,6 +1,7 @@
 """Even, adaptive and oracle sampling side by side, by the error of the final image of each method.
 
     python -m bench.adaptive --scenes diffuse glossy SCENE.xml ... [--spp 128] [-o bench/results/adaptive.json]
+    python -m bench.adaptive --by wcv --scenes diffuse SCENE.xml ... [--cache out/adaptive]
     python -m bench.adaptive --timed diffuse SCENE.xml ... [--timed-size 320 180]
     python -m bench.adaptive --table                                   # of what is in the file
 
@@ -13,6 +14,10 @@ adaptive samples cost is measured on larger ones, since each pass takes a time t
 for: CPU seconds of the process, all threads together, so that others on the machine do not lengthen them. They hold the
 runs of the method that the choice needs; the last run, which makes the image, is no part of either. The error of
 even samples in the same time is that of as many more samples, by the slope from half of --spp to twice as many.
+
+With --by the samples are shared out for one method, and all methods that can use its stacks are measured on them: a
+render a scene instead of one for each method, as without `ngpt render --for`. There are no half and twice as many even
+samples then. Stacks are kept in --cache.
 
 `pilot` is what `assess` expects of each method from 16 even samples per pixel, and what is true then; `expected` what
 it expects of the adaptive stacks, which is what `--error` goes by. A scene that is
@@ -31,6 +36,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from bench.common import metadata, save, summary
+from bench.pipelines import Kept
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import EPSILON, relative_squared_error, relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
@@ -64,23 +70,30 @@ def main() -> None:
     parser.add_argument("--known", type=int, default=3, help="renders that the oracle knows the error from")
     parser.add_argument("--reference-spp", type=int, default=4096)
     parser.add_argument("--methods", nargs="+", default=[name for name in SAMPLER if not METHODS[name].missing()])
+    parser.add_argument("--by", choices=[m for m, s in SAMPLER.items() if s == "gpt"], help="one method shares out")
+    parser.add_argument("--cache", type=Path, default=Path("out/adaptive"), help="folder for stacks, with --by")
     parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/adaptive.json"))
     args = parser.parse_args()
     if args.table:
-        print(*table(json.loads(args.output.read_text())), sep="\n")
+        result = json.loads(args.output.read_text())
+        for lines in (table(result), *(table_by(result, by) for by in result.get("by", {}))):
+            print(*lines, "", sep="\n")
         return
 
     from data_gen.backend import use_variant
 
     use_variant()
     result: dict = {"benchmark": "adaptive", "size": list(args.size), "spp": args.spp}
-    result |= {"metadata": metadata("mitsuba", "onnxruntime", "mitsuba-oidn"), "scenes": {}, "costs": {}}
+    result |= {"metadata": metadata("mitsuba", "onnxruntime", "mitsuba-oidn"), "scenes": {}, "by": {}, "costs": {}}
     if args.output.exists():
         before = json.loads(args.output.read_text())
-        result |= {part: before[part] for part in ("scenes", "costs")}
+        result |= {part: before[part] for part in ("scenes", "by", "costs") if part in before}
     for path in args.scenes:
-        result["scenes"][scene_name(path)] = bench_scene(path, args)
+        if args.by:
+            result["by"].setdefault(args.by, {})[scene_name(path)] = bench_by(path, args)
+        else:
+            result["scenes"][scene_name(path)] = bench_scene(path, args)
         save(args.output, result)
         print(scene_name(path), flush=True)
     for path in args.timed:
@@ -134,6 +147,50 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
                     if name == "adaptive":
                         row["expected"] = [adaptive.assess(stack, method).error ** 2 for stack in stacks]
                 result["methods"][method] = row
+    return result
+
+
+def bench_by(path: str, args: argparse.Namespace) -> dict:
+    """Method -> errors of its images of even samples, of those that ``args.by`` shared out by itself, and by its true
+    errors, one of each seed; and of the pilot's. All of sampler `gpt`."""
+    from data_gen import adaptive, passes
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(path, tuple(args.size))
+    kept = Kept(args.cache / f"{scene_name(path)}-{'x'.join(map(str, args.size))}-{args.spp}-{args.by}")
+
+    def render(name: str, spp: int, seed: int, **more) -> GradientStack:
+        more = {"sampler": "gpt"} | more
+        return kept.stack(f"{name}-{spp}-{seed}", lambda: render_stack(scene, spp, seed, **more))
+
+    with patch.object(passes, "PASS_SECONDS", 60.0):
+        half = {"spp": args.reference_spp // 2, "sampler": "primal", "with_features": False}
+        halves = [render("reference", seed=_REFERENCE | i, **half)["primal"] for i in range(2)]
+        known = [render("known", args.spp // 2, _KNOWN + seed) for seed in range(args.known)]
+        need = true_error(known, args.by, halves) * math.sqrt(args.spp // 2)
+
+        def told(stack, method):
+            n = stack["samples"].ravel() if "samples" in stack else float(stack.attributes["ngpt:spp"])
+            return adaptive.Assessment(need / np.sqrt(n), 0.0, method)
+
+        shared = {"adaptive": adaptive.Adaptive(None, args.by)}
+        stacks = {"pilot": [render("pilot", PILOT, 0)]}
+        stacks["even"] = [render("even", args.spp, seed) for seed in range(args.seeds)]
+        stacks["adaptive"] = [render("adaptive", args.spp, seed, **shared) for seed in range(args.seeds)]
+        with patch.object(adaptive, "assess", told):
+            stacks["oracle"] = [render("oracle", args.spp, seed, **shared) for seed in range(args.seeds)]
+    result: dict = {"setup": {name: getattr(args, name) for name in ("seeds", "known", "reference_spp")}, "methods": {}}
+    for method in (m for m in args.methods if SAMPLER[m] == "gpt"):
+        row: dict = {}
+        for name, each in stacks.items():
+            # Above 0: see bench_scene.
+            row[name] = [max(relmse_trimmed(reconstruct(stack, method).image, *halves), 1e-9) for stack in each]
+        row["expected"] = {
+            name: [adaptive.assess(stack, method).error ** 2 for stack in stacks[name]]
+            for name in ("pilot", "even", "adaptive")
+        }
+        result["methods"][method] = row
     return result
 
 
@@ -214,6 +271,30 @@ def table(result: dict) -> list[str]:
     }.items():
         lines.append(f"| {title} | " + " | ".join(cell(found[m]) for m in methods) + " |")
     lines.append("| seconds over even | " + " | ".join(f"{price(result['costs'], m):.2f}" for m in methods) + " |")
+    return lines + foretold
+
+
+def table_by(result: dict, by: str) -> list[str]:
+    """Lines of two tables in Markdown, of samples that one method shared out: errors of adaptive and of the oracle's
+    samples over those of even ones; and errors that were expected over the true ones, of the pilot, even and
+    adaptive."""
+    scenes = result["by"][by]
+    methods = list(dict.fromkeys(m for entry in scenes.values() for m in entry["methods"]))
+    head = ["| scene | " + " | ".join(f"`{m}`" for m in methods) + " |", "|---|" + "--:|" * len(methods)]
+    found: dict[str, list[tuple[float, ...]]] = {m: [] for m in methods}
+    lines, foretold = list(head), ["", *head]
+    for scene, entry in scenes.items():
+        told = []
+        for m, row in entry["methods"].items():
+            even = mean_log(row["even"])
+            found[m].append(tuple(mean_log(row[name]) / even for name in ("adaptive", "oracle")))
+            ratios = (math.sqrt(mean_log(e) / mean_log(row[name])) for name, e in row["expected"].items())
+            told.append(", ".join(f"{ratio:.2f}" for ratio in ratios))
+        lines.append(f"| {scene} | " + " | ".join(", ".join(f"{x:.2f}" for x in found[m][-1]) for m in methods) + " |")
+        foretold.append(f"| {scene} | " + " | ".join(told) + " |")
+    means = (", ".join(f"{mean_log([row[i] for row in found[m]]):.2f}" for i in (0, 1)) for m in methods)
+    worse = (", ".join(str(sum(row[i] > 1 for row in found[m])) for i in (0, 1)) for m in methods)
+    lines += ["| mean | " + " | ".join(means) + " |", "| worse than even | " + " | ".join(worse) + " |"]
     return lines + foretold
 
 

@@ -69,7 +69,7 @@ def main() -> None:
     if args.table:
         print(table(result))
     if args.docs:
-        write_page(PAGE, table(result))
+        write_page(PAGE, table(result), MARKS)
 
 
 def measure_all(args: argparse.Namespace) -> None:
@@ -188,11 +188,11 @@ def shown(name: str, row: dict) -> str:
     return f"{name} (apart)" if row["apart"] else name
 
 
-def write_page(page: Path, text: str) -> None:
+def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     """Puts the tables between the marks of the page."""
-    before, _, rest = page.read_text().partition(MARKS[0])
-    _, _, after = rest.partition(MARKS[1])
-    page.write_text(f"{before}{MARKS[0]}\n\n{text}\n\n{MARKS[1]}{after}")
+    before, _, rest = page.read_text().partition(marks[0])
+    _, _, after = rest.partition(marks[1])
+    page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
-from bench.photons import samples_within
+from bench.photons import costs_of
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relmse_trimmed
@@ -138,8 +138,8 @@ def bench_scene(name: str, args: argparse.Namespace) -> dict:
     scene = load(name, tuple(args.size))
     halves = [reference(scene, name, half, args) for half in range(2)]
     rows: dict = {"seconds": args.seconds, "error of half a reference": relmse_trimmed(halves[0], halves[1])}
-    for sampler in args.samplers:
-        spp = samples_within(scene, sampler, args.seconds, {})
+    for sampler, (start, each) in costs_of(scene, {sampler: {} for sampler in args.samplers}).items():
+        spp = max(2, round((args.seconds - start) / each))
         errors: dict[str, list[float]] = {}
         spent, light = [], []
         for seed in range(1, args.seeds + 1):

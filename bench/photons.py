@@ -1,18 +1,20 @@
 """Photons with and without gradients, path tracing with and without: errors at equal time on scenes with caustics.
 
-    python -m bench.photons --cache out/photons --scenes glossy SCENE.xml ... --picture docs/images/photons.jpg
+    python -m bench.photons --cache out/photons --scenes glossy SCENE.xml ... --picture docs/images/photons.jpg --docs
+    python -m bench.photons --table                                                         # of what is in the file
 
 Time is processor time of all threads together, so that other work on the machine does not change the comparison. What a
-sample costs is measured between two renders of one sampler; each gets as many as --seconds buy. The time in which the
-kernels of a pass are recorded counts, which is most of it for small images with few photons. The reference is made by
-photons, in two halves with their own seeds, of --reference-spp passes each with 16 light paths for each pixel, gathered
-within 1 pixel at first: path tracing does not find all the light here. Its blur is that of the photon maps, a little,
-on the photons' side. Errors are the trimmed relMSE.
+sample costs is measured between two renders of one sampler, the least of two, all samplers in turn; each gets as many
+as --seconds buy. What it takes to record the kernels of a render is not in that: images here are small, and renders
+short. The reference is made by photons, in two halves with their own seeds, of --reference-spp passes each with 16
+light paths for each pixel, gathered within 1 pixel at first: path tracing does not find all the light here. Its blur is
+that of the photon maps, a little, on the photons' side. Errors are the trimmed relMSE.
 
-Scenes with media have `bre` and `beams` for `ppm`, their gradient twins, and `vpm`. With --reference-by the reference
-is by another sampler: `primal` or `bdpt`, which are right where they find the light, of --reference-spp samples. With
---samplers others are compared than those of the picture, which has a row for each scene of surfaces alone. Scenes that
-are in the cache are not rendered again.
+Scenes with media have `vpm`, `bre` and `beams` for `ppm`, and their gradient twins. Samplers that refuse a scene are
+left out of it. With --reference-by the reference is by another sampler: `primal` or `bdpt`, which are right where they
+find the light, of --reference-spp samples. With --samplers others are compared. The picture has a row for each scene.
+Scenes that are in the cache are not rendered again, so scenes with references of several kinds are several calls; the
+last one names them all. --docs puts the tables into the page.
 """
 
 import argparse
@@ -24,7 +26,9 @@ import numpy as np
 
 import ngpt
 from bench import panels
+from bench.bidirectional import write_page
 from bench.common import metadata, save
+from ngpt.errors import NgptError
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relmse_trimmed
@@ -39,44 +43,62 @@ METHODS = {
     "primal": ("oidn",),
     "bdpt": ("primal", "oidn"),
     "vcm": ("primal", "oidn"),
+    "gvcm": ("primal", "l1", "wcv"),
+    "gbdpt": ("l1", "wcv"),
 }
 METHODS_IN_MEDIA = {
+    "vpm": ("primal", "oidn"),
+    "gvpm": ("primal", "l1", "wcv"),
     "bre": ("primal", "oidn"),
     "gbre": ("primal", "l1", "wcv"),
     "beams": ("primal", "oidn"),
     "gbeams": ("primal", "l1", "wcv"),
     "planes": ("primal", "oidn"),
     "gplanes": ("primal", "l1", "wcv"),
-    "vpm": ("primal", "oidn"),
     "gpt": ("l1", "wcv"),
     "primal": ("primal", "oidn"),
 }
-PHOTONS = ("ppm", "gpm", "vpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes")
+# Each photon sampler, its gradient twin, and the dimensions in which it blurs, in media
+TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1), "planes": ("gplanes", 0)}
+PHOTONS = (*TWINS, *(twin for twin, _ in TWINS.values()))
 # Samplers with one sample of each pixel in a pass, or a few
-IN_PASSES = (*PHOTONS, "bdpt", "vcm")
+IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
 DEFAULT = (*PHOTONS, "gpt", "primal")
-SHOWN = (("ppm", "primal"), ("gpm", "l1"), ("gpm", "wcv"), ("gpt", "l1"), ("primal", "oidn"))
+# Columns of the picture: samplers on surfaces and in media, and the method
+SHOWN = (
+    (("ppm", "vpm"), "primal"),
+    (("gpm", "gvpm"), "l1"),
+    (("gpt", "gpt"), "l1"),
+    (("primal", "primal"), "oidn"),
+)
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
-SETUP = ("size", "seconds", "radius", "photons", "reference_spp")
+SETUP = ("size", "seconds", "radius", "photons")
 REFERENCE = {"radius": 1.0, "photons": 16}
+PAGE = Path("docs/photons.md")
+MARKS = "<!-- python -m bench.photons -->", "<!-- ends here -->"
 TILE = 192
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scenes", nargs="+", required=True)
+    parser.add_argument("--scenes", nargs="+", default=[])
     parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
     parser.add_argument("--reference-by", metavar="SAMPLER", help="default: ppm, or bre in media")
     parser.add_argument("--samplers", nargs="+", default=DEFAULT, help="default: %(default)s")
     parser.add_argument("--radius", type=float, default=3.0, help="of the photons that are compared, in pixels")
-    parser.add_argument("--vcm-radius", type=float, help="that of vcm (default: its own)")
+    parser.add_argument("--vcm-radius", type=float, help="that of vcm and gvcm (default: their own)")
     parser.add_argument("--photons", type=int, default=1, help="light paths of a pass for each pixel")
-    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered, of one setup")
+    parser.add_argument("--cache", type=Path, default="out/photons", help="folder for what is rendered, of one setup")
     parser.add_argument("--picture", type=Path)
-    parser.add_argument("-o", "--output", default="bench/results/photons.json")
+    parser.add_argument("-o", "--output", type=Path, default="bench/results/photons.json")
+    parser.add_argument("--table", action="store_true", help="print the tables of the file, and measure nothing")
+    parser.add_argument("--docs", action="store_true", help=f"write the tables into {PAGE}")
     args = parser.parse_args()
+    if args.table:
+        print(table(json.loads(args.output.read_text())))
+        return
 
     from data_gen.backend import use_variant
 
@@ -95,12 +117,14 @@ def main() -> None:
         row = json.loads((folder / "row.json").read_text())
         images = [read_image(path) for path in sorted(folder.glob("*.exr"))]
         result["scenes"][scene_name(scene)] = row
-        if len(images) > len(SHOWN) and all(sampler in row for sampler, _ in SHOWN):
+        if len(images) > len(SHOWN):
             rows.append(images)
         save(args.output, result)
         print(scene_name(scene), row, flush=True)
-        if args.picture and rows:
-            panels.save(args.picture, picture(rows, result["scenes"]))
+    if args.picture and rows:
+        panels.save(args.picture, picture(rows))
+    if args.docs:
+        write_page(PAGE, table(result), MARKS)
 
 
 def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndarray]]:
@@ -118,50 +142,111 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
         for i in range(2)
     ]
     row: dict = {"reference": by, "error of half a reference": relmse_trimmed(halves[0], halves[1])}
+    wanted = {
+        sampler: {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
+        for sampler in (METHODS_IN_MEDIA if foggy else METHODS)
+        if sampler in args.samplers
+    }
+    if args.vcm_radius:
+        wanted |= {sampler: {"radius": args.vcm_radius} for sampler in ("vcm", "gvcm") if sampler in wanted}
     shown = {}
-    for sampler, methods in (METHODS_IN_MEDIA if foggy else METHODS).items():
-        if sampler not in args.samplers:
-            continue
-        options = {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
-        if sampler == "vcm" and args.vcm_radius:
-            options = {"radius": args.vcm_radius}
-        spp = samples_within(scene, sampler, args.seconds, options)
-        stack = render_stack(scene, spp, 0, sampler, **options)
-        row[sampler] = {"spp": spp}
-        for method in methods:
+    for sampler, (_, each) in costs_of(scene, wanted).items():
+        spp = max(2, round(args.seconds / each))
+        stack = render_stack(scene, spp, 0, sampler, **wanted[sampler])
+        row[sampler] = {"spp": spp, "milliseconds": round(1e3 * each, 3)}
+        for method in METHODS_IN_MEDIA[sampler] if foggy else METHODS[sampler]:
             image = shown[sampler, method] = denoise(stack, method)
             row[sampler][method] = float(f"{relmse_trimmed(image, *halves):.4g}")
-    return row, [shown[which] for which in SHOWN if which in shown] + [(halves[0] + halves[1]) / 2]
+    columns = [(samplers[foggy], method) for samplers, method in SHOWN]
+    return row, [shown[which] for which in columns if which in shown] + [(halves[0] + halves[1]) / 2]
 
 
-def samples_within(scene, sampler: str, seconds: float, options: dict) -> int:
-    """How many samples per pixel so much processor time buys, at least 2."""
+def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tuple[float, float]]:
+    """Of samplers with their options: seconds of a render of no samples, and of a sample; the least of some rounds.
+
+    Samplers take turns. Those that refuse the scene are left out.
+    """
     from data_gen.render import render_stack
 
-    def cost(spp: int) -> float:
+    def cost(sampler: str, spp: int) -> float:
         start = time.process_time()
-        render_stack(scene, spp, 1, sampler, **options)
+        render_stack(scene, spp, 1, sampler, **samplers[sampler])
         return time.process_time() - start
 
-    few, many = (4, 12) if sampler in IN_PASSES else (16, 64)
-    cost(few)  # compiles the kernels
-    fixed = cost(few)
-    each = max(cost(many) - fixed, 1e-3) / (many - few)
-    return max(2, round(1 + (seconds - fixed) / each))
+    counts = {sampler: (3, 9) if sampler in IN_PASSES else (16, 64) for sampler in samplers}
+    found: dict[str, tuple[float, float]] = {}
+    for turn in range(1 + rounds):
+        for sampler, (few, many) in list(counts.items()):
+            try:
+                short = cost(sampler, few)
+            except NgptError as refusal:
+                print(refusal)
+                del counts[sampler]
+                continue
+            # The first turn compiles the kernels.
+            if turn:
+                each = max(cost(sampler, many) - short, 1e-3) / (many - few)
+                found[sampler] = min(
+                    found.get(sampler, (np.inf, np.inf)), (short - few * each, each), key=lambda c: c[1]
+                )
+    return found
 
 
-def picture(rows: list[list[np.ndarray]], scenes: dict) -> np.ndarray:
-    headings = []
-    for sampler, method in SHOWN:
-        name = TITLES[sampler] if sampler == "primal" else sampler
-        what = name if method == "primal" else f"{name} and {TITLES[method]}"
-        headings.append([what, ", ".join(f"{scene[sampler][method]:.3g}" for scene in scenes.values())])
-    headings.append(["reference", "error (relMSE), by rows"])
-    stops = [auto_exposure(row[-1]) for row in rows]
+def table(result: dict) -> str:
+    """Two tables in Markdown: errors; and those of photons alone, in brackets with OIDN, over their twins'."""
+    scenes = result["scenes"]
+    lines = ["| method | " + " | ".join(scenes) + " |", "|---|" + "--:|" * len(scenes)]
+    methods = dict.fromkeys([*METHODS_IN_MEDIA.items(), *METHODS.items()])
+    found = [(s, m) for s, several in methods for m in several if any(m in row.get(s, {}) for row in scenes.values())]
+    least = {name: min(row[s][m] for s, m in found if m in row.get(s, {})) for name, row in scenes.items()}
+    for sampler, method in dict.fromkeys(found):
+        title = f"`{TITLES['primal'] if sampler == 'primal' else sampler}`"
+        cells = []
+        for name, row in scenes.items():
+            error = row.get(sampler, {}).get(method)
+            cells.append("" if error is None else f"**{error:.2g}**" if error == least[name] else f"{error:.2g}")
+        lines.append(f"| {title}{'' if method == 'primal' else f' and {TITLES[method]}'} | {' | '.join(cells)} |")
+    halves = (f"{row['error of half a reference']:.2g}, `{row['reference']}`" for row in scenes.values())
+    lines += ["| half a reference | " + " | ".join(halves) + " |", ""]
+    lines += [
+        "| scene | photons | blurred in | passes | cost of a pass | `l1` | `wcv` |",
+        "|---|---|--:|--:|--:|--:|--:|",
+    ]
+    for name, row in scenes.items():
+        for sampler, (twin, dimensions) in TWINS.items():
+            if sampler in row and twin in row:
+                one, other = row[sampler], row[twin]
+                gains = (f"{one['primal'] / other[m]:.2g} ({one['oidn'] / other[m]:.2g})" for m in ("l1", "wcv"))
+                cost = other["milliseconds"] / one["milliseconds"]
+                cells = (
+                    f"`{sampler}`, `{twin}`",
+                    f"{dimensions}D",
+                    f"{one['spp']}, {other['spp']}",
+                    f"{cost:.2g}",
+                    *gains,
+                )
+                lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
+def picture(rows: list[list[np.ndarray]]) -> np.ndarray:
+    headings: list[list[str]] = []
+    for samplers, method in SHOWN:
+        names = " or ".join(dict.fromkeys(TITLES["primal"] if s == "primal" else s for s in samplers))
+        what = names if method == "primal" else f"{names} and {TITLES[method]}"
+        headings.append([what])
+    headings.append(["reference"])
+    stops = [auto_exposure(images[-1]) for images in rows]
     tiles = []
     for column in range(len(headings)):
-        size = TILE, TILE * rows[0][0].shape[0] // rows[0][0].shape[1]
-        tiles.append([panels.scaled(to_srgb8(row[column], stop), size) for row, stop in zip(rows, stops, strict=True)])
+        shapes = [images[0].shape for images in rows]
+        sizes = [(TILE, TILE * height // width) for height, width, _ in shapes]
+        tiles.append(
+            [
+                panels.scaled(to_srgb8(images[column], stop), size)
+                for images, stop, size in zip(rows, stops, sizes, strict=True)
+            ]
+        )
     return panels.columns(headings, tiles)
 
 

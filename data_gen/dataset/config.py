@@ -41,6 +41,7 @@ class Config:
     scenes: int = 0
     varied: bool = False
     sights: dict[str, float] = field(default_factory=dict)
+    adaptive: float = 0.0
     crops: int = 4
     files: tuple[Files, ...] = ()
 
@@ -66,6 +67,8 @@ class Config:
         ):
             if bad:
                 raise NgptError(f"data configuration: {text}")
+        if self.adaptive:
+            self._check_adaptive()
         if self.sampler == "auto":
             return
         if not find(self.sampler).gradients and "dx" in METHODS[self.reference_method].needs:
@@ -73,6 +76,19 @@ class Config:
                 f"data configuration: reference_method '{self.reference_method}' needs gradients, and sampler "
                 f"'{self.sampler}' renders none; use 'oidn', or 'primal' with many samples"
             )
+
+    def _check_adaptive(self) -> None:
+        from data_gen.adaptive import LEAST  # It needs the renderer.
+
+        name = self.sampler
+        for bad, text in (
+            (not 0 < self.adaptive <= 1, "the share of inputs whose samples are shared out, 0 to 1"),
+            (self.frames > 1, "frames of shots have even samples; leave it out"),
+            (self.spp[1] < LEAST, f"fewer than {LEAST} samples cannot be shared out; spp goes up to {self.spp[1]}"),
+            (name != "auto" and find(name).batch > 0, f"the samples of '{name}' depend on each other; use 'gpt'"),
+        ):
+            if bad:
+                raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")
 
     def plan(self) -> list[Job]:
         """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""

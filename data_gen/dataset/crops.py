@@ -98,15 +98,39 @@ def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
     return [int(n) for n in np.exp(low + u * (high - low))]
 
 
+def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> list[bool]:
+    """Which inputs of the crop get uneven samples: ``config.adaptive`` of those with enough samples to share out.
+
+    By random numbers of their own, so that views, seeds and references are those of even samples.
+    """
+    if not config.adaptive:
+        return [False] * len(counts)
+    from data_gen.adaptive import LEAST
+
+    rng = np.random.default_rng((*scene_seed(config, name), crop, zlib.crc32(b"adaptive")))
+    return [bool(rng.random() < config.adaptive) and n >= LEAST for n in counts]
+
+
+def render_input(config: Config, scene, spp: int, seed: int, uneven: bool) -> GradientStack:
+    """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
+    from data_gen.adaptive import Adaptive
+    from data_gen.render import render_stack
+
+    stack = render_stack(scene, spp, seed, config.sampler, adaptive=Adaptive() if uneven else None)
+    if config.adaptive and "samples" not in stack:
+        stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
+    return stack
+
+
 def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
     """One crop and its record, or one of each frame of a shot; ``around`` are the ``Surroundings`` of its scene."""
     from data_gen.dataset.cameras import find_view
     from data_gen.dataset.movement import Movement, random_movement
     from data_gen.frames.motion import motion_vectors, snapshot
-    from data_gen.render import render_stack
 
     rng = np.random.default_rng((*scene_seed(config, name), crop))
     counts = sample_counts(rng, config)
+    uneven = uneven_inputs(config, name, crop, counts)
     scene, moving = around.scene, config.frames > 1
     clock = time.perf_counter()
     for _ in range(ATTEMPTS):
@@ -116,7 +140,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
         found = time.perf_counter() - clock
         seeds = _seeds(rng, config)
         clock = time.perf_counter()
-        first = render_stack(scene, counts[0], seeds[0], config.sampler)
+        first = render_input(config, scene, counts[0], seeds[0], uneven[0])
         if np.mean(np.nan_to_num(first["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
@@ -131,8 +155,8 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 found = time.perf_counter() - clock
                 seeds = _seeds(rng, config)
                 clock = time.perf_counter()
-                first = render_stack(scene, counts[0], seeds[0], config.sampler)
-            data, told = _crop(config, scene, first, counts, seeds, clock)
+                first = render_input(config, scene, counts[0], seeds[0], uneven[0])
+            data, told = _crop(config, scene, first, counts, seeds, uneven, clock)
             told = {"crop": crop, "view": movement.view_at(frame).record()} | told
             told["seconds"]["camera"] = round(found, 4)
             if moving:
@@ -153,14 +177,13 @@ def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def _crop(
-    config: Config, scene, first: GradientStack, counts: list[int], seeds: list[int], clock: float
+    config: Config, scene, first: GradientStack, counts: list[int], seeds: list[int], uneven: list[bool], clock: float
 ) -> tuple[CropData, dict]:
     """The crop of which ``first`` is the first input, begun at ``clock``, and its record."""
     from data_gen.render import render_stack
 
-    stacks = [first] + [
-        render_stack(scene, *pair, config.sampler) for pair in zip(counts[1:], seeds[1:-HALVES], strict=True)
-    ]
+    further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
+    stacks = [first] + [render_input(config, scene, *each) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
@@ -183,6 +206,7 @@ def _crop(
     told = {
         "spp": counts,
         "seeds": seeds,
+        **({"adaptive": uneven} if config.adaptive else {}),
         "repaired": [count for _, count in cleaned],
         "seconds": {part: round(value, 4) for part, value in seconds.items()},
     }

@@ -17,6 +17,7 @@ Not followed: bump and normal maps, whose derivatives Mitsuba keeps to itself.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -31,6 +32,15 @@ MAX_STEPS = 12
 TOLERANCE = 1e-4
 # How far from ω the walk back may end.
 RETURNS = 1e-3
+
+
+# Asked of each event but the first: whether a chain would have ended there, whatever the event.
+Ends = Callable[[mi.SurfaceInteraction3f], mi.Bool]
+
+
+def nowhere(si: mi.SurfaceInteraction3f) -> mi.Bool:
+    """A chain ends nowhere but behind its events."""
+    return mi.Bool(False)
 
 
 @dataclass
@@ -99,7 +109,15 @@ def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
 
 
 @dr.syntax
-def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True) -> Shot:
+def shoot(
+    scene,
+    z: mi.SurfaceInteraction3f,
+    ω: mi.Vector3f,
+    events: mi.UInt32,
+    target: Target,
+    active=True,
+    ends: Ends = nowhere,
+) -> Shot:
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
@@ -117,6 +135,7 @@ def shoot(scene, z: mi.SurfaceInteraction3f, ω: mi.Vector3f, events: mi.UInt32,
         u = dr.select(code == REFLECT, mi.Float(0), 1 - dr.epsilon(mi.Float))
         sample, f_P = si.bsdf().sample(mi.BSDFContext(), si, u, mi.Point2f(0.5), good)
         good &= si.is_valid() & (sample.pdf > 0) & (event(sample.sampled_type) == code)
+        good &= (left == events) | ~ends(si)
         # --------------------- Differentials ---------------------
         dp0, dn0 = on_surface(si, ray.d, dp0 + dd0 * si.t)
         dp1, dn1 = on_surface(si, ray.d, dp1 + dd1 * si.t)
@@ -183,12 +202,14 @@ def turn(code, η, n, d, dn0, dn1, dd0, dd1) -> tuple[mi.Vector3f, mi.Vector3f, 
 
 
 @dr.syntax
-def walk(scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True) -> tuple[mi.Vector3f, Shot, mi.Bool]:
+def walk(
+    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, ends: Ends = nowhere
+) -> tuple[mi.Vector3f, Shot, mi.Bool]:
     """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
 
     A step that breaks the chain, or comes no nearer, is halved.
     """
-    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active)
+    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)
     active = best.good & ~found
@@ -200,7 +221,7 @@ def walk(scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=Tr
         s = (best.B1.y * best.miss.x - best.B1.x * best.miss.y) * scale
         t = (best.B0.x * best.miss.y - best.B0.y * best.miss.x) * scale
         next_ω = dr.normalize(best_ω + turns.s * s + turns.t * t)
-        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t))
+        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends)
         nearer = shot.good & (dr.norm(shot.miss) < error)
         part = dr.select(nearer, dr.fmin(1, 2 * part), part / 2)
         if nearer:
@@ -212,7 +233,7 @@ def walk(scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=Tr
 
 
 def follow(
-    scene, z, ω, base: Shot, z1, events, target: Target, active=True
+    scene, z, ω, base: Shot, z1, events, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Float, mi.Bool]:
     """The copy, from vertex ``z1``, of the chain that the ``base`` shot took from ``z`` in direction ``ω``.
 
@@ -220,10 +241,10 @@ def follow(
     returned, and nothing is between the last event and the target.
     """
     # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
-    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good)
+    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)
-    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found)
+    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends)
     found &= returned & (dr.squared_norm(back - ω) < RETURNS**2)
     ray = mi.Ray3f(shot.ray)
     ray.maxt = dr.select(target.far, dr.largest(mi.Float), dr.norm(target.p - ray.o) * (1 - mi.math.ShadowEpsilon))

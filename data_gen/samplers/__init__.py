@@ -236,6 +236,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _PPM,
     _GPM,
     _VPM,
+    _GVPM,
     _BRE,
     _GBRE,
     _BEAMS,
@@ -243,6 +244,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _PLANES,
     _GPLANES,
     _VCM,
+    _GVCM,
     _PRIMAL,
 ) = (
     f"data_gen.samplers.{name}"
@@ -256,6 +258,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "photons.ppm",
         "photons.gpm",
         "photons.vpm",
+        "photons.gvpm",
         "photons.bre",
         "photons.gbre",
         "photons.beams",
@@ -263,6 +266,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "photons.planes",
         "photons.gplanes",
         "vcm.integrator",
+        "vcm.gvcm",
         "primal",
     )
 )
@@ -273,6 +277,12 @@ _PHOTON_OPTIONS = {
     "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
 }
 _PLANE_OPTIONS = {"planes": "light paths of a photon map that planes are swept from (64)"}
+
+_VCM_OPTIONS = {
+    "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
+    "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
+    "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+}
 
 for _sampler in (
     Sampler(
@@ -382,6 +392,18 @@ for _sampler in (
         module=_VPM,
     ),
     Sampler(
+        "gvpm",
+        "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
+        _from_module(_GVPM),
+        lambda facts: _refused_but_for_media(facts, "gvpm"),
+        _notes_on_photons,
+        _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVPM,
+    ),
+    Sampler(
         "bre",
         "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
         _from_module(_BRE),
@@ -462,16 +484,24 @@ for _sampler in (
         _from_module(_VCM),
         lambda facts: _refused_but_for_surfaces(facts, "vcm"),
         _notes_on_vcm,
-        {
-            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
-            "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
-            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
-        },
+        _VCM_OPTIONS,
         gradients=False,
         tried=False,
         batch=1,
         biased=True,
         module=_VCM,
+    ),
+    Sampler(
+        "gvcm",
+        "gradients of paths from both ends, joined and merged with photons (hidden lamps and all caustics)",
+        _from_module(_GVCM),
+        lambda facts: _refused_but_for_surfaces(facts, "gvcm"),
+        _notes_on_vcm,
+        _VCM_OPTIONS,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVCM,
     ),
     Sampler(
         "primal",

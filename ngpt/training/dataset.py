@@ -31,6 +31,7 @@ from ngpt.training.shards import (
     OF_INPUTS,
     REFERENCE_CAUSTIC,
     REFERENCE_HALVES,
+    SAMPLES,
     Shard,
     tensor_names,
 )
@@ -225,7 +226,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     if not crops:
         return shard
     gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
-    names = tensor_names(gradients, caustic, [name for name in (REFERENCE_HALVES, MOTION) if name in shard.names])
+    optional = (REFERENCE_HALVES, MOTION, *SAMPLES)
+    names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names])
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")

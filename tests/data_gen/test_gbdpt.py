@@ -475,7 +475,7 @@ def splats_rejected(shifted):
 @pytest.mark.parametrize(
     ("modules", "function", "mutate"),
     [
-        (("offset_path", "light_shift"), "difference", dark_pairs_weighted),
+        (("integrator", "light_shift"), "difference", dark_pairs_weighted),
         (("light_shift",), "shifted", splats_rejected),
     ],
     ids=["dark pairs weighted", "splats rejected"],

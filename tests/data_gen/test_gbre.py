@@ -101,7 +101,34 @@ def test_jacobians_in_media_by_finite_differences(rays):
 
 @pytest.mark.parametrize("name", ["nested", *(pytest.param(n, marks=pytest.mark.slow) for n in LONG)])
 def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(renderer, name):
-    """By the densities and throughputs of the copy itself, evaluated anew: r(T(x)) r(x) = 1, and T(T(x)) = x."""
+    """Camera rays come by, a hundredth of their length apart."""
+    import drjit as dr
+
+    from data_gen.samplers.photons.gbre import Beside
+
+    mi = renderer
+
+    def rays(eye, p, medium, rng):
+        to, n = p - eye, p.shape[1]
+        length = np.linalg.norm(to, axis=0)
+
+        def ray(spread):
+            d = to + rng.normal(size=p.shape) * spread * length
+            d = mi.Vector3f(d / np.linalg.norm(d, axis=0))
+            zero, everywhere = dr.zeros(mi.Spectrum, n), dr.full(mi.Bool, True, n)
+            return Beside(mi.Point3f(eye), d, dr.full(mi.Float, 100, n), medium, zero, zero + 1, everywhere)
+
+        return ray(0.004), ray(0.012), mi.Float((0.01 * length) ** 2)
+
+    assert_copies_are_light_paths(mi, name, rays)
+
+
+def assert_copies_are_light_paths(mi, name, receivers):
+    """By the densities and throughputs of the copy itself, evaluated anew: r(T(x)) r(x) = 1, and T(T(x)) = x.
+
+    ``receivers`` (eye, photons' places, their media, random numbers) has what photons are gathered at and copied to,
+    and the squared radius.
+    """
     import drjit as dr
 
     from data_gen.paths import media
@@ -111,10 +138,9 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
     from data_gen.samplers.photons.copies import Photon, photon_of, start_of
     from data_gen.samplers.photons.fog import Fog
-    from data_gen.samplers.photons.gbre import Beside, copy_beside
+    from data_gen.samplers.photons.gbre import copy_beside
     from data_gen.samplers.photons.trace import trace, vertex_in_media_of
 
-    mi = renderer
     scene = load(mi, getattr(media_scenes, name), (8, 8))
     lights, n = LightEnds(scene), 1 << 14
     ways = Fog(scene, lights, "gbre")
@@ -126,20 +152,7 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     rng = np.random.default_rng(0)
     j = mi.UInt32(rng.choice(np.flatnonzero(inside), 4000))
     photon = photon_of(photons, j)
-    # Camera rays that come by, a hundredth of their length apart
-    eye, p = np.array(ways.eye), np.array(photon.p)
-    to = p - eye
-    length = np.linalg.norm(to, axis=0)
-    medium = dr.gather(mi.MediumPtr, photons.medium, j)
-
-    def ray(spread):
-        d = to + rng.normal(size=p.shape) * spread * length
-        d = mi.Vector3f(d / np.linalg.norm(d, axis=0))
-        zero, everywhere = dr.zeros(mi.Spectrum, 4000), dr.full(mi.Bool, True, 4000)
-        return Beside(mi.Point3f(ways.eye), d, dr.full(mi.Float, 100, 4000), medium, zero, zero + 1, everywhere)
-
-    A, B = ray(0.004), ray(0.012)
-    r2 = mi.Float((0.01 * length) ** 2)
+    A, B, r2 = receivers(np.array(ways.eye), np.array(photon.p), dr.gather(mi.MediumPtr, photons.medium, j), rng)
     apart = A.near(photon.p, r2)[1] & ~B.near(photon.p, r2)[1]
     moved, _, r, good = copy_beside(scene, ways, lights, starts, photons, j, photon, A, B, r2)
     good &= apart

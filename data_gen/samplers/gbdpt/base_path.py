@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.manifold import event
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
+from data_gen.samplers.gbdpt.pairs import difference
 
 
 @dataclass
@@ -24,6 +27,23 @@ class Plan:
     max_depth: int
     rr_depth: int
     longest: int  # the number of edges up to which paths are found from both ends
+    pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
+    η: mi.Float | None = None  # of ``mis``, where photons are gathered, too
+
+    @property
+    def joins(self) -> bool:
+        """Whether there are paths from lights."""
+        return self.longest > 1 and self.lights.emitters is not None
+
+    def merged(self, bsdf: mi.BSDFPtr, joins: mi.Bool | bool = True) -> mi.Float:
+        """η at a vertex of that material; 0 where nothing merges."""
+        if self.η is None:
+            return mi.Float(0)
+        return dr.select(self.materials.connectable(bsdf) & joins, self.η, 0)
+
+    def known(self, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
+        """What a light path knows at a vertex of that material."""
+        return end if self.η is None else mis.gathered(end, self.merged(bsdf))
 
 
 @dataclass
@@ -35,6 +55,7 @@ class Step:
     # A sampled point of an emitter
     light: mi.DirectionSample3f
     weight: mi.Spectrum  # Le / p
+    shared: mi.Bool  # Δ has a share in what is completed at z
     C_light: mi.Spectrum
     others_light: mi.Float
     e_light: mi.Float
@@ -42,12 +63,14 @@ class Step:
     p_light: mi.Float  # of sampling that direction
     q_light: mi.Float
     joins: mi.Bool  # light paths may find paths that end here
+    η: mi.Float  # photons that are gathered here; 0 if none are
     # The sampled direction
     u_lobe: mi.Float
     u_direction: mi.Point2f
     wo: mi.Vector3f
     d: mi.Vector3f
     kind: mi.UInt32
+    event: mi.UInt32  # mirror, glass or hole, of ``manifold``
     p: mi.Float
     q: mi.Float
     f_p: mi.Spectrum  # f / p, survival included
@@ -116,12 +139,14 @@ def base_step(
     Le, p_met, e_met = emission_at(scene, lights, x1, si, met)
     # Longer paths are not found by light paths.
     counted = z.depth + 1 <= plan.longest
-    end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH)
+    η_merged = plan.merged(bsdf, joins)
+    end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH, η_merged)
     step = Step(
         z=z,
         connectable=active & materials.connectable(bsdf),
         light=light,
         weight=weight,
+        shared=mi.Bool(True),
         C_light=C,
         others_light=others,
         e_light=e,
@@ -129,11 +154,13 @@ def base_step(
         p_light=p,
         q_light=q,
         joins=joins,
+        η=η_merged,
         u_lobe=u_lobe,
         u_direction=u_direction,
         wo=sample.wo,
         d=d,
         kind=kind,
+        event=event(sample.sampled_type),
         p=sample.pdf,
         q=q_next,
         f_p=f_p * survival,

@@ -19,7 +19,7 @@ from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import connection, emission_at
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, evaluate
 from data_gen.samplers.gbdpt.base_path import Plan, Step, known_end, known_met
-from data_gen.samplers.gbdpt.pairs import difference
+from data_gen.samplers.gbdpt.chain_shift import Chain, Course, follow_chain
 
 
 @dataclass
@@ -87,7 +87,7 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times
         own = offset.apart | offset.joined
         busy |= own
         others1 = mis.others_connected(offset.end, *known[:3], y.end, *known[3:])
-        sums.append(Δ_before + dr.select(~own, times * difference(C, others, offset.β * g, offset.r, others1), 0))
+        sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
     # What a shift to y needs of the materials, but for the offset path's own
     both = z_connectable & plan.materials.connectable(y.si.bsdf())
 
@@ -100,7 +100,7 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times
             good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
             g1, known1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
             others1 = mis.others_connected(v.end, *known1[:3], y.end, *known1[3:])
-            return times * difference(C, others, v.β * g1, offset.r, others1)
+            return times * plan.pair(C, others, v.β * g1, offset.r, others1)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
         return i + 1, *(dr.select(i == k, old + Δ1, old) for k, old in enumerate(Δ))
@@ -110,23 +110,28 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times
     return C, others, list(Δ)
 
 
-def take_step(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
-    """Takes all offset paths along a step of their base path; connections to the light path are not in it."""
+def take_step(
+    scene, plan: Plan, step: Step, offsets: list[Offset], course: Course | None = None, chain: Chain | None = None
+) -> list[Offset]:
+    """Takes all offset paths along a step of their base path; connections to the light path are not in it.
+
+    Where there is a ``chain``, that behind the step, bent paths alone are shifted; ``course`` is the one before it.
+    """
     busy = mi.Bool(False)
     for offset in offsets:
         busy |= offset.apart | offset.joined
-    offsets = [settled(step, offset) for offset in offsets]
+    offsets = [settled(plan, step, offset) for offset in offsets]
 
     def rotate(i, y, *others):
         own = y.apart | y.joined
-        y = dr.if_stmt((y,), own, lambda y: step_own(scene, plan, step, y), lambda y: y)
+        y = dr.if_stmt((y,), own, lambda y: step_own(scene, plan, step, y, course, chain), lambda y: y)
         return i + 1, *others, y
 
     state = (mi.UInt32(0), *offsets)
     return list(dr.while_loop(state, lambda i, *_: busy & (i < len(offsets)), rotate, label="offset steps")[1:])
 
 
-def settled(step: Step, y: Offset) -> Offset:
+def settled(plan: Plan, step: Step, y: Offset) -> Offset:
     """A step that both paths take alike; for offset paths that are not settled, nothing."""
     here = ~(y.apart | y.joined)
     x = step.z.si
@@ -135,27 +140,29 @@ def settled(step: Step, y: Offset) -> Offset:
     cos = cosine(x, step.light.d)
     p_light = dr.select(step.light.delta, 0, step.light.pdf)
     others = mis.others_to_light(end, step.e_light, p_light, cos, step.p_light, step.q_light)
-    Δ = difference(step.C_light, step.others_light, y.β * step.f_light * step.weight, y.r, others)
+    Δ = plan.pair(step.C_light, step.others_light, y.β * step.f_light * step.weight, y.r, others)
     # ----------------------- Next vertex -------------------------
     β = y.β * step.f_p
-    end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH)
+    end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH, step.η)
     # ------------------ Emission met by chance -------------------
     others = mis.others_emitted(known_met(end, step.counted), step.e_met, step.p_met)
-    Δ += difference(step.C_met, step.others_met, β * step.Le, y.r, others)
+    Δ += plan.pair(step.C_met, step.others_met, β * step.Le, y.r, others)
     end = mis.arrive(end, cosine(step.x1, step.d), dr.square(step.x1.t))
     return Offset(
         ray=y.ray,
         hit=y.hit,
         β=dr.select(here, dr.select(step.goes_on, β, 0), y.β),
         r=y.r,
-        end=Partial(dr.select(here, end.vcm, y.end.vcm), dr.select(here, end.vc, y.end.vc)),
+        end=dr.select(here, end, y.end),
         apart=y.apart,
         joined=y.joined,
         Δ=y.Δ + dr.select(here, Δ, 0),
     )
 
 
-def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
+def step_own(
+    scene, plan: Plan, step: Step, y: Offset, course: Course | None = None, chain: Chain | None = None
+) -> Offset:
     """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
     # ------------------------ The vertex -------------------------
     si = own_vertex(y, step.z.si)
@@ -165,7 +172,7 @@ def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
     # ------------------------ To a light -------------------------
     lit = (dr.max(step.C_light) > 0) & step.connectable & connectable
     C, r, others = to_same_light(scene, plan, step, y, si, bsdf, lit)
-    Δ = y.Δ + difference(step.C_light, step.others_light, C, y.r * r, others)
+    Δ = y.Δ + plan.pair(step.C_light, step.others_light, C, y.r * r, others)
 
     # ------------- Next vertex: reconnect, or replay -------------
     smooth = step.kind == SMOOTH
@@ -174,6 +181,14 @@ def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
     # What neither does is rejected: β = 0.
     none = Offset(y.ray, y.hit, mi.Spectrum(0), y.r, y.end, mi.Bool(False), mi.Bool(False), Δ)
     state = (none, mi.Spectrum(0), mi.Float(0))
+    if chain is not None:
+        # Its own vertex stays where it is until there is something to walk to.
+        waits = y.apart & connectable & (chain.open | chain.arrives)
+        joins &= y.joined
+        replays &= course.ahead
+        state = dr.select(waits, (replace(y, Δ=Δ), *state[1:]), state)
+        walks = waits & chain.arrives
+        state = dr.if_stmt(state, walks, lambda *_: bend(scene, plan, step, chain, y, none, si, bsdf), lambda *old: old)
     state = dr.if_stmt(state, joins, lambda *_: reconnect(scene, plan, step, y, none, si, bsdf), lambda *old: old)
     # Where all is smooth there is nothing to replay.
     if not plan.materials.all_connectable:
@@ -181,7 +196,7 @@ def step_own(scene, plan: Plan, step: Step, y: Offset) -> Offset:
     moved, C, others = state
 
     # ------------------ Emission met by chance -------------------
-    moved.Δ = moved.Δ + difference(step.C_met, step.others_met, C, moved.r, others)
+    moved.Δ = moved.Δ + plan.pair(step.C_met, step.others_met, C, moved.r, others)
     return moved
 
 
@@ -202,7 +217,7 @@ def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tup
     β, r = y.β * f * (J / step.p * step.survival), y.r * (J * p / step.p)
     good &= dr.isfinite(dr.sum(β)) & dr.isfinite(r)
     β, r = dr.select(good, β, 0), dr.select(good, r, 0)
-    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False))
+    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False), step.η)
 
     # ----------------------- Emission at x1 ----------------------
     y1 = seen_from(x1, d)
@@ -236,6 +251,13 @@ def replay(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[
     end = mis.arrive(end, cosine(y1, d), dr.square(y1.t))
     lives = good & y1.is_valid() & step.x1.is_valid()
     return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ), β * Le, others
+
+
+def bend(scene, plan, step: Step, chain: Chain, y: Offset, none: Offset, si, bsdf) -> tuple:
+    """Through the mirrors and glass of the base path to its next vertex; and emission there."""
+    ray, β, r, end, C, others = follow_chain(scene, plan, step, chain, si, bsdf, y.β, y.r, y.end, mi.Bool(True))
+    lives = step.x1.is_valid() & step.x1_connectable & (dr.max(β) > 0)
+    return Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives, none.Δ), C, others
 
 
 def to_same_light(scene, plan: Plan, step: Step, y: Offset, si, bsdf, active):

@@ -41,10 +41,11 @@ class Path:
 
 @dataclass
 class Level:
-    """The base paths that have come to some ``depth``, of the camera samples ``lanes``; and their offset paths."""
+    """Base paths that have come to some ``depth``, of the camera samples ``lanes``; and their offset paths."""
 
-    depth: int
+    first: bool
     lanes: mi.UInt32
+    depth: mi.UInt32
     base: Path
     offsets: list[Path]
 
@@ -69,7 +70,7 @@ def levels(
     paths = frozen(begun, scene, rays, first_hit, hide_emitters, fixed=True)
     while True:
         dr.eval(paths, lanes, η)
-        yield Level(depth, lanes, paths[0], paths[1:])
+        yield Level(depth == 1, lanes, dr.opaque(mi.UInt32, depth, dr.width(lanes)), paths[0], paths[1:])
         if depth >= max_depth:
             return
         paths, η, numbers = frozen(onward, materials, paths, η, type(random)(numbers), depth >= rr_depth)

@@ -15,7 +15,7 @@ import mitsuba as mi
 
 from data_gen.paths import media
 from data_gen.paths.vertex import Materials
-from data_gen.samplers.photons.camera import Path, scattered
+from data_gen.samplers.photons.camera import Level, Path, scattered
 from data_gen.samplers.photons.fog import Fog
 
 
@@ -35,17 +35,6 @@ class Piece(Path):
         return Path(self.ray, self.hit, β, alive, self.sky_seen)
 
 
-@dataclass
-class PieceLevel:
-    """Pieces of base paths, of the camera samples ``lanes``, and of their offset paths; ``depth`` numbers segments."""
-
-    first: bool
-    lanes: mi.UInt32
-    depth: mi.UInt32
-    base: Piece
-    offsets: list[Piece]
-
-
 def levels_in_media(
     scene: mi.Scene,
     fog: Fog,
@@ -57,8 +46,11 @@ def levels_in_media(
     max_depth: int,
     rr_depth: int,
     frozen: Callable,
-) -> Iterator[PieceLevel]:
-    """As ``camera.levels()``; ``first_surface`` (scene, ray, medium, active) is what camera rays themselves meet."""
+) -> Iterator[Level]:
+    """As ``camera.levels()``; ``first_surface`` (scene, ray, medium, active) is what camera rays themselves meet.
+
+    ``depth`` numbers segments, of which each piece is a level.
+    """
     n = dr.width(rays[0][0].o)
     lanes, numbers, first = dr.arange(mi.UInt32, n), random.random, True
     η, depth = dr.opaque(mi.Float, 1, n), dr.opaque(mi.UInt32, 1, n)
@@ -67,7 +59,7 @@ def levels_in_media(
     dr.eval(lanes)
     while True:
         dr.eval(pieces)
-        yield PieceLevel(first, lanes, depth, pieces[0], pieces[1:])
+        yield Level(first, lanes, depth, pieces[0], pieces[1:])
         pieces, depth, η, numbers = frozen(onward, fog, materials, pieces, depth, η, type(random)(numbers), limits)
         dr.eval(pieces, depth, η, numbers)
         go_on = dr.compress(pieces[0].alive)

@@ -7,7 +7,7 @@ with the photon for its own copy (``of_pairs``), and by other copies (``of_copie
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -19,12 +19,14 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.shift import gradient_weight
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt.lights import LightRay
-from data_gen.samplers.photons.camera import Path
+from data_gen.samplers.photons.camera import Level, Path
 from data_gen.samplers.photons.copies import copy, is_near, light, photon_of
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.pairs import Pairs, Points, pieces
 from data_gen.samplers.photons.ppm import Passes, begin
 
+# Levels are joined until they have so many paths for each camera sample.
+LEVELS = 3
 # Pairs of a point and a photon that are in memory together, for each camera sample; and the bytes of one.
 PAIRS = 16
 PAIR_BYTES = 192
@@ -101,17 +103,21 @@ def gradient_pass(integrator, passes: Passes, camera: CameraSamples, film: Gradi
     # The primal, the four Δ, and how many photons were gathered and had no copy
     sums = [dr.zeros(mi.Spectrum, n) for _ in range(1 + len(SHIFTS))] + [dr.zeros(mi.Point2f, n)]
     Le = mi.Spectrum(0)
-    # Emission that camera paths meet is counted with the first map, or without any.
-    maps, emission = maps_of(integrator, passes, keys, camera.first), True
-    near = next(maps, None)
-    while near is not None or emission:
-        for level in integrator.levels(passes, random, rays):
-            if emission:
-                Le = Le + integrator.met(passes, level, sums)
-            if near is not None:
-                for part in integrator.parts(passes, near, level, integrator.pairs * n):
-                    add_to(sums, level.lanes, part)
-        near, emission = next(maps, None), False
+    for levels in groups(integrator.levels(passes, random, rays), LEVELS * n):
+        for level in levels:
+            Le = Le + integrator.met(passes, level, sums)
+        lanes, level = [level.lanes for level in levels], joined(passes, levels)
+        del levels
+        together = [dr.zeros(type(total), dr.width(level.lanes)) for total in sums]
+        for near in maps_of(integrator, passes, keys, camera.first):
+            for part in integrator.parts(passes, near, level, integrator.pairs * n):
+                together = [total + value for total, value in zip(together, part, strict=True)]
+                dr.eval(together)
+        low = 0
+        for some in lanes:
+            places = dr.arange(mi.UInt32, dr.width(some)) + dr.opaque(mi.UInt32, low)
+            add_to(sums, some, [dr.gather(type(total), total, places) for total in together])
+            low += dr.width(some)
     L, *Δ, counts = sums
     values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
     if integrator.diagnostics:
@@ -119,6 +125,40 @@ def gradient_pass(integrator, passes: Passes, camera: CameraSamples, film: Gradi
     film.put_all(values)
     for name, difference, (_, _, inside) in zip(SHIFTS, Δ, shifted, strict=True):
         film.put(name, to_rgb(difference, ray.wavelengths), inside)
+
+
+def groups(levels: Iterator[Level], most: int) -> Iterator[list[Level]]:
+    """The levels, as many at a time as have at most so many paths: a kernel for few takes as long as one for many."""
+    group: list[Level] = []
+    for level in levels:
+        if group and sum(dr.width(one.lanes) for one in (*group, level)) > most:
+            yield group
+            group = []
+        group.append(level)
+    yield group
+
+
+def joined(passes: Passes, levels: list[Level]) -> Level:
+    """All paths of some levels, one level after another."""
+    if len(levels) == 1:
+        return levels[0]
+    n, low = sum(dr.width(level.lanes) for level in levels), 0
+    first = levels[0]
+    paths = [dr.empty(type(path), n) for path in (first.base, *first.offsets)]
+    all_of_it = [dr.empty(mi.UInt32, n), dr.empty(mi.UInt32, n), paths]
+    for level in levels:
+        values = [level.lanes, level.depth, [level.base, *level.offsets]]
+        all_of_it = passes.frozen(entered, all_of_it, values, dr.opaque(mi.UInt32, low))
+        dr.eval(all_of_it)
+        low += dr.width(level.lanes)
+    lanes, depth, (base, *offsets) = all_of_it
+    return replace(first, lanes=lanes, depth=depth, base=base, offsets=offsets)
+
+
+def entered(all_of_it: list, values: list, low: mi.UInt32) -> list:
+    """``all_of_it``, a tree of arrays, with that of ``values`` from place ``low`` on."""
+    dr.scatter(all_of_it, values, low + dr.arange(mi.UInt32, dr.width(values[0])))
+    return all_of_it
 
 
 def maps_of(integrator, passes: Passes, keys, number: int) -> Iterator:

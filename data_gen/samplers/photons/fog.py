@@ -70,7 +70,11 @@ class Fog:
         σs is in the photons that are gathered there.
         """
         segment, x = self.fly(trace, ray, medium, channel, random, active)
+        return x, segment.place, self.brought(segment, channel)
+
+    def brought(self, segment: segments.Segment, channel) -> mi.Spectrum:
+        """What ``ahead()`` has of a segment: its integrand over its density, without σs."""
         σ_c = pick(extinction(segment.place.medium, segment.ray), channel)
         # Where nothing is scattered, of a colour, photons have none of it either.
         weight = dr.select(segment.albedo > 0, segment.weight / (segment.albedo * σ_c), 0)
-        return x, segment.place, mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))
+        return mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))

@@ -35,8 +35,8 @@ from data_gen.samplers.photons.differences import PAIR_BYTES, PAIRS, Near, add_t
 from data_gen.samplers.photons.ppm import PPM, Passes
 from data_gen.samplers.photons.radius import shrunk
 
-# Of a camera sample beside that: five paths with their rays, hits and throughputs, and as many sums
-PATHS_BYTES = 1024
+# Of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
+PATHS_BYTES = 3072
 
 
 class GPM(PPM):
@@ -72,7 +72,7 @@ class GPM(PPM):
 
     def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
         """What is seen directly, at the first level; emission that paths meet at others is added to the ``sums``."""
-        if level.depth > 1:
+        if not level.first:
             add_to(sums, level.lanes, passes.frozen(emitted, passes.scene, level.base, level.offsets))
         elif self.max_depth > 0:
             return passes.frozen(CameraPath.emission, level.base, passes.scene, fixed=True)
@@ -80,10 +80,9 @@ class GPM(PPM):
 
     def parts(self, passes: Passes, near, level: Level, most: int) -> Iterator[list]:
         """Of the photons ``near`` a level's paths, the differences."""
-        if level.depth < self.max_depth:
-            longest = min(self.max_depth - level.depth, 0xFFFFFFFF)
-            lengths = dr.opaque(mi.UInt32, longest, dr.width(level.lanes))
-            yield from differences(passes, near, level.base, level.offsets, lengths, most)
+        longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
+        dr.eval(longest)
+        yield from differences(passes, near, level.base, level.offsets, longest, most)
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

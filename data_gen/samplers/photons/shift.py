@@ -14,9 +14,10 @@ to y and not to x. Surfaces are curved, and photons lie on them, not on a plane;
 The map from b̂ to ĉ is a rigid one, and its inverse is the same with x and y in each other's place. So shifting the
 copy back gives b, on curved surfaces too.
 
-In a medium there is no surface, so b and b' themselves are moved. Beside a camera ray x and y are the points of both
-rays at the same distance, n and m the directions of the rays: distance, and place beside the ray, have the volume for
-their product, and the map keeps the one and turns or mirrors the other. So it keeps volumes, whatever the rays.
+In a medium there is no surface, so b and b' themselves are moved. Near to points x and y, in balls, b' is the mirror
+image of b in the plane between them. Beside a camera ray x and y are the points of both rays at the same distance, n
+and m the directions of the rays: distance, and place beside the ray, have the volume for their product, and the map
+keeps the one and turns or mirrors the other. So it keeps volumes, whatever the rays.
 
 A plane of two edges, the first along d, turns about that edge, so that it goes through the point on the other ray: the
 angle between both edges stays, and both their lengths change (``about``).
@@ -44,6 +45,11 @@ def moved(b̂, x, n, y, m):
     n = mirror(n, across)
     m = dr.select(dr.dot(n, m) < 0, -m, m)
     return y + rotate(mirror(b̂ - x, across), n, m)
+
+
+def image(b, x, y):
+    """b': the mirror image of ``b`` in the plane between x and y, which differ."""
+    return y + mirror(b - x, dr.normalize(y - x))
 
 
 def mirror(v, across):

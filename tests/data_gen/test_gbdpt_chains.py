@@ -1,0 +1,253 @@
+"""Camera paths of ``gbdpt`` that go through mirrors or glass behind their first vertex, and their copies."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from data_gen_scenes import caustics, glass
+from test_gbdpt_glass import by_a_wall, close, number
+from unbiased import DISTANCES, REFERENCES, gradient_tests, load, render_ours
+
+
+def under_a_sky():
+    """A ball and a mirror on a floor, lit by a sky alone: chains end where it is."""
+    from data_gen.scenes.builtin import _rgb
+
+    scene = caustics()
+    del scene["lamp"]
+    return scene | {"sky": {"type": "constant", "radiance": _rgb(1, 2, 3)}}
+
+
+def lacquered():
+    """A room with a ball of glass and a lacquered one: it mirrors, but paths may be joined at it too."""
+    scene = glass()
+    del scene["hole"]
+    scene["rough"]["bsdf"] = {"type": "plastic"}
+    return scene
+
+
+ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}
+
+
+class Bent:
+    """The first camera path of each lane that is bent right behind what the camera sees, up to the end of its chain."""
+
+    LENGTH = 4
+
+    def __init__(self, mi, description):
+        import drjit as dr
+
+        from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.vertex import Materials
+        from data_gen.samplers.bdpt.lights import LightEnds
+        from data_gen.samplers.bdpt.vertex import Vertex
+        from data_gen.samplers.gbdpt.base_path import Plan, base_step
+        from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight
+        from data_gen.samplers.gbdpt.pairs import difference_of_one
+
+        self.mi, self.dr = mi, dr
+        self.scene = scene = load(mi, description, (32, 32))
+        self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
+        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, pair=difference_of_one)
+        ray, _, _ = camera.rays()
+        random, x = camera.random.clone(), scene.ray_intersect(mi.Ray3f(ray))
+        z = Vertex(x, mi.Spectrum(1), self.first_end(x, ray), mi.UInt32(1))
+        active, course, chain = x.is_valid(), straight(), no_chain(dr.width(ray))
+        self.good, self.β = mi.Bool(False), mi.Spectrum(0)
+        for depth in range(1, self.LENGTH + 1):
+            z.depth = mi.UInt32(depth)
+            step, _, _ = base_step(scene, plan, random, z, active, mi.Float(1), mi.Bool(True), mi.Float(0))
+            step, course, chain = along(scene, plan, step, course, chain)
+            here = active & chain.arrives & ~self.good & dr.all(chain.x1.p == x.p)
+            found = (step, chain)
+            self.step, self.chain = dr.select(here, found, (self.step, self.chain)) if depth > 1 else found
+            self.good |= here
+            active = step.goes_on & step.x1.is_valid()
+            z = Vertex(step.x1, step.β1, step.end1, mi.UInt32(depth + 1))
+            dr.eval(z, active, course, chain, self.step, self.chain, self.good)
+
+    def first_end(self, x, ray):
+        from data_gen.samplers.bdpt import mis
+        from data_gen.samplers.bdpt.vertex import cosine
+
+        _, e = self.camera.sensor.sample_direction(x, self.camera.lens)
+        return mis.begin_camera(e[0], cosine(x, ray.d))
+
+    def own(self, pixels):
+        """Where the camera looks so many pixels to the right and half as many down, and what an end knows there."""
+        ray, _, inside = self.camera.rays((pixels, pixels / 2))
+        x = self.scene.ray_intersect(self.mi.Ray3f(ray))
+        active = self.good & inside & x.is_valid() & self.plan.materials.connectable(x.bsdf())
+        return x, self.first_end(x, ray), active
+
+    def copy(self, step, chain, x, end, active):
+        from data_gen.samplers.gbdpt.chain_shift import follow_chain
+
+        mi = self.mi
+        found = follow_chain(
+            self.scene, self.plan, step, chain, x, x.bsdf(), mi.Spectrum(1), mi.Float(1), end, mi.Bool(active)
+        )
+        self.dr.eval(found)
+        return found
+
+    def direction(self, x, active):
+        """That in which the copy leaves its own vertex."""
+        from functools import partial
+
+        from data_gen.paths.manifold import Target, follow, shoot
+        from data_gen.samplers.gbdpt import chain_shift
+
+        step, chain, dr = self.step, self.chain, self.dr
+        reached = step.x1.is_valid()
+        target = Target(step.x1.p, dr.select(reached, self.mi.Vector3f(step.x1.n), step.d), ~reached)
+        base = shoot(self.scene, chain.x1, chain.ω, chain.events, target, active)
+        ends = partial(chain_shift.ends, self.scene, self.plan)
+        ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, target, active, ends)
+        dr.eval(ω)
+        return ω
+
+
+@pytest.fixture(
+    scope="module",
+    params=["sky", "lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room"))],
+)
+def bent(renderer, request):
+    return Bent(renderer, ENDS[request.param])
+
+
+def test_a_path_is_its_own_copy_in_its_own_place(bent):
+    dr = bent.dr
+    x, end, active = bent.own(0)
+    asked = np.array(active).sum()
+    assert asked > 500
+    _, β, r, end1, C, others = bent.copy(bent.step, bent.chain, x, end, active)
+    good = active & (dr.max(β) > 0)
+    assert np.array(good).sum() > 0.9 * asked, (np.array(good).sum(), asked)
+    close(r, 1, good)
+    close(β, bent.step.β1, good)
+    there = np.array(good & bent.step.x1.is_valid())
+    if there.any():
+        close(end1.vc, bent.step.end1.vc, there)
+        assert not np.array(end1.vcm).any() and not np.array(bent.step.end1.vcm)[there].any()
+    lit = np.array(good & (dr.max(bent.step.C_met) > 0))
+    if lit.sum() > 20:
+        close(C, bent.step.C_met, lit)
+        close(others, bent.step.others_met, lit & (np.array(bent.step.others_met) > 0))
+
+
+def forward(bent, x, ω, end, good):
+    """The copy as a camera path: the point where it arrives, its direction, f / p, and what its end knows there."""
+    from data_gen.samplers.bdpt import mis
+    from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
+
+    mi, dr, scene = bent.mi, bent.dr, bent.scene
+    f, p, q = evaluate(RADIANCE, x, x.bsdf(), x.to_local(ω), good)
+    β, end, d = f / p, mis.leave(end, cosine(x, ω), p, q, mi.Bool(False)), mi.Vector3f(ω)
+    si, events = scene.ray_intersect(x.spawn_ray(ω), good), mi.UInt32(bent.chain.events)
+    end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+    for _ in range(6):
+        here = good & (events != 0)
+        sample, f_p = si.bsdf().sample(mi.BSDFContext(), si, number(mi, dr, events & 3), mi.Point2f(0.5), here)
+        d1 = si.to_world(sample.wo)
+        reached = scene.ray_intersect(si.spawn_ray(d1), here)
+        end1 = mis.leave(end, cosine(si, d1), sample.pdf, mi.Float(0), mi.Bool(True))
+        end1 = mis.arrive(end1, cosine(reached, d1), dr.square(reached.t))
+        si, d, β, end = dr.select(here, (reached, d1, β * f_p, end1), (si, d, β, end))
+        events >>= 2
+        dr.eval(si, d, β, end, events)
+    return si, d, β, p, end
+
+
+def test_copies_are_paths_that_the_camera_could_have_found(bent):
+    """β / r is the copy's own throughput, traced forward; weights are those along it; and the copy's copy is the path,
+    with 1 / r."""
+    dr = bent.dr
+    x, end, active = bent.own(0.25)
+    asked = np.array(active).sum()
+    _, β, r, end1, _, _ = bent.copy(bent.step, bent.chain, x, end, active)
+    good = active & (dr.max(β) > 0)
+    assert np.array(good).sum() > 0.4 * asked, (np.array(good).sum(), asked)
+    # -------------------------- Forward --------------------------
+    ω = bent.direction(x, good)
+    si, d, β_own, p, end_own = forward(bent, x, ω, end, good)
+    far = ~bent.step.x1.is_valid()
+    off = dr.select(far, dr.norm(d - bent.step.d), dr.norm(si.p - bent.step.x1.p))
+    assert np.quantile(np.array(off)[np.array(good)], 0.95) < 3e-3
+    close(β / r, β_own, good, most=0.1)
+    there = np.array(good & ~far)
+    if there.any():
+        close(end1.vc, end_own.vc, there, most=0.1)
+    # -------------------------- And back -------------------------
+    x0, end0, _ = bent.own(0)
+    chain = replace(bent.chain, x1=x, ω=ω, p=p)
+    _, β0, r0, end2, _, _ = bent.copy(bent.step, chain, x0, end0, good)
+    back = good & (dr.max(β0) > 0)
+    assert np.array(back).sum() > 0.97 * np.array(good).sum()
+    close(r * r0, 1, back, median=1e-2, most=0.1)
+    close(β0 / r0, bent.step.β1, back, median=1e-2, most=0.1)
+    there = np.array(back & ~far)
+    if there.any():
+        close(end2.vc, bent.step.end1.vc, there, median=1e-2, most=0.1)
+
+
+@pytest.fixture
+def long_passes(monkeypatch):
+    """A pass of 64 samples per pixel: much less of the time goes by with recording kernels."""
+    from data_gen.samplers import SAMPLERS
+
+    for name in ("bdpt", "gbdpt"):
+        monkeypatch.setitem(SAMPLERS, name, replace(SAMPLERS[name], batch=64))
+
+
+def z_tests(mi, description, pixels):
+    scene = load(mi, description, (32, 32))
+    references = np.stack([stack["primal"] for stack in render_ours(scene, "bdpt", 16, 64, seed=REFERENCES)])
+    return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("pixels", DISTANCES)
+@pytest.mark.parametrize("ends", [glass, lacquered, under_a_sky, by_a_wall, "glossy"])
+def test_unbiased(renderer, long_passes, ends, pixels):
+    for name, result in z_tests(renderer, ends, pixels):
+        assert result.passed, f"{name}: {result}"
+
+
+@pytest.mark.slow
+def test_a_jacobian_of_one_fails_the_z_test(renderer, long_passes, monkeypatch):
+    from data_gen.samplers.gbdpt import chain_shift
+
+    follow = chain_shift.follow
+
+    def mutant(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
+        return ω, shot, J * 0 + 1, found
+
+    monkeypatch.setattr(chain_shift, "follow", mutant)
+    passed = {name: result.passed for name, result in z_tests(renderer, glass, DISTANCES[-1])}
+    assert passed["primal"] and not (passed["dx"] and passed["dy"])
+
+
+@pytest.mark.slow
+def test_less_noise_than_without(renderer, monkeypatch):
+    """Under a ball of glass in a room, as it looks in an image of 384x384 pixels."""
+    from data_gen.samplers.gbdpt import chain_shift
+
+    scene = load(renderer, glass, (384, 384))
+    film = renderer.traverse(scene.sensors()[0])
+    film["film.crop_size"], film["film.crop_offset"] = [32, 32], [176, 208]
+    film.update()
+
+    def noise():
+        layers = render_ours(scene, "gbdpt", 1, 64)[0]
+        return layers["dx_var"].mean() + layers["dy_var"].mean()
+
+    followed, follow = noise(), chain_shift.follow
+
+    def lost(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
+        return ω, shot, J, found & False
+
+    monkeypatch.setattr(chain_shift, "follow", lost)
+    without = noise()
+    assert followed < 0.5 * without, (followed, without)
