@@ -20,6 +20,8 @@ _POINTS = ("point", "spot", "directional", "projector")
 _LENSES = ("dielectric", "roughdielectric")
 # Samplers by photons, first the ones without gradients
 _PHOTONS = ("ppm", "gpm", "bre", "gbre")
+# By photons and by paths from both ends
+_JOINED = ("vcm", "gvcm")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
@@ -85,15 +87,20 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         )
     if facts.mirrors:
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
+    points = any(name in _POINTS for name in plugins["Emitter"])
     if any(name in plugins["BSDF"] for name in _LENSES):
-        points = any(name in _POINTS for name in plugins["Emitter"])
-        able = [f"`--sampler {name}`" for name in _PHOTONS if not SAMPLERS[name].refuses(facts)]
-        if able:
+        if able := _commands(_PHOTONS, facts):
             lines.append(
                 "glass: the light behind it, where that is seen in mirrors or through glass, "
                 + ("is found by photons alone for lights without size: " if points else "is found best by photons: ")
-                + ", ".join(able)
+                + able
             )
+        if able := _commands(_JOINED, facts):
+            lines.append(
+                f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
+            )
+    if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
+        lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):
         lines.append("holes: features are those of what is seen through them")
     if any(name in plugins["BSDF"] for name in ("bumpmap", "normalmap")):
@@ -103,6 +110,11 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     if not plugins["Emitter"]:
         lines.append("lights: none, so the image will be black")
     return lines
+
+
+def _commands(names: tuple[str, ...], facts: Facts) -> str:
+    """The options of those samplers that can render the scene."""
+    return ", ".join(f"`--sampler {name}`" for name in names if not SAMPLERS[name].refuses(facts))
 
 
 def _camera(lens: bool, shutter: float) -> list[str]:

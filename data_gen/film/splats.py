@@ -6,6 +6,8 @@ integers, whose sums do not: the same values give the same bits, whatever the th
 
 from __future__ import annotations
 
+from typing import Self
+
 import drjit as dr
 import mitsuba as mi
 
@@ -31,6 +33,13 @@ class Splats:
         # side by side in memory: most of the time of a splat is that of reaching it.
         self.sums = dr.zeros(dr.int64_array_t(mi.Float), pixels * BINS * channels)
         self.lost = dr.zeros(mi.UInt32, pixels)
+
+    @classmethod
+    def on(cls, pixels: int, channels: int, sums: tuple) -> Self:
+        """Those that go on with ``sums``, which are changed: ``sums`` and ``lost`` of others."""
+        splats = cls.__new__(cls)
+        splats.pixels, splats.channels, (splats.sums, splats.lost) = pixels, channels, sums
+        return splats
 
     def add(self, pixel: mi.UInt32, components: list, active) -> None:
         """Adds a value of a Float for each channel to the ``pixel`` of each lane that is ``active``."""

@@ -244,6 +244,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _PLANES,
     _GPLANES,
     _VCM,
+    _GVCM,
     _PRIMAL,
 ) = (
     f"data_gen.samplers.{name}"
@@ -265,6 +266,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "photons.planes",
         "photons.gplanes",
         "vcm.integrator",
+        "vcm.gvcm",
         "primal",
     )
 )
@@ -275,6 +277,12 @@ _PHOTON_OPTIONS = {
     "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
 }
 _PLANE_OPTIONS = {"planes": "light paths of a photon map that planes are swept from (64)"}
+
+_VCM_OPTIONS = {
+    "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
+    "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
+    "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
+}
 
 for _sampler in (
     Sampler(
@@ -476,16 +484,24 @@ for _sampler in (
         _from_module(_VCM),
         lambda facts: _refused_but_for_surfaces(facts, "vcm"),
         _notes_on_vcm,
-        {
-            "radius": "how far photons are gathered from in the first pass, in pixels where most is seen (2)",
-            "joined_depth": "edges of a path, up to which it is found from both ends (17); longer ones from the camera",
-            "roughness_threshold": "the microfacet roughness above which photons are gathered at materials",
-        },
+        _VCM_OPTIONS,
         gradients=False,
         tried=False,
         batch=1,
         biased=True,
         module=_VCM,
+    ),
+    Sampler(
+        "gvcm",
+        "gradients of paths from both ends, joined and merged with photons (hidden lamps and all caustics)",
+        _from_module(_GVCM),
+        lambda facts: _refused_but_for_surfaces(facts, "gvcm"),
+        _notes_on_vcm,
+        _VCM_OPTIONS,
+        tried=False,
+        batch=1,
+        biased=True,
+        module=_GVCM,
     ),
     Sampler(
         "primal",

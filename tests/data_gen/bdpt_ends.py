@@ -50,24 +50,22 @@ class Ends:
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, leave
 
         mi, dr, random = self.mi, self.dr, self.random
-        found, there, waiting = [], si.is_valid(), mi.Float(0)
+        found, there = [], si.is_valid()
         for depth in range(1, self.LENGTH + 1):
             bsdf = si.bsdf()
             η = dr.select(self.connectable(bsdf), mi.Float(self.η), 0) if self.connectable else mi.Float(0)
             end = mis.gathered(end, η) if mode == IMPORTANCE else end
             vertex = Vertex(si, mi.Spectrum(1), end, mi.UInt32(depth))
             sample, _ = bsdf.sample(context(mode), si, random.next_1d(), random.next_2d(), there)
-            d, end = leave(vertex, bsdf, sample, there)
+            # Camera paths know at the next event whether photons are gathered.
+            d, end = leave(vertex, bsdf, sample, there, 0.0 if mode == IMPORTANCE else η)
             delta = event_kind(sample.sampled_type) != SMOOTH
             found.append((vertex, there, bsdf, delta))
-            if mode != IMPORTANCE:
-                end = mis.settled(end, waiting, cosine(si, d), delta)
-                waiting = mis.pending(η, cosine(si, d), sample.pdf, delta)
             there = there & (sample.pdf > 0)
             si = self.scene.ray_intersect(si.spawn_ray(d), there)
             there &= si.is_valid()
-            end, waiting = mis.arrive(end, cosine(si, d), dr.square(si.t)), waiting / cosine(si, d)
-            dr.eval(found, si, end, there, waiting)
+            end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+            dr.eval(found, si, end, there)
         return found
 
     def densities(self, t, s):

@@ -180,6 +180,7 @@ def test_inspection_names_what_matters(scene_file):
     assert any("clear glass" in line for line in report["plan"])
     # Its light is a sky: photons are better, not the only way.
     assert any("found best by photons: `--sampler ppm`, `--sampler gpm`" in line for line in report["plan"])
+    assert any("both ends in one: `--sampler vcm`, `--sampler gvcm`" in line for line in report["plan"])
     assert not any("photons" in line for line in inspect_scene("diffuse")["plan"] if "refuses" not in line)
     assert "thinlens" in inspect_scene("lens")["plugins"]["sensor"]
     with pytest.raises(NgptError, match="not a scene Mitsuba can read"):
@@ -216,6 +217,10 @@ def test_inspection_of_media_lens_maps_and_shutter(scene_file):
     plan = "\n".join(report["plan"])
     assert "media: offset paths join where light scatters" in plan and "`--sampler gpt-simple` refuses" in plan
     assert "nothing moves" in plan and "'direct' layer" not in plan
+    assert "small lights in media: paths find their beams" in plan and "glass" not in plan
+    through_glass = "\n".join(inspect_scene(scene_file(text=text.replace('"diffuse"', '"dielectric"')))["plan"])
+    assert "found by photons alone for lights without size: `--sampler bre`" in through_glass
+    assert "both ends" not in through_glass  # which see no media
     report = inspect_scene("lens")
     assert report["lens"] and "depth of field" in "\n".join(report["plan"])
 

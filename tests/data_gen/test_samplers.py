@@ -74,7 +74,7 @@ NAMES = [*SAMPLERS, "toy"]
 
 
 # Passes of chains take long to start, and some laws take many; beams are photons along rays to these laws.
-LONG = ("gmlt", "beams", "gbeams", "planes", "gplanes")
+LONG = ("gmlt", "beams", "gbeams", "planes", "gplanes", "gvcm")
 
 
 def long_slow(names):
@@ -192,7 +192,7 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
 
 
 # 64 renders of these take long. Their film is that of the others.
-DEAR = ("gbdpt", "gmlt", "ppm", "gpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm")
+DEAR = ("gbdpt", "gmlt", "ppm", "gpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
 SLOW = [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in NAMES]
 
 

@@ -140,7 +140,7 @@ class BDPT(GradientIntegrator):
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
         active = si.is_valid() & (depth < self.max_depth)
         _, density = camera.sensor.sample_direction(si, camera.lens, active)
-        end, waiting = mis.begin_camera(density[0], cosine(si, ray.d)), mi.Float(0)
+        end = mis.begin_camera(density[0], cosine(si, ray.d))
         while dr.hint(active, label="camera path"):
             z = Vertex(si, β, end, depth)
             bsdf = si.bsdf()
@@ -157,7 +157,7 @@ class BDPT(GradientIntegrator):
             f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
             lit &= dr.max(f * weight) > 0
             q = reverse_density(si, bsdf, wo, lit)
-            z.end = mis.Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0))
+            z.end = mis.Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
             C, others = to_light(lights, z, light, weight, f, p, q)
             lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
             L += dr.select(lit, C / (1 + others), 0)
@@ -175,9 +175,10 @@ class BDPT(GradientIntegrator):
             found = active & (sample.pdf > 0)
             sky_seen |= found & (event_kind(sample.sampled_type) != NULL)
             η = dr.select(found, η * sample.eta, η)
-            d, end = leave(z, bsdf, sample, found)
+            η_merged = mi.Float(0)
             if dr.hint(merging is not None, mode="scalar"):
-                end, waiting = merging.leaves(z, bsdf, sample, end, waiting, joined)
+                η_merged = merging.at(bsdf, joined)
+            d, end = leave(z, bsdf, sample, found, η_merged)
             β *= f_p
             # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
@@ -196,8 +197,6 @@ class BDPT(GradientIntegrator):
             si = reached
             active &= si.is_valid() & (depth < self.max_depth)
             end = mis.arrive(end, cosine(si, d), dr.square(si.t))
-            if dr.hint(merging is not None, mode="scalar"):
-                waiting /= cosine(si, d)
         return L, Le
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:

@@ -20,7 +20,7 @@ Both ends may also come to one vertex, and merge: η = π r² N times as many su
 radius r as there are pairs that end in a given unit of area. Paths merge at vertices where photons are gathered, and
 there only if light came from a delta event: else a connection finds the path, and blurs nothing. So a light path knows
 at once, its ``vcm`` is 0 there, and ``gathered`` adds η to it as one more summand; a camera path knows when it leaves
-the next vertex, and η waits in ``pending`` until then. Where nothing merges all is as without.
+the next vertex, and η is ``waiting`` until then. Where nothing merges all is as without.
 
 ``p`` are densities in solid angle, ``q`` the same with both directions of the vertex swapped; cosines are absolute, to
 the geometric normal. All quotients are taken one by one: squares of densities would leave float32.
@@ -28,7 +28,7 @@ the geometric normal. All quotients are taken one by one: squares of densities w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -40,6 +40,8 @@ class Partial:
 
     vcm: mi.Float
     vc: mi.Float
+    # Of a camera path: what is added to ``vc`` if the next event is a delta
+    waiting: mi.Float = field(default_factory=lambda: mi.Float(0))
 
 
 def begin_camera(e: mi.Float, cos: mi.Float) -> Partial:
@@ -52,30 +54,20 @@ def begin_light(e: mi.Float, p: mi.Float, delta: mi.Bool, cos: mi.Float) -> Part
     return Partial(dr.rcp(e * cos), dr.select(delta, 0, dr.rcp(e * p * cos)))
 
 
-def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool) -> Partial:
-    """Behind an event that was sampled with density ``p``."""
-    vc = dr.select(delta, end.vc * cos, cos / p * (end.vcm + end.vc * q))
-    return Partial(dr.select(delta, 0, dr.rcp(p)), vc)
+def leave(end: Partial, cos: mi.Float, p: mi.Float, q: mi.Float, delta: mi.Bool, η: mi.Float | float = 0.0) -> Partial:
+    """Behind an event that was sampled with density ``p``; camera paths leave a vertex that merges with ``η``."""
+    vc = dr.select(delta, (end.vc + end.waiting) * cos, cos / p * (end.vcm + end.vc * q))
+    return Partial(dr.select(delta, 0, dr.rcp(p)), vc, dr.select(delta, 0, mi.Float(η) * (cos / p)))
 
 
 def arrive(end: Partial, cos: mi.Float, distance2: mi.Float) -> Partial:
     """At the next vertex."""
-    return Partial(end.vcm * distance2 / cos, end.vc / cos)
+    return Partial(end.vcm * distance2 / cos, end.vc / cos, end.waiting * dr.rcp(cos))
 
 
 def gathered(y: Partial, η: mi.Float) -> Partial:
     """At a vertex of a light path; η is 0 where no photons are gathered."""
     return Partial(dr.select(y.vcm > 0, y.vcm, η), y.vc)
-
-
-def pending(η: mi.Float, cos: mi.Float, p: mi.Float, delta: mi.Bool) -> mi.Float:
-    """Behind an event of a camera path, as ``leave``: what is added to ``vc`` if the next event is a delta."""
-    return dr.select(delta, 0, cos / p * η)
-
-
-def settled(end: Partial, waiting: mi.Float, cos: mi.Float, delta: mi.Bool) -> Partial:
-    """Behind that next event: with what has been ``waiting`` since the last vertex, converted as ``vc`` is."""
-    return Partial(end.vcm, end.vc + dr.select(delta, waiting * cos, 0))
 
 
 def others_merged(z: Partial, q_z: mi.Float, y: Partial, q_y: mi.Float, η: mi.Float) -> mi.Float:

@@ -138,12 +138,14 @@ def light_sampled(si, bsdf, sample: mi.BSDFSample3f, f_p: mi.Spectrum, active) -
     return dr.select(smooth, f * dr.rcp(sample.pdf), f_p * (bends * turns)), q
 
 
-def leave(vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active) -> tuple[mi.Vector3f, Partial]:
-    """The direction of a sampled event, and what the path's end knows behind it."""
+def leave(
+    vertex: Vertex, bsdf, sample: mi.BSDFSample3f, active, η: mi.Float | float = 0.0
+) -> tuple[mi.Vector3f, Partial]:
+    """The direction of a sampled event, and what the path's end knows behind it; ``η`` is that of ``mis.leave``."""
     si, d = vertex.si, vertex.si.to_world(sample.wo)
     smooth = event_kind(sample.sampled_type) == SMOOTH
     q = reverse_density(si, bsdf, sample.wo, active & smooth)
-    return d, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, ~smooth)
+    return d, mis.leave(vertex.end, cosine(si, d), sample.pdf, q, ~smooth, η)
 
 
 def light_leaves(

@@ -28,11 +28,22 @@ class Plan:
     rr_depth: int
     longest: int  # the number of edges up to which paths are found from both ends
     pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
+    η: mi.Float | None = None  # of ``mis``, where photons are gathered, too
 
     @property
     def joins(self) -> bool:
         """Whether there are paths from lights."""
         return self.longest > 1 and self.lights.emitters is not None
+
+    def merged(self, bsdf: mi.BSDFPtr, joins: mi.Bool | bool = True) -> mi.Float:
+        """η at a vertex of that material; 0 where nothing merges."""
+        if self.η is None:
+            return mi.Float(0)
+        return dr.select(self.materials.connectable(bsdf) & joins, self.η, 0)
+
+    def known(self, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
+        """What a light path knows at a vertex of that material."""
+        return end if self.η is None else mis.gathered(end, self.merged(bsdf))
 
 
 @dataclass
@@ -52,6 +63,7 @@ class Step:
     p_light: mi.Float  # of sampling that direction
     q_light: mi.Float
     joins: mi.Bool  # light paths may find paths that end here
+    η: mi.Float  # photons that are gathered here; 0 if none are
     # The sampled direction
     u_lobe: mi.Float
     u_direction: mi.Point2f
@@ -127,7 +139,8 @@ def base_step(
     Le, p_met, e_met = emission_at(scene, lights, x1, si, met)
     # Longer paths are not found by light paths.
     counted = z.depth + 1 <= plan.longest
-    end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH)
+    η_merged = plan.merged(bsdf, joins)
+    end1 = mis.leave(end, cosine(si, d), sample.pdf, q_next, kind != SMOOTH, η_merged)
     step = Step(
         z=z,
         connectable=active & materials.connectable(bsdf),
@@ -141,6 +154,7 @@ def base_step(
         p_light=p,
         q_light=q,
         joins=joins,
+        η=η_merged,
         u_lobe=u_lobe,
         u_direction=u_direction,
         wo=sample.wo,

@@ -147,7 +147,19 @@ class GBDPT(BDPT):
 
     @dr.syntax
     def shifted_camera_path(
-        self, scene, plan, camera, random, ray, importance, shifted, kept, count, course=None, chain=None
+        self,
+        scene,
+        plan,
+        camera,
+        random,
+        ray,
+        importance,
+        shifted,
+        kept,
+        count,
+        course=None,
+        chain=None,
+        merging=None,
     ):
         """``BDPT.camera_path``, Δ of its four offset paths, and where its ``course`` has led.
 
@@ -179,6 +191,10 @@ class GBDPT(BDPT):
                 u = random.next_1d()
                 L, Δ = self.shifted_connection(scene, plan, step, joins, kept, count, ray, u, L, offsets)
                 offsets = with_differences(offsets, Δ)
+            if dr.hint(merging is not None, mode="scalar"):
+                gathers = active & scatters_smoothly(si.bsdf()) & step.joins
+                light, Δ = merging.differences(z, si.bsdf(), gathers, offsets)
+                L, offsets = L + light, with_differences(offsets, Δ)
             offsets = take_step(scene, plan, step, offsets, came, chain)
             si, β, end = step.x1, step.β1, step.end1
             depth += 1

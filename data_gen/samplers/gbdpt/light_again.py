@@ -6,7 +6,8 @@ a shift is eight rays: so each seen vertex has a lane of its own in a second ker
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from typing import Any
 
 import drjit as dr
@@ -16,8 +17,9 @@ from data_gen.film.splats import Splats
 from data_gen.paths.manifold import event, prepend_event
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
-from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on
+from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on, unmerged
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
+from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import record, record_class
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -92,9 +94,17 @@ def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: m
 
 @dr.syntax
 def light_again(
-    scene, lights: LightEnds, camera, random, camera_ray: mi.Ray3f, depth: mi.UInt32, rr_depth: int
+    scene,
+    lights: LightEnds,
+    camera,
+    random,
+    camera_ray: mi.Ray3f,
+    depth: mi.UInt32,
+    rr_depth: int,
+    known: Callable[[Partial, mi.BSDFPtr], Partial] = unmerged,
 ) -> tuple[LightRay, End, Link, Any, mi.Point2f, mi.Bool]:
     """Traces light paths up to the vertex at ``depth``; all that ``light_path`` has sampled is sampled again.
+    ``known`` is the same.
 
     Returned are where light begins, the vertex, its ``Link``, what is kept of the vertex at the other end of that, the
     place on the lens, and whether it is there.
@@ -103,12 +113,14 @@ def light_again(
     start, end, active = begin(scene, lights, random, camera_ray)
     link, left = first_link(), dr.zeros(record_class(mi.variant()))
     while dr.hint(active & (end.y.depth < depth), label="light path again"):
-        y = end.y
+        bsdf = end.y.si.bsdf()
+        y = replace(end.y, end=known(end.y.end, bsdf))
         here = record(end.ray, end.hit, y, active)
         if dr.hint(lens, mode="scalar"):
             random.next_2d()
-        end, active, sample, survival = go_on(scene, random, start, y, y.si.bsdf(), rr_depth, active)
+        end, active, sample, survival = go_on(scene, random, start, y, bsdf, rr_depth, active)
         link = next_link(link, y.depth, sample, survival)
         left = dr.select(link.depth == y.depth, here, left)
     on_lens = random.next_2d() if lens else mi.Point2f(0.5)
+    end.y.end = known(end.y.end, end.y.si.bsdf())
     return start, end, link, left, on_lens, active

@@ -63,7 +63,8 @@ def splat_differences(
     """
     ray, importance, _ = camera.rays()
     random = camera.random.clone()
-    start, end, link, left, lens, there = light_again(scene, plan.lights, camera, random, ray, depth, plan.rr_depth)
+    again = scene, plan.lights, camera, random, ray, depth, plan.rr_depth, plan.known
+    start, end, link, left, lens, there = light_again(*again)
     y = end.y
     bsdf = y.si.bsdf()
     # It has been seen: nothing is in between.
@@ -166,7 +167,8 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bo
     seen = active & (dr.max(C) > 0) & dr.isfinite(dr.sum(C))
     # Nothing is in the way of what has been followed.
     C = dr.select(seen if bent else seen & ~scene.ray_test(shadow, seen), C, 0)
-    return C, r * J, mis.others_to_camera(Partial(vcm, vc), importance[0], cosine(x, toward.d), q)
+    end = plan.known(Partial(vcm, vc), bsdf)
+    return C, r * J, mis.others_to_camera(end, importance[0], cosine(x, toward.d), q)
 
 
 def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:

@@ -143,7 +143,7 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
     Δ = plan.pair(step.C_light, step.others_light, y.β * step.f_light * step.weight, y.r, others)
     # ----------------------- Next vertex -------------------------
     β = y.β * step.f_p
-    end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH)
+    end = mis.leave(y.end, cosine(x, step.d), step.p, step.q, step.kind != SMOOTH, step.η)
     # ------------------ Emission met by chance -------------------
     others = mis.others_emitted(known_met(end, step.counted), step.e_met, step.p_met)
     Δ += plan.pair(step.C_met, step.others_met, β * step.Le, y.r, others)
@@ -153,7 +153,7 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
         hit=y.hit,
         β=dr.select(here, dr.select(step.goes_on, β, 0), y.β),
         r=y.r,
-        end=Partial(dr.select(here, end.vcm, y.end.vcm), dr.select(here, end.vc, y.end.vc)),
+        end=dr.select(here, end, y.end),
         apart=y.apart,
         joined=y.joined,
         Δ=y.Δ + dr.select(here, Δ, 0),
@@ -217,7 +217,7 @@ def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tup
     β, r = y.β * f * (J / step.p * step.survival), y.r * (J * p / step.p)
     good &= dr.isfinite(dr.sum(β)) & dr.isfinite(r)
     β, r = dr.select(good, β, 0), dr.select(good, r, 0)
-    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False))
+    end = mis.leave(y.end, cosine(si, d), p, q, mi.Bool(False), step.η)
 
     # ----------------------- Emission at x1 ----------------------
     y1 = seen_from(x1, d)

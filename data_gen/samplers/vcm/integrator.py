@@ -74,11 +74,11 @@ class Passes:
         """Of a camera sample, with all that its light path may leave in the map."""
         # Dr.Jit gives each array the next power of two of bytes.
         places = 1 << (self.integrator.vertices - 1).bit_length() if self.integrator.vertices else 0
-        return SAMPLE_BYTES + places * VERTEX_BYTES
+        return self.integrator.sample_bytes + places * VERTEX_BYTES
 
     def instead(self, lane_bytes: int) -> str:
         """What else than a smaller image would fit into so many bytes for each camera sample."""
-        places = (lane_bytes - SAMPLE_BYTES) // VERTEX_BYTES
+        places = (lane_bytes - self.integrator.sample_bytes) // VERTEX_BYTES
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
         return f", or no more than --option joined_depth={fits}" if fits else ""
 
@@ -104,13 +104,16 @@ class VCM(BDPT):
     # Light through glass and back has long paths, which the camera finds by rare and bright ones alone. Of a light path
     # 16 vertices are kept.
     usually_joined = 17
+    # What becomes of light paths that end at the camera
+    splatter = Splatter
+    name, sample_bytes = "vcm", SAMPLE_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.radius = float(props.get("radius", 2.0))
         self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
         if not 0 < self.radius < float("inf"):
-            raise NgptError(f"vcm: a radius of {self.radius:g} pixels; use one above 0")
+            raise NgptError(f"{self.name}: a radius of {self.radius:g} pixels; use one above 0")
 
     @property
     def longest(self) -> int:
@@ -123,9 +126,9 @@ class VCM(BDPT):
         return max(self.longest - 1, 0)
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene, "vcm")
-        refuse_camera(scene, "vcm")
-        return Passes(self, scene, LightEnds(scene, "vcm"), Materials(scene, self.threshold), pixel_width(scene))
+        refuse(scene, self.name)
+        refuse_camera(scene, self.name)
+        return Passes(self, scene, LightEnds(scene, self.name), Materials(scene, self.threshold), pixel_width(scene))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One light path and one camera path for each camera sample, of which a pixel has one."""
@@ -133,33 +136,35 @@ class VCM(BDPT):
         (ray, importance, _), random = camera.rays(), camera.random.clone()
         dr.eval(ray, importance)
         values = frozen(features, scene, camera.sensor, camera.random, ray, fixed=True)
-        n, photons = dr.width(camera.pixel), None
         ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        photons = None
         if self.vertices and passes.lights.emitters is not None:
-            radius, splats = self.radius * passes.width * shrunk(camera.first), film.splats("primal")
-            kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
-            sums = splats.sums, splats.lost
-            dr.make_opaque(sums)
-            numbers, sums, kept = frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
-            dr.eval(numbers, sums, kept)
-            splats.sums, splats.lost = sums
-            random, photons = type(random)(numbers), Photons(kept, radius, n)
+            random, photons, _ = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
         L, Le = frozen(self.seen, *ends, random, ray, importance, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
         film.put_all(values)
 
+    def light_paths(self, passes: Passes, camera: CameraSamples, random, ray, importance, splats: Splats) -> tuple:
+        """Traces and splats them: random numbers to go on by, the photons, and the splatter's state."""
+        n, radius = dr.width(camera.pixel), self.radius * passes.width * shrunk(camera.first)
+        kept, η, sums = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n)), (splats.sums, splats.lost)
+        dr.make_opaque(sums)
+        ends = passes.scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        numbers, sums, kept, state = passes.frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
+        dr.eval(numbers, sums, kept, state)
+        splats.sums, splats.lost = sums
+        return type(random)(numbers), Photons(kept, radius, n), state
+
     def lit(self, scene, lights, materials, sensor, lens, random, ray, importance, kept: Map, η, sums: tuple) -> tuple:
-        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; with the random numbers to go on by."""
+        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; what ``light_paths`` goes on with."""
         size = mi.ScalarVector2u(sensor.film().crop_size())
         camera = SimpleNamespace(sensor=sensor, lens=lens, size=size)
-        splats = Splats.__new__(Splats)
-        splats.pixels, splats.channels, (splats.sums, splats.lost) = int(dr.prod(size)), 3, sums
-        keeper = Keeper(Splatter(splats, ray, importance), η, kept)
+        keeper = Keeper(self.splatter(Splats.on(int(dr.prod(size)), 3, sums), ray, importance), η, kept)
         at_vertices = partial(known, materials, η)
         ends = scene, lights, camera, random.clone(), ray
-        _, count, random, _ = self.light_path(*ends, self.longest, keeper, known=at_vertices)
-        return random.random, sums, Map(kept.vertices, kept.photon, kept.first, count)
+        _, count, random, state = self.light_path(*ends, self.longest, keeper, known=at_vertices)
+        return random.random, sums, Map(kept.vertices, kept.photon, kept.first, count), state
 
     def seen(self, scene, lights, materials, sensor, lens, random, ray, importance, photons: Photons | None) -> tuple:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all."""

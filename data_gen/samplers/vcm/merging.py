@@ -14,12 +14,11 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.integrator import Splatter
-from data_gen.samplers.bdpt.light_path import Seen
+from data_gen.samplers.bdpt.light_path import Seen, Visitor
 from data_gen.samplers.bdpt.mis import Partial
-from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, record_class
+from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
 from data_gen.samplers.photons.copies import Photon, faces
 from data_gen.samplers.photons.grid import Grid
 
@@ -64,20 +63,20 @@ class Reader:
 class Keeper:
     """Splats what a light path brings to the camera, as ``bdpt`` does, and keeps its vertices in a map."""
 
-    def __init__(self, splatter: Splatter, η: mi.Float, kept: Map):
+    def __init__(self, splatter: Visitor, η: mi.Float, kept: Map):
         self.splatter, self.η, self.kept = splatter, η, kept
 
-    def start(self) -> None:
-        return None
+    def start(self) -> Any:
+        return self.splatter.start()
 
-    def sees(self, state: None, seen: Seen) -> None:
-        self.splatter.sees(None, seen)
+    def sees(self, state: Any, seen: Seen) -> Any:
         place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
         for target, value in zip(_values(self.kept.vertices), _values(seen.kept), strict=True):
             dr.scatter(target, value, place, here)
         # As ``known`` has it
         photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
         dr.scatter(self.kept.photon, photon, place, here)
+        return self.splatter.sees(state, seen)
 
 
 @dataclass(init=False)
@@ -104,39 +103,47 @@ class Merging:
     def __init__(self, photons: Photons, materials: Materials, longest: int):
         self.photons, self.materials, self.longest = photons, materials, longest
 
-    def leaves(self, z: Vertex, bsdf: mi.BSDFPtr, sample: mi.BSDFSample3f, end: Partial, waiting: mi.Float, joined):
-        """``end`` behind an event, with what has been ``waiting`` for a delta; and what waits for the next one."""
-        cos, delta = cosine(z.si, z.si.to_world(sample.wo)), event_kind(sample.sampled_type) != SMOOTH
-        η = dr.select(joined & self.materials.connectable(bsdf), self.photons.η, 0)
-        return mis.settled(end, waiting, cos, delta), mis.pending(η, cos, sample.pdf, delta)
+    def at(self, bsdf: mi.BSDFPtr, joined: mi.Bool) -> mi.Float:
+        """η at a vertex of that material; 0 where nothing merges."""
+        return dr.select(joined & self.materials.connectable(bsdf), self.photons.η, 0)
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
         """That of the photons near to the vertex ``z``, weighted."""
-        photons, vertices = self.photons, self.photons.kept.vertices
-        active, longest = active & self.materials.connectable(bsdf), self.longest - z.depth
+        photons, active = self.photons, active & self.materials.connectable(bsdf)
 
         def one(i, near):
-            j = dr.gather(mi.UInt32, photons.grid.index, i, near)
-
-            def its(name):
-                value = getattr(vertices, name)
-                return dr.gather(type(value), value, j, near)
-
-            photon = Photon(dr.zeros(mi.Point3f), its("n"), its("d"), its("β"))
-            near = near & faces(photon, z.si) & (its("depth") <= longest)
-            C, others = self.merged(z, bsdf, photon, Partial(its("vcm"), its("vc")), near)
+            photon, end, near = self.photon(i, z, near)
+            C, others = self.merged(z, bsdf, photon, end, near)
             C /= 1 + others
             return dr.select(near & dr.isfinite(dr.sum(C)), C, 0)
 
         zero = dr.zeros(mi.Spectrum, dr.width(z.depth))
         return photons.K * photons.grid.gather(z.si.p, photons.radius2, active, one, zero)
 
+    def photon(self, i: mi.UInt32, z: Vertex, near: mi.Bool) -> tuple[Photon, Partial, mi.Bool]:
+        """The photon of place ``i`` in the grid, ``near`` to z; its light path's end; and whether it is gathered."""
+        grid, vertices = self.photons.grid, self.photons.kept.vertices
+        j = dr.gather(mi.UInt32, grid.index, i, near)
+
+        def its(name):
+            value = getattr(vertices, name)
+            return dr.gather(type(value), value, j, near)
+
+        found = Photon(dr.gather(mi.Point3f, grid.p, i, near), its("n"), its("d"), its("β"))
+        gathered = near & faces(found, z.si) & (its("depth") <= self.longest - z.depth)
+        return found, Partial(its("vcm"), its("vc")), gathered
+
     def merged(self, z: Vertex, bsdf: mi.BSDFPtr, photon: Photon, end: Partial, active) -> tuple[mi.Spectrum, mi.Float]:
         """What a ``photon`` brings to the camera by ``z``, but for the kernel; ``end`` is its light path's."""
-        f, p, q = evaluate(RADIANCE, z.si, bsdf, z.si.to_local(-photon.d), active)
-        # f has a cosine; the photons lie as densely as the geometric one is large.
-        C = z.β * f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
-        return C, mis.others_merged(z.end, q, end, p, self.photons.η)
+        g, p, q = brought(photon, z.si, bsdf, active)
+        return z.β * g, mis.others_merged(z.end, q, end, p, self.photons.η)
+
+
+def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, mi.Float, mi.Float]:
+    """What a ``photon`` adds to radiance at ``si``, but for the kernel; p of the direction to the light, q swapped."""
+    f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
+    # f has a cosine; the photons lie as densely as the geometric one is large.
+    return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q
 
 
 def known(materials: Materials, η: mi.Float, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
