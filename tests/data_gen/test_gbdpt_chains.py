@@ -109,7 +109,7 @@ class Bent:
 
 @pytest.fixture(
     scope="module",
-    params=["sky", "lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room"))],
+    params=["lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room", "sky"))],
 )
 def bent(renderer, request):
     return Bent(renderer, ENDS[request.param])
