@@ -109,7 +109,7 @@ class Bent:
 
 @pytest.fixture(
     scope="module",
-    params=["sky", "lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room"))],
+    params=["lacquer", *(pytest.param(name, marks=pytest.mark.slow) for name in ("lamp", "wall", "room", "sky"))],
 )
 def bent(renderer, request):
     return Bent(renderer, ENDS[request.param])
@@ -136,13 +136,14 @@ def test_a_path_is_its_own_copy_in_its_own_place(bent):
 
 
 def forward(bent, x, ω, end, good):
-    """The copy as a camera path: the point where it arrives, its direction, f / p, and what its end knows there."""
+    """The copy as a camera path: the point where it arrives, its direction, f / p, both densities, and what its end
+    knows there."""
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.vertex import RADIANCE, cosine, evaluate
 
     mi, dr, scene = bent.mi, bent.dr, bent.scene
     f, p, q = evaluate(RADIANCE, x, x.bsdf(), x.to_local(ω), good)
-    β, end, d = f / p, mis.leave(end, cosine(x, ω), p, q, mi.Bool(False)), mi.Vector3f(ω)
+    P, β, end, d = mi.Float(1), f / p, mis.leave(end, cosine(x, ω), p, q, mi.Bool(False)), mi.Vector3f(ω)
     si, events = scene.ray_intersect(x.spawn_ray(ω), good), mi.UInt32(bent.chain.events)
     end = mis.arrive(end, cosine(si, d), dr.square(si.t))
     for _ in range(6):
@@ -152,10 +153,21 @@ def forward(bent, x, ω, end, good):
         reached = scene.ray_intersect(si.spawn_ray(d1), here)
         end1 = mis.leave(end, cosine(si, d1), sample.pdf, mi.Float(0), mi.Bool(True))
         end1 = mis.arrive(end1, cosine(reached, d1), dr.square(reached.t))
-        si, d, β, end = dr.select(here, (reached, d1, β * f_p, end1), (si, d, β, end))
+        si, d, β, P, end = dr.select(here, (reached, d1, β * f_p, P * sample.pdf, end1), (si, d, β, P, end))
         events >>= 2
-        dr.eval(si, d, β, end, events)
-    return si, d, β, p, end
+        dr.eval(si, d, β, P, end, events)
+    return si, d, β, p, P, end
+
+
+def spread(bent, x, ω, end, good, h=1e-3):
+    """The area that directions about ω light where their chains arrive, by finite differences."""
+    mi, dr = bent.mi, bent.dr
+    frame = mi.Frame3f(ω)
+    corners = [
+        forward(bent, x, dr.normalize(ω + h * turn), end, good)[0].p for turn in (frame.s, -frame.s, frame.t, -frame.t)
+    ]
+    s0, s1, t0, t1 = (np.array(corner, np.float64).T for corner in corners)
+    return np.linalg.norm(np.cross(s0 - s1, t0 - t1), axis=-1)
 
 
 def test_copies_are_paths_that_the_camera_could_have_found(bent):
@@ -169,7 +181,7 @@ def test_copies_are_paths_that_the_camera_could_have_found(bent):
     assert np.array(good).sum() > 0.4 * asked, (np.array(good).sum(), asked)
     # -------------------------- Forward --------------------------
     ω = bent.direction(x, good)
-    si, d, β_own, p, end_own = forward(bent, x, ω, end, good)
+    si, d, β_own, p, P, end_own = forward(bent, x, ω, end, good)
     far = ~bent.step.x1.is_valid()
     off = dr.select(far, dr.norm(d - bent.step.d), dr.norm(si.p - bent.step.x1.p))
     assert np.quantile(np.array(off)[np.array(good)], 0.95) < 3e-3
@@ -177,8 +189,17 @@ def test_copies_are_paths_that_the_camera_could_have_found(bent):
     there = np.array(good & ~far)
     if there.any():
         close(end1.vc, end_own.vc, there, most=0.1)
-    # -------------------------- And back -------------------------
+    # ---------------------- Brute force for r --------------------
     x0, end0, _ = bent.own(0)
+    base = forward(bent, x0, bent.chain.ω, end0, good)
+    here = there & (np.array(base[3]) > 0)
+    if there.any():
+        area, area0 = spread(bent, x, ω, end, good), spread(bent, x0, bent.chain.ω, end0, good)
+        r_own = np.array(p * P / (base[3] * base[4]), np.float64) * area0 / area
+        error = np.abs(np.array(r, np.float64) / r_own - 1)[here]
+        # Of 1000 some arrive beside an edge, or by a tangent.
+        assert np.median(error) < 0.01 and np.quantile(error, 0.8) < 0.05, np.quantile(error, [0.5, 0.8])
+    # -------------------------- And back -------------------------
     chain = replace(bent.chain, x1=x, ω=ω, p=p)
     _, β0, r0, end2, _, _ = bent.copy(bent.step, chain, x0, end0, good)
     back = good & (dr.max(β0) > 0)
@@ -211,21 +232,6 @@ def z_tests(mi, description, pixels):
 def test_unbiased(renderer, long_passes, ends, pixels):
     for name, result in z_tests(renderer, ends, pixels):
         assert result.passed, f"{name}: {result}"
-
-
-@pytest.mark.slow
-def test_a_jacobian_of_one_fails_the_z_test(renderer, long_passes, monkeypatch):
-    from data_gen.samplers.gbdpt import chain_shift
-
-    follow = chain_shift.follow
-
-    def mutant(*args, **more):
-        ω, shot, J, found = follow(*args, **more)
-        return ω, shot, J * 0 + 1, found
-
-    monkeypatch.setattr(chain_shift, "follow", mutant)
-    passed = {name: result.passed for name, result in z_tests(renderer, glass, DISTANCES[-1])}
-    assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
 @pytest.mark.slow
