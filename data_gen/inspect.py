@@ -56,7 +56,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     integrator = next(iter(plugins["Integrator"]), "path")
     lens = "thinlens" in plugins["Sensor"]
     mirrors = any(name in plugins["BSDF"] for name in _MIRRORS)
-    facts = Facts(integrator, tuple(sorted(media)), polarised(), mirrors)
+    facts = Facts(integrator, tuple(sorted(media)), polarised(), mirrors, "heterogeneous" in plugins["Medium"])
     sampler, reason = choose(facts)
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
@@ -99,6 +99,8 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
+    if facts.grids and (able := _commands(("vpm",), facts)):
+        lines.append(f"media whose density varies: photons are gathered in them near to points alone: {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
         lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):

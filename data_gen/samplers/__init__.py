@@ -166,6 +166,11 @@ def _refused_but_for_media(facts: Facts, name: str) -> str:
     return ""
 
 
+def _refused_but_for_fog(facts: Facts, name: str) -> str:
+    grids = f"there are media whose density varies, which '{name}' does not render" if facts.grids else ""
+    return _refused_but_for_media(facts, name) or grids
+
+
 def _refused_by_gpt_simple(facts: Facts) -> str:
     mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
     return _refused_but_for_surfaces(facts, "gpt-simple") or mirrors
@@ -395,7 +400,7 @@ for _sampler in (
         "gvpm",
         "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
         _from_module(_GVPM),
-        lambda facts: _refused_but_for_media(facts, "gvpm"),
+        lambda facts: _refused_but_for_fog(facts, "gvpm"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
         tried=False,
@@ -407,7 +412,7 @@ for _sampler in (
         "bre",
         "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
         _from_module(_BRE),
-        lambda facts: _refused_but_for_media(facts, "bre"),
+        lambda facts: _refused_but_for_fog(facts, "bre"),
         _notes_on_photons,
         _PHOTON_OPTIONS,
         gradients=False,
@@ -420,7 +425,7 @@ for _sampler in (
         "gbre",
         "gradients of photons in media gathered along whole rays (caustics in fog, beams of lamps in haze)",
         _from_module(_GBRE),
-        lambda facts: _refused_but_for_media(facts, "gbre"),
+        lambda facts: _refused_but_for_fog(facts, "gbre"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
         tried=False,
@@ -432,7 +437,7 @@ for _sampler in (
         "beams",
         "photon beams: light in media gathered from whole light paths, without gradients (thin fog, beams of lamps)",
         _from_module(_BEAMS),
-        lambda facts: _refused_but_for_media(facts, "beams"),
+        lambda facts: _refused_but_for_fog(facts, "beams"),
         _notes_on_photons,
         _PHOTON_OPTIONS,
         gradients=False,
@@ -445,7 +450,7 @@ for _sampler in (
         "gbeams",
         "gradients of photon beams (thin fog, beams of lamps)",
         _from_module(_GBEAMS),
-        lambda facts: _refused_but_for_media(facts, "gbeams"),
+        lambda facts: _refused_but_for_fog(facts, "gbeams"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
         tried=False,
@@ -457,7 +462,7 @@ for _sampler in (
         "planes",
         "photon planes: light scattered in media again and again without blur, without gradients (thin fog)",
         _from_module(_PLANES),
-        lambda facts: _refused_but_for_media(facts, "planes"),
+        lambda facts: _refused_but_for_fog(facts, "planes"),
         _notes_on_photons,
         _PHOTON_OPTIONS | _PLANE_OPTIONS,
         gradients=False,
@@ -470,7 +475,7 @@ for _sampler in (
         "gplanes",
         "gradients of photon planes (thin fog)",
         _from_module(_GPLANES),
-        lambda facts: _refused_but_for_media(facts, "gplanes"),
+        lambda facts: _refused_but_for_fog(facts, "gplanes"),
         _notes_on_photons,
         _PHOTON_OPTIONS | _PLANE_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
         tried=False,

@@ -104,6 +104,19 @@ class GradientIntegrator(mi.SamplingIntegrator):
         si = hit.compute_surface_interaction(ray)
         return T * si.emitter(scene).eval(si, hit.is_valid() if media.grids else mi.Bool(True))
 
+    def behind_grids(self, scene, media: Media, segment: segments.Segment) -> mi.Spectrum:
+        """Le where the first ``segment`` of a path has come through grids, or to the environment of a scene with grids.
+
+        It is light like any other, not in ``direct``: it has noise, and less so together with the light that was
+        scattered on the way, since a path finds one or the other. The environment is here in all pixels. Else the box
+        around a cloud would stand out from the sky.
+        """
+        if self.hide_emitters or self.max_depth < 1 or not media.grids:
+            return mi.Spectrum(0)
+        si = segment.hit.compute_surface_interaction(segment.ray)
+        arrives = ~segment.place.scatters & ((segment.nulls.M > 0) | ~segment.hit.is_valid())
+        return si.emitter(scene).eval(si, arrives)
+
 
 def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
     """The integrator ``plugin`` with the parameters of the scene's own ``path``, and ``options`` of its own.

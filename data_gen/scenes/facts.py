@@ -22,18 +22,22 @@ class Facts:
     ``media``       the names of its media, sorted
     ``polarised``   the name of a variant that renders polarised light, or ""
     ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
+    ``grids``       whether there are media whose density varies
     """
 
     integrator: str
     media: tuple[str, ...]
     polarised: str = ""
     mirrors: bool = False
+    grids: bool = False
 
 
 def scene_facts(scene: mi.Scene) -> Facts:
     """The facts about a scene that is loaded."""
-    names = {medium.id() or medium.class_name() for medium in media_of(scene)}
-    return Facts(integrator_name(scene), tuple(sorted(names)), polarised())
+    media = media_of(scene)
+    names = {medium.id() or medium.class_name() for medium in media}
+    grids = any(not medium.is_homogeneous() for medium in media)
+    return Facts(integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids)
 
 
 def integrator_name(scene: mi.Scene) -> str:

@@ -83,6 +83,13 @@ def smoke():
     return cloudy(grid(1))
 
 
+def wisps():
+    """Grids that fade out within their box, in mist: other densities in each colour, and an albedo that varies."""
+    volumes = {"sigma_t": density(3, 0.2, 1.0, 3, fades=True), "albedo": density(3, 0.5, 1.0, 7)}
+    cloud = {name: {"type": "gridvolume", "grid": grid, **placed()} for name, grid in volumes.items()}
+    return cloudy({"type": "heterogeneous", "scale": 6.0} | cloud, mist={"albedo": 0.8, "sigma_t": 0.1})
+
+
 def coloured_smoke():
     """The same with another density in each colour, an albedo that varies, and mist around it."""
     cloud = grid(3) | {"albedo": {"type": "gridvolume", "grid": density(3, 0.5, 1.0, 7), **placed()}}
@@ -149,9 +156,12 @@ def placed():
     return {"to_world": mi.ScalarTransform4f().translate([-0.7, -0.7, -0.6]).scale(1.4)}
 
 
-def density(channels, low, high, seed):
+def density(channels, low, high, seed, fades=False):
+    """Random values from ``low`` to ``high``; where it ``fades``, 0 along its edges."""
     import mitsuba as mi
     import numpy as np
 
     values = np.random.default_rng(seed).uniform(low, high, (5, 5, 5, channels)).astype(np.float32)
+    if fades:
+        values[[0, -1]] = values[:, [0, -1]] = values[:, :, [0, -1]] = 0
     return mi.VolumeGrid(values)

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 from data_gen_scenes import _scale, fog
 from test_photons import assert_alike
-from unbiased import light_of_gradients, load, render_ours
+from unbiased import gradient_tests, light_of_gradients, load, render_ours, render_references
 
 from ngpt.errors import NgptError
 
 
-def alike(renderer, scene, radius=0.4, photons=128, block=4):
+def alike(renderer, scene, radius=0.4, photons=128, block=4, references=128):
     scene = load(renderer, scene, (16, 16))
     ours = render_ours(scene, "vpm", batches=8, spp=1, radius=radius, photons=photons)
-    theirs = render_ours(scene, "primal", batches=8, spp=128)
+    theirs = render_ours(scene, "primal", batches=8, spp=references)
     # Light that is seen directly is its expectation in ours, and has its own edges.
     images, references = (np.stack([light_of_gradients(s) for s in stacks]) for stacks in (ours, theirs))
     assert references.mean() > 0.01
@@ -57,6 +57,41 @@ def test_paths_in_media_are_no_longer_than_the_scene_says(renderer, max_depth):
         return scene | {"integrator": {"type": "volpath", "max_depth": max_depth}}
 
     alike(renderer, short)
+
+
+def test_density_is_not_blurred_in_grids(renderer):
+    """Grids that fade have the image of ``volpath``; the same seed, the same bits."""
+    alike(renderer, media_scenes.wisps, radius=0.6, photons=40, references=32)
+    scene = load(renderer, media_scenes.wisps, (8, 8))
+    once, again = (render_ours(scene, "vpm", batches=1, spp=3)[0]["primal"] for _ in range(2))
+    assert np.array_equal(once, again) and once.any()
+
+
+@pytest.mark.slow
+def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
+    """So twice the image of half the radius, less the image of the radius, is that of ``volpath``."""
+    scene = load(renderer, media_scenes.smoke, (16, 16))
+    theirs = [s["primal"].mean() for s in render_ours(scene, "primal", batches=16, spp=128)]
+    wide, narrow = (
+        [s["primal"].mean() for s in render_ours(scene, "vpm", 16, 1, seed=seed, photons=128, radius=radius)]
+        for seed, radius in ((0, 0.4), (100, 0.2))
+    )
+    off = 2 * np.mean(narrow) - np.mean(wide) - np.mean(theirs)
+    error = np.sqrt((4 * np.var(narrow) + np.var(wide) + np.var(theirs)) / 15)
+    assert abs(off) < 4 * error and error < 0.03 * np.mean(theirs), (off, error)
+    assert np.mean(theirs) - np.mean(wide) > 2 * error
+
+
+def test_lamps_and_skies_behind_grids_are_seen(renderer):
+    """Of paths of one edge, before any photon: the light that comes through, as ``volpath`` has it."""
+
+    def seen():
+        return media_scenes.before_the_sky() | {"integrator": {"type": "volpath", "max_depth": 1}}
+
+    scene = load(renderer, seen, (16, 16))
+    ours, references = render_ours(scene, "vpm", batches=8, spp=12), render_references(renderer, scene, 8, 64)
+    ((_, result),) = gradient_tests([{"primal": stack["primal"]} for stack in ours], references)
+    assert result.passed, result
 
 
 def test_it_converges_in_media(renderer):
@@ -104,8 +139,10 @@ def test_media_and_lights_that_vpm_refuses(renderer):
     from data_gen.samplers import find
     from data_gen.scenes.facts import Facts
 
-    with pytest.raises(NgptError, match=r"'vpm' .* media whose density varies; use --sampler gpt"):
-        render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "vpm")
+    with pytest.raises(NgptError, match=r"'bre' .* media whose density varies.* use --sampler gpt, .*vpm \(no grad"):
+        render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "bre")
+    with pytest.raises(NgptError, match=r"'gvpm' .* media whose density varies; use --sampler gpt, or vpm"):
+        renderer.load_dict({"type": "gvpm"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
     def endless():
         return media_scenes.haze() | {"sky": {"type": "constant"}}
@@ -114,3 +151,11 @@ def test_media_and_lights_that_vpm_refuses(renderer):
         render_stack(load(renderer, endless, (8, 8)), 1, 0, "vpm")
     with pytest.raises(NgptError, match="there are no media, and 'ppm' has the same image"):
         find("vpm", Facts("volpath", ()))
+
+
+def test_a_report_on_grids_names_the_sampler_of_photons(renderer):
+    from data_gen.inspect import inspect_scene
+
+    smoke, haze = ("\n".join(inspect_scene(name)["plan"]) for name in ("smoke", "haze"))
+    assert "media whose density varies: photons are gathered in them near to points alone: `--sampler vpm`" in smoke
+    assert "`--sampler bre` refuses: there are media whose density varies" in smoke and "density varies" not in haze

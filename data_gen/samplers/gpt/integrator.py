@@ -185,14 +185,14 @@ class GPT(GradientIntegrator):
             hit, place = first.hit, first.place
             x = media.vertex(first.ray, hit, place)
             Le = importance * self.lamps_in_fog(scene, plan.media, ray, within, channel)
-            L_first = β * self.behind_grids(scene, plan, first)
+            L_first = β * self.behind_grids(scene, plan.media, first)
             offsets = []
             for offset_ray, offset_importance, inside in shifted:
                 there, offset_β = fly(offset_ray, offset_importance)
                 y = start(plan, x, β, there.ray, there.hit, offset_β, inside, there.place)
                 if plan.media.grids:
                     # Both paths replay the numbers of this segment: r = 1, w = 1/2.
-                    y.Δ = offset_β * self.behind_grids(scene, plan, there) - L_first
+                    y.Δ = offset_β * self.behind_grids(scene, plan.media, there) - L_first
                     y.A = dr.select(inside, 1, 2) * L_first
                 offsets.append(y)
         else:
@@ -248,19 +248,6 @@ class GPT(GradientIntegrator):
             depth += 1
             active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
         return L, L_caustic, offsets, chain
-
-    def behind_grids(self, scene, plan: Plan, segment) -> mi.Spectrum:
-        """Le where the first ``segment`` of a path has come through grids, or to the environment of a scene with grids.
-
-        It is light like any other, not in ``direct``: it has noise, and less so together with the light that was
-        scattered on the way, since a path finds one or the other. The environment is here in all pixels. Else the box
-        around a cloud would stand out from the sky.
-        """
-        if self.hide_emitters or not plan.media.grids:
-            return mi.Spectrum(0)
-        si = segment.hit.compute_surface_interaction(segment.ray)
-        arrives = ~segment.place.scatters & ((segment.nulls.M > 0) | ~segment.hit.is_valid())
-        return si.emitter(scene).eval(si, arrives & (plan.max_depth > 0))
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:

@@ -93,10 +93,12 @@ class Both:
 class BRE(VPM):
     """Progressive photon mapping by the beam radiance estimate in homogeneous media, and on surfaces; no gradients.
 
-    Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``.
+    Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``; nor are media whose
+    density varies.
     """
 
     name = "bre"
+    grids = False
 
     def gathering(self, photons, width: float, number: int, paths: int):
         if self.fog is None:

@@ -13,17 +13,18 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The homogeneous media of a scene, one of which may be around its camera: ``within``.
+    """The media of a scene, one of which may be around its camera: ``within``.
 
-    Raises NgptError, in the name of the ``sampler``, for media whose density varies, and where light from infinitely
-    far away comes through a medium without end.
+    Raises NgptError, in the name of the ``sampler``, for media whose density varies unless it renders ``grids``, and
+    where light from infinitely far away comes through a medium without end.
     """
 
-    def __init__(self, scene: mi.Scene, lights: LightEnds, sampler: str):
+    def __init__(self, scene: mi.Scene, lights: LightEnds, sampler: str, grids: bool = False):
         self.media = Media(scene)
-        if self.media.grids:
+        if self.media.grids and not grids:
             raise NgptError(
-                f"sampler '{sampler}' cannot render this scene: there are media whose density varies; use --sampler gpt"
+                f"sampler '{sampler}' cannot render this scene: there are media whose density varies; "
+                "use --sampler gpt, or vpm for photons"
             )
         sensor = scene.sensors()[0]
         self.within = mi.MediumPtr(sensor.get_medium())
@@ -65,16 +66,29 @@ class Fog:
         return segment, vertex(segment.ray, segment.hit, segment.place)
 
     def ahead(self, trace, ray, medium, channel, random, active):
-        """The vertex at the end of a camera path's segment, its place, and T over the density of its distance.
-
-        σs is in the photons that are gathered there.
-        """
+        """The vertex at the end of a camera path's segment, its place, and what the path has ``brought`` there."""
         segment, x = self.fly(trace, ray, medium, channel, random, active)
         return x, segment.place, self.brought(segment, channel)
 
     def brought(self, segment: segments.Segment, channel) -> mi.Spectrum:
-        """What ``ahead()`` has of a segment: its integrand over its density, without σs."""
+        """The integrand of a camera path's segment over its density; without σs, if that is in ``power()``."""
+        if self.media.grids:
+            return segment.weight
         σ_c = pick(extinction(segment.place.medium, segment.ray), channel)
         # Where nothing is scattered, of a colour, photons have none of it either.
         weight = dr.select(segment.albedo > 0, segment.weight / (segment.albedo * σ_c), 0)
         return mi.Spectrum(dr.select(segment.place.scatters, weight, segment.weight))
+
+    def power(self, photons) -> mi.Spectrum:
+        """What counts of each photon of a map in media: the power Φ that is scattered there; with grids, Φ / σs.
+
+        The sum of Φ / σs over a volume is the light that goes through, which is smooth where σs is not: the density of
+        a grid is taken where the camera path scatters, and is not blurred.
+        """
+        if not self.media.grids:
+            return photons.β
+        scatters = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
+        here = dr.zeros(mi.MediumInteraction3f, len(photons))
+        here.p, here.medium = photons.p, photons.medium
+        σs, _, _ = photons.medium.get_scattering_coefficients(here, scatters)
+        return mi.Spectrum(dr.select(scatters & (σs > 0), photons.β / σs, 0))

@@ -111,10 +111,12 @@ class InBalls(AlongPieces):
 class GVPM(VPM):
     """Gradients of photons in homogeneous media and on surfaces.
 
-    Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``.
+    Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``; nor are
+    media whose density varies.
     """
 
     name = "gvpm"
+    grids = False
     pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def __init__(self, props: mi.Properties):

@@ -208,13 +208,14 @@ class PPM(GradientIntegrator):
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
         if dr.hint(fog is not None, mode="scalar"):
             channel, first = media.choose_channel(random.next_1d()), partial(self.first_surface, scene)
-            si, place, weight = fog.ahead(first, ray, fog.within, channel, random, mi.Bool(True))
-            Le = importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
-            β *= weight
+            segment, si = fog.fly(first, ray, fog.within, channel, random, mi.Bool(True))
+            place, Le = segment.place, importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
+            β *= fog.brought(segment, channel)
+            L_first = β * self.behind_grids(scene, fog.media, segment)
         else:
             si, place, channel = self.first_hit(scene, ray).compute_surface_interaction(ray), None, None
-            Le = importance * si.emitter(scene).eval(si, shown)
-        L = dr.zeros(mi.Spectrum, dr.width(ray))
+            Le, L_first = importance * si.emitter(scene).eval(si, shown), 0
+        L = dr.zeros(mi.Spectrum, dr.width(ray)) + (L_first if emission else 0)
         active = si.is_valid() & (depth < self.max_depth)
         while dr.hint(active, label="camera path"):
             bsdf = si.bsdf()

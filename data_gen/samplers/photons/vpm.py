@@ -4,6 +4,9 @@ r"""Progressive photon mapping in media and on surfaces: ``ppm``, and photons wh
     b, d, Φ     a photon within radius r of it, in the same medium; the direction it came along, its scattered power
     L(x)        Σ f(d) Φ / (4/3 π r³ N),    f: the phase function, N: light paths of the pass
 
+Φ is the power that is scattered at b, and the camera path brings T over the density of x, without σs. In scenes with
+media whose density varies it is Φ / σs(b), and the camera path has σs(x). Paths of both ends go by null collisions.
+
 Each segment of a camera path has one vertex: where it scatters in a medium, or on the surface behind. All light that is
 scattered in a medium comes from photons there. What of it lamps send directly comes from photons, too: a beam of light
 in haze is what the photons of its lamp draw.
@@ -39,13 +42,15 @@ class GatheringInMedia:
     """The photons of a map in media, gathered within ``radius``; ``paths`` light paths have brought them."""
 
     photons: Any
+    Φ: mi.Spectrum
     grid: Grid
     radius2: mi.Float
     K: mi.Float
     max_depth: mi.UInt32
 
-    def __init__(self, photons, radius: float, paths: int, max_depth: int):
-        self.photons = photons
+    def __init__(self, fog: Fog, photons, radius: float, paths: int, max_depth: int):
+        self.photons, self.Φ = photons, fog.power(photons)
+        dr.eval(self.Φ)
         scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
         self.grid = Grid(photons.p, scattered, radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
@@ -61,7 +66,7 @@ class GatheringInMedia:
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
             near = near & (dr.gather(mi.MediumPtr, photons.medium, j, near) == place.medium)
             near &= dr.gather(mi.UInt32, photons.depth, j, near) <= longest
-            d, Φ = dr.gather(mi.Vector3f, photons.d, j, near), dr.gather(mi.Spectrum, photons.β, j, near)
+            d, Φ = dr.gather(mi.Vector3f, photons.d, j, near), dr.gather(mi.Spectrum, self.Φ, j, near)
             f, _ = phase.eval_pdf(mi.PhaseFunctionContext(), seen, -d, near)
             return dr.select(near, f * Φ, 0)
 
@@ -83,24 +88,27 @@ class Both:
 
 
 class VPM(PPM):
-    """Progressive photon mapping in homogeneous media and on surfaces; no gradients.
+    """Progressive photon mapping in media and on surfaces; no gradients.
 
     Plugin ``vpm``. Parameters are those of ``ppm``; the ``radius`` of the first pass is that of photons in media, too.
 
     Biased, and consistent: the mean over passes converges to the image of ``volpath``.
 
-    Not handled: media whose density varies, light from infinitely far away through a medium without end, and what
-    ``ppm`` does not handle.
+    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
     """
 
     name = "vpm"
+    grids = True  # whether media may have a density that varies
     # Two words more for each vertex; and two for each light path
     map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)
         lights = LightEnds(scene, self.name)
-        self.fog = Fog(scene, lights, self.name) if media_of(scene) else None
+        self.fog = Fog(scene, lights, self.name, self.grids) if media_of(scene) else None
+        if self.fog and self.fog.media.grids:
+            # Φ / σs of each vertex
+            self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * 3 * 4
         passed = media.index_matched if self.fog else lambda shape: False
         materials = Materials(scene, self.threshold, passed, media=self.fog is not None)
         return Passes(self, scene, lights, materials, pixel_width(scene))
@@ -110,7 +118,7 @@ class VPM(PPM):
         if self.fog is None:
             return on_surfaces
         radius = self.radius * width * shrunk(number, 3)
-        return Both(on_surfaces, GatheringInMedia(photons, radius, paths, self.max_depth))
+        return Both(on_surfaces, GatheringInMedia(self.fog, photons, radius, paths, self.max_depth))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:
