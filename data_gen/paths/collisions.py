@@ -157,23 +157,24 @@ def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
     return τ, hit, ray, medium, M, N
 
 
-def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active) -> tuple:
-    """The null collisions of a ``base`` segment on another way to its end: m_i' = m_i M' / M.
+def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active, to_surface: bool = False) -> tuple:
+    """The null collisions of a ``base`` segment on another way, to its end or ``to_surface``: m_i' = m_i M' / M.
 
-    Returns τ of homogeneous media, what is met, the medium there, the integrand of the list with its Jacobian over the
-    density of that of the base path, and of that the colour c, which is the ratio of the densities.
+    Returns τ of homogeneous media, what is met, the last piece of the ray, the medium there, the integrand of the list
+    with its Jacobian over the density of that of the base path, and of that the colour c, which is the ratio of the
+    densities.
     """
     none, one = mi.UInt32(0), mi.Float(1)
-    τ, hit, _, end, M, N = cross(passes, trace, ray, medium, reach, channel, base.key, one, none, active)
+    τ, hit, last, end, M, N = cross(passes, trace, ray, medium, reach, channel, base.key, one, none, active)
     scale = M / base.M
-    moved = active & (base.n > 0) & ~hit.is_valid()
+    moved = active & (base.n > 0) & (to_surface | ~hit.is_valid())
 
     def place(N):
         return cross(passes, trace, ray, medium, reach, channel, base.key, scale, base.n, mi.Bool(True))[-1]
 
     (N,) = dr.if_stmt((N,), moved, lambda N: (place(N),), lambda N: (N,))
     N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
-    return τ, hit, end, N, pick(N, channel)
+    return τ, hit, last, end, N, pick(N, channel)
 
 
 def list_jacobian(scale: mi.Float, n: mi.UInt32) -> mi.Float:

@@ -172,7 +172,7 @@ def reconnect(scene, media: Media, y, place: Place, ray, x1, base: Segment, chan
     reach, medium = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf), place.toward(y, ray.d)
     trace = next_surface(scene)
     if media.grids:
-        τ, hit, medium, N, N_c = collisions.rescale(
+        τ, hit, _, medium, N, N_c = collisions.rescale(
             media.passes, trace, ray, medium, reach, channel, base.nulls, active
         )
     else:

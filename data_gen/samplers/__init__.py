@@ -400,7 +400,7 @@ for _sampler in (
         "gvpm",
         "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
         _from_module(_GVPM),
-        lambda facts: _refused_but_for_fog(facts, "gvpm"),
+        lambda facts: _refused_but_for_media(facts, "gvpm"),
         _notes_on_photons,
         _PHOTON_OPTIONS | {"diagnostics": "true: rates of failed shifts"},
         tried=False,

@@ -44,6 +44,7 @@ class FlightLevel(Level):
     """Paths behind ``depth`` segments."""
 
     camera: tuple  # the base paths' first rays, and their importance, of all camera samples
+    behind: list  # behind the first segment what each path has seen through grids, if there are any
 
 
 def levels_by_segments(
@@ -53,19 +54,24 @@ def levels_by_segments(
     random: mi.Sampler,
     rays: list,
     first_surface: Callable,
+    behind_grids: Callable,
     hide_emitters: bool,
     max_depth: int,
     rr_depth: int,
     frozen: Callable,
 ) -> Iterator[FlightLevel]:
-    """As ``camera.levels()``; ``first_surface`` (scene, ray, medium, active) is what camera rays themselves meet."""
+    """As ``camera.levels()``; ``first_surface`` (scene, ray, medium, active) is what camera rays themselves meet.
+
+    ``behind_grids`` (scene, media, segment) is Le that a first segment leads to, through grids.
+    """
     n = dr.width(rays[0][0].o)
     lanes, η, depth, stream = dr.arange(mi.UInt32, n), dr.full(mi.Float, 1, n), 1, type(random)
-    paths, channel, numbers = frozen(begun, scene, fog, random, rays, first_surface, hide_emitters, fixed=True)
+    seen = first_surface, behind_grids, hide_emitters
+    paths, behind, channel, numbers = frozen(begun, scene, fog, random, rays, *seen, fixed=True)
     while True:
-        dr.eval(paths, channel, numbers, lanes, η)
+        dr.eval(paths, behind, channel, numbers, lanes, η)
         depths = dr.opaque(mi.UInt32, depth, dr.width(lanes))
-        yield FlightLevel(depth == 1, lanes, depths, paths[0], paths[1:], rays[0][:2])
+        yield FlightLevel(depth == 1, lanes, depths, paths[0], paths[1:], rays[0][:2], behind)
         if depth >= max_depth:
             return
         paths, η, numbers = frozen(onward, materials, paths, η, stream(numbers), depth >= rr_depth)
@@ -75,12 +81,14 @@ def levels_by_segments(
             return
         known = lanes, η, channel
         paths, lanes, η, channel, numbers = frozen(further, scene, fog, paths, known, stream(numbers), go_on)
-        depth += 1
+        depth, behind = depth + 1, []
 
 
-def begun(scene, fog: Fog, random, rays: list, first_surface: Callable, hide_emitters: bool) -> tuple:
+def begun(
+    scene, fog: Fog, random, rays: list, first_surface: Callable, behind_grids: Callable, hide_emitters: bool
+) -> tuple:
     """The paths of these rays, (ray, importance, whether it is on the film) of each, behind their first segment."""
-    random, paths = random.clone(), []
+    random, paths, behind = random.clone(), [], []
     channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, fog.media)
     for ray, importance, inside in rays:
         ray, n = mi.Ray3f(ray.o, ray.d, ray.time, ray.wavelengths), dr.width(ray)
@@ -90,16 +98,19 @@ def begun(scene, fog: Fog, random, rays: list, first_surface: Callable, hide_emi
         alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, n))
         medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, n))
         trace = partial(first_surface, scene)
-        paths.append(flown(fog, trace, ray, β, alive, sky_seen, medium, channel, numbers))
-    return paths, channel, random.random
+        segment = segments.fly(fog.media, trace, ray, medium, channel, numbers, alive)
+        paths.append(flight(fog, segment, β, alive, sky_seen, channel))
+        if fog.media.grids:
+            behind.append(paths[-1].β * behind_grids(scene, fog.media, segment) * dr.select(alive, mi.Float(1), 0))
+    return paths, behind, channel, random.random
 
 
-def flown(fog: Fog, trace, ray, β, alive, sky_seen, medium, channel, numbers: segments.Numbers) -> Flight:
-    """The path that goes on along ``ray``, from within the ``medium``, behind that segment."""
-    segment = segments.fly(fog.media, trace, ray, medium, channel, numbers, alive)
+def flight(fog: Fog, segment: segments.Segment, β, alive, sky_seen, channel) -> Flight:
+    """The path that goes on by that ``segment``."""
     place = segment.place
-    β = β * fog.brought(segment, channel)
-    return Flight(segment.ray, segment.hit, β, alive, sky_seen, place.medium, place.scatters)
+    return Flight(
+        segment.ray, segment.hit, β * fog.brought(segment, channel), alive, sky_seen, place.medium, place.scatters
+    )
 
 
 def onward(materials: Materials, paths: list[Flight], η, random, roulette: bool) -> tuple:
@@ -139,6 +150,7 @@ def further(scene, fog: Fog, paths: list[Flight], known: tuple, random, go_on: m
         time = taken(old.time) if dr.width(old.time) > 1 else old.time
         wavelengths = taken(old.wavelengths) if dr.width(old.wavelengths) > 1 else old.wavelengths
         ray = mi.Ray3f(taken(old.o), taken(old.d), time, wavelengths)
-        state = taken(path.β), taken(path.alive), taken(path.sky_seen), taken(path.medium)
-        found.append(flown(fog, segments.next_surface(scene), ray, *state, channel, numbers))
+        alive, medium = taken(path.alive), taken(path.medium)
+        segment = segments.fly(fog.media, segments.next_surface(scene), ray, medium, channel, numbers, alive)
+        found.append(flight(fog, segment, taken(path.β), alive, taken(path.sky_seen), channel))
     return found, lanes, η, channel, random.random

@@ -20,7 +20,8 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import media, segments
+from data_gen.paths import collisions, media, segments
+from data_gen.paths.collisions import Collisions
 from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, context, evaluate
 from data_gen.samplers.photons import shift
@@ -64,6 +65,7 @@ class Through:
     medium: mi.MediumPtr  # at a
     τ_c: mi.Float  # of the photon's way, in colour c
     channel: mi.UInt32  # c
+    nulls: Collisions | None  # of the photon's way; None without grids
 
 
 def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi.Bool:
@@ -111,7 +113,7 @@ def copy(
     if fog is None:
         hit, Φ = scene.ray_intersect(way.ray, good), way.Φ * J
     else:
-        T, T_c, met, ray, _ = let_through(scene, fog, way, mi.Float(dr.inf), good)
+        T, T_c, met, ray, _ = let_through(scene, fog, way, mi.Float(dr.inf), good, to_surface=True)
         hit, Φ, r = met.compute_surface_interaction(ray, active=good), way.Φ * (J * T), r * T_c
     moved = Photon(hit.p, hit.n, way.ray.d, Φ)
     good &= hit.is_valid() & connectable(hit.bsdf())
@@ -131,14 +133,27 @@ def copy_in_medium(scene, fog, lights: LightEnds, starts: LightRay, photons, j, 
     here = dr.zeros(mi.MediumInteraction3f, dr.width(reach))
     here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, medium
     σs, _, σ = medium.get_scattering_coefficients(here, good)
-    albedo = dr.select(good, σs / media.pick(σ, way.through.channel), 0)
-    return Photon(target, photon.n, way.ray.d, way.Φ * (J * T * albedo)), r * T_c, good
+    σ_c = media.pick(σ, way.through.channel)
+    if not fog.media.grids:
+        return Photon(target, photon.n, way.ray.d, way.Φ * (J * T * dr.select(good, σs / σ_c, 0))), r * T_c, good
+    # As ``Fog.power()``, with the density of the photon's own place
+    here.p = photon.p
+    _, _, σ = photon.medium.get_scattering_coefficients(here, good)
+    base_σ_c = media.pick(σ, way.through.channel)
+    good &= σ_c > 0
+    Φ = dr.select(good & (σs > 0), way.Φ * (J * T) / base_σ_c, 0)
+    return Photon(target, photon.n, way.ray.d, mi.Spectrum(Φ)), r * T_c * (σ_c / base_σ_c), good
 
 
-def let_through(scene, fog, way: Way, reach: mi.Float, active) -> tuple:
+def let_through(scene, fog, way: Way, reach: mi.Float, active, to_surface: bool = False) -> tuple:
     """T' / T_c and T'_c / T_c of the way, over a distance or up to a surface; the surface, last piece, and medium."""
     ray, through = media.shortened(way.ray, reach), way.through
     trace = segments.next_surface(scene)
+    if through.nulls is not None:
+        known = through.channel, through.nulls, active, to_surface
+        τ, met, ray, medium, N, N_c = collisions.rescale(fog.media.passes, trace, ray, through.medium, reach, *known)
+        T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
+        return T, T_c, met, ray, medium
     τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
     return dr.exp(through.τ_c - τ), dr.exp(through.τ_c - media.pick(τ, through.channel)), met, ray, medium
 
@@ -189,7 +204,7 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
         # The record knows the last piece alone.
         origin_of_photon = dr.select(first, start.ray.o, origin)
         base_length = dr.dot(foot - origin_of_photon, photon.d)
-        through = known_of_media(scene, fog, photon, origin_of_photon)
+        through = known_of_media(scene, fog, photons, j, photon, origin_of_photon)
     known = dr.isfinite(density) & (base_length > 0)
     Φ = dr.select(first, moved.β, Φ)
     origin = dr.select(first, dr.select(beyond, aside, moved.ray.o), origin)
@@ -203,18 +218,26 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
     )
 
 
-def known_of_media(scene, fog, photon: Photon, origin) -> Through:
-    """Media between the ``photon`` and the ``origin`` of its last edge."""
+def known_of_media(scene, fog, photons, j, photon: Photon, origin) -> Through:
+    """Media between the ``photon``, of place ``j``, and the ``origin`` of its last edge."""
     b = dr.zeros(mi.SurfaceInteraction3f, dr.width(photon.p))
     b.p, b.n = photon.p, photon.n
     back, medium = b.spawn_ray(-photon.d), photon.medium
     reach = dr.dot(back.o - origin, photon.d)
+    if fog.media.grids:
+        trace, back, none = segments.next_surface(scene), media.shortened(back, reach), mi.UInt32(0)
+        steps = none, mi.Float(1), none, mi.Bool(True)
+        τ, _, _, medium, M, _ = collisions.cross(
+            fog.media.passes, trace, back, medium, reach, photon.channel, *steps
+        )
+        key, n, N_c = (dr.gather(type(v), v, j) for v in (photons.key, photons.nulls, photons.N_c))
+        return Through(medium, media.pick(τ, photon.channel), photon.channel, Collisions(key, n, M, N_c))
     if not fog.media.boundaries:
         τ = media.depth(media.extinction(medium, back), reach)
     else:
         trace, back = segments.next_surface(scene), media.shortened(back, reach)
         τ, _, _, medium = segments.cross(fog.media.passes, trace, back, medium, reach, True)
-    return Through(medium, media.pick(τ, photon.channel), photon.channel)
+    return Through(medium, media.pick(τ, photon.channel), photon.channel, None)
 
 
 def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:

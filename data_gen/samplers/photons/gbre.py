@@ -117,13 +117,14 @@ class AlongPieces:
 
     starts: LightRay
     photons: Any
+    Φ: mi.Spectrum
     grid: Grid
     radius2: mi.Float
     K: mi.Float
     receivers = staticmethod(beside_of)
 
     def __init__(self, starts: LightRay, photons, radius: float, paths: int):
-        self.starts, self.photons = starts, photons
+        self.starts, self.photons, self.Φ = starts, photons, photons.β
         reach, volume = self.kernel(radius)
         scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
         self.grid = Grid(photons.p, scattered, reach)
@@ -144,6 +145,7 @@ class AlongPieces:
         """Of each pair C, four Δ with the photon for its copy, and counts; and where a copy is to be looked for."""
         j = dr.gather(mi.UInt32, self.grid.index, pairs.place)
         photon = photon_of(self.photons, j)
+        photon.Φ = dr.gather(mi.Spectrum, self.Φ, j)
         short = dr.gather(mi.UInt32, self.photons.depth, j) <= dr.gather(mi.UInt32, longest, pairs.point)
         direct = dr.isfinite(dr.gather(mi.Float, self.photons.density, j))
         A = self.receivers([base], None, pairs.point)

@@ -28,6 +28,7 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.shift import gradient_weight
 from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons import shift
@@ -45,6 +46,7 @@ from data_gen.samplers.photons.differences import (
     emitted,
     gradient_pass,
 )
+from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.gbre import PATHS_BYTES, AlongPieces, Both, with_media
 from data_gen.samplers.photons.pairs import Points
 from data_gen.samplers.photons.ppm import Passes
@@ -99,6 +101,11 @@ class InBalls(AlongPieces):
 
     receivers = staticmethod(ball_of)
 
+    def __init__(self, fog: Fog, starts: LightRay, photons, radius: float, paths: int):
+        super().__init__(starts, photons, radius, paths)
+        self.Φ = fog.power(photons)
+        dr.eval(self.Φ)
+
     @staticmethod
     def kernel(radius: float) -> tuple[float, float]:
         return radius, 4 / 3 * np.pi * radius**3
@@ -109,14 +116,12 @@ class InBalls(AlongPieces):
 
 
 class GVPM(VPM):
-    """Gradients of photons in homogeneous media and on surfaces.
+    """Gradients of photons in media and on surfaces.
 
-    Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``; nor are
-    media whose density varies.
+    Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``.
     """
 
     name = "gvpm"
-    grids = False
     pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def __init__(self, props: mi.Properties):
@@ -132,16 +137,18 @@ class GVPM(VPM):
     def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
         radius = self.radius * passes.width
         on_surfaces = Near(starts, photons, radius * shrunk(number), paths)
-        yield Both(on_surfaces, InBalls(starts, photons, radius * shrunk(number, 3), paths))
+        yield Both(on_surfaces, InBalls(self.fog, starts, photons, radius * shrunk(number, 3), paths))
 
     def levels(self, passes: Passes, random, rays: list) -> Iterator:
-        paths = passes.materials, random, rays, self.first_surface, self.hide_emitters
+        paths = passes.materials, random, rays, self.first_surface, self.behind_grids, self.hide_emitters
         return levels_by_segments(passes.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
     def met(self, passes: Passes, level: FlightLevel, sums: list) -> mi.Spectrum:
         if not level.first:
             add_to(sums, level.lanes, passes.frozen(emitted, passes.scene, level.base, level.offsets))
             return mi.Spectrum(0)
+        if level.behind:
+            add_to(sums, level.lanes, passes.frozen(differences_behind, level.behind, level.offsets))
         return passes.frozen(self.seen_directly, passes.scene, *level.camera, fixed=True)
 
     def seen_directly(self, scene, ray: mi.Ray3f, importance) -> mi.Spectrum:
@@ -154,6 +161,12 @@ class GVPM(VPM):
         dr.eval(longest, base, offsets)
         yield from differences(passes, near.on_surfaces, base, offsets, longest, most)
         yield from differences(passes, near.in_media, level.base, level.offsets, longest, most)
+
+
+def differences_behind(behind: list, offsets: list[Flight]) -> list:
+    """Of what paths have seen behind grids, that of base paths and its four Δ."""
+    C, *others = behind
+    return [C, *(gradient_weight(mi.Float(1), y.alive) * (C1 - C) for y, C1 in zip(offsets, others, strict=True))]
 
 
 def ends(base: Flight, offsets: list[Flight]) -> list[Path]:

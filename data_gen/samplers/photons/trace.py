@@ -82,6 +82,27 @@ def vertices_in_media_class(variant: str) -> type:
 
 
 @cache
+def vertices_in_grids_class(variant: str) -> type:
+    """The same of a scene with media whose density varies."""
+
+    @dataclass
+    class VerticesInGrids(vertices_in_media_class(variant)):  # type: ignore[misc]
+        """27 words a vertex; of the edge that leads there ``collisions.Collisions`` without M."""
+
+        key: mi.UInt32
+        nulls: mi.UInt32
+        N_c: mi.Float
+
+    return VerticesInGrids
+
+
+def kind_of_vertices(fog: Fog | None) -> type:
+    """What maps of a scene with those media hold, beside edges."""
+    of_media = vertices_in_grids_class if fog and fog.media.grids else vertices_in_media_class
+    return (of_media if fog else vertices_class)(mi.variant())
+
+
+@cache
 def vertices_and_edges_class(variant: str) -> type:
     """The same where the edges of light paths are kept, too."""
 
@@ -155,8 +176,7 @@ def _start(scene, lights: LightEnds, random, fog) -> tuple:
 
 
 def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen, edges: bool) -> Iterator[Any]:
-    vertices = vertices_and_edges_class if edges else vertices_in_media_class if fog else vertices_class
-    kind = vertices(mi.variant())
+    kind = vertices_and_edges_class(mi.variant()) if edges else kind_of_vertices(fog)
     map_before = None
     while dr.width(lanes := dr.compress(paths.alive)):
         paths, random = _at(paths, lanes), random.at(lanes)
@@ -191,7 +211,7 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
     ray, β, density, survival = mi.Ray3f(paths.ray), paths.β, paths.density, paths.survival
     parent, bounce, alive, within = mi.UInt32(paths.parent), mi.UInt32(paths.bounce), mi.Bool(paths.alive), paths.within
     brightest, (max_depth, rr_depth) = paths.brightest, depths
-    kind = (vertices_in_media_class if fog else vertices_class)(mi.variant())
+    kind = kind_of_vertices(fog)
     while dr.hint(alive & (place < end), label="light paths"):
         if dr.hint(fog is not None, mode="scalar"):
             channel, medium = within
@@ -200,7 +220,8 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
             segment, si = fog.fly(next_surface(scene), ray, medium, channel, random, alive)
             hit, where, β = segment.hit, segment.place, β * segment.weight
             exists, scatters = alive & si.is_valid() & (dr.max(β) > 0), where.scatters
-            around = where.medium, channel
+            nulls = segment.nulls
+            around = where.medium, channel, *((nulls.key, nulls.n, nulls.N_c) if nulls else ())
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
             si = hit.compute_surface_interaction(ray, active=alive)
