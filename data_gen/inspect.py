@@ -99,7 +99,7 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
-    if facts.grids and (able := _commands(("vpm",), facts)):
+    if facts.grids and (able := _commands(("vpm", "gvpm"), facts)):
         lines.append(f"media whose density varies: photons are gathered in them near to points alone: {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
         lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")

@@ -50,8 +50,9 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     assert_copies_are_light_paths(mi, name, balls)
 
 
-QUICK = [("colours", 4)]
-SLOW = [("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
+QUICK = [("colours", 4), ("wisps", 4)]
+FOG = [("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
+SLOW = [*FOG, ("wisps", 1), ("smoke", 4), ("coloured_smoke", 4), ("before_the_sky", 1)]
 
 
 @pytest.mark.parametrize(("name", "pixels"), QUICK + [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW])
@@ -74,7 +75,17 @@ def test_a_wrong_jacobian_in_balls_is_found(renderer, monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["nested", "milk"])
+def test_null_collisions_that_are_stretched_without_their_jacobian_are_found(renderer, monkeypatch):
+    import drjit as dr
+
+    monkeypatch.setattr("data_gen.paths.collisions.list_jacobian", lambda scale, n: dr.full(type(scale), 1))
+    stacks = passes(load(renderer, media_scenes.wisps, (12, 12)), 64, 4, "gvpm", radius=1.4, photons=32)
+    with pytest.raises(AssertionError):
+        assert_no_bias(stacks, 4)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["nested", "milk", "wisps", "before_the_sky"])
 def test_the_primal_is_that_of_vpm(renderer, name):
     """The same camera paths and photons; Russian roulette alone looks at five paths instead of one."""
 
@@ -107,3 +118,16 @@ def test_photons_in_balls_have_copies_and_differences_little_noise(renderer):
     failed = pass_through(render_stack(scene, 2, 0, "gvpm", radius=1.0, diagnostics=True))["diagnostics.shiftFailures"]
     mean, median = gain(passes(scene, 8, 1, "gvpm", radius=1.0))
     assert failed.mean() < 0.1 and mean > 5 and median > 30, (failed.mean(), mean, median)
+
+
+@pytest.mark.slow
+def test_photons_in_grids_have_copies_and_differences_little_noise(renderer):
+    """Where a grid is empty there are none: more fail than in fog."""
+    from data_gen.render import render_stack
+    from ngpt.io.exr import pass_through
+
+    scene = load(renderer, media_scenes.wisps, (24, 24))
+    stack = render_stack(scene, 2, 0, "gvpm", radius=1.0, photons=8, diagnostics=True)
+    failed = pass_through(stack)["diagnostics.shiftFailures"]
+    mean, median = gain(passes(scene, 8, 1, "gvpm", radius=0.7, photons=8))
+    assert failed.mean() < 0.2 and mean > 6 and median > 15, (failed.mean(), mean, median)

@@ -60,11 +60,16 @@ def test_paths_in_media_are_no_longer_than_the_scene_says(renderer, max_depth):
 
 
 def test_density_is_not_blurred_in_grids(renderer):
-    """Grids that fade have the image of ``volpath``; the same seed, the same bits."""
+    """Grids that fade have the image of ``volpath``."""
     alike(renderer, media_scenes.wisps, radius=0.6, photons=40, references=32)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["vpm", "gvpm"])
+def test_the_same_seed_has_the_same_bits_in_grids(renderer, name):
     scene = load(renderer, media_scenes.wisps, (8, 8))
-    once, again = (render_ours(scene, "vpm", batches=1, spp=3)[0]["primal"] for _ in range(2))
-    assert np.array_equal(once, again) and once.any()
+    once, again = (render_ours(scene, name, batches=1, spp=3)[0] for _ in range(2))
+    assert all(np.array_equal(once[layer], again[layer]) for layer in once) and once["primal"].any()
 
 
 @pytest.mark.slow
@@ -82,6 +87,7 @@ def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
     assert np.mean(theirs) - np.mean(wide) > 2 * error
 
 
+@pytest.mark.slow
 def test_lamps_and_skies_behind_grids_are_seen(renderer):
     """Of paths of one edge, before any photon: the light that comes through, as ``volpath`` has it."""
 
@@ -139,10 +145,12 @@ def test_media_and_lights_that_vpm_refuses(renderer):
     from data_gen.samplers import find
     from data_gen.scenes.facts import Facts
 
-    with pytest.raises(NgptError, match=r"'bre' .* media whose density varies.* use --sampler gpt, .*vpm \(no grad"):
+    with pytest.raises(
+        NgptError, match=r"'bre' .* media whose density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"
+    ):
         render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "bre")
-    with pytest.raises(NgptError, match=r"'gvpm' .* media whose density varies; use --sampler gpt, or vpm"):
-        renderer.load_dict({"type": "gvpm"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
+    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies; use --sampler gpt, or vpm or gvpm"):
+        renderer.load_dict({"type": "gbre"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
     def endless():
         return media_scenes.haze() | {"sky": {"type": "constant"}}
@@ -157,5 +165,6 @@ def test_a_report_on_grids_names_the_sampler_of_photons(renderer):
     from data_gen.inspect import inspect_scene
 
     smoke, haze = ("\n".join(inspect_scene(name)["plan"]) for name in ("smoke", "haze"))
-    assert "media whose density varies: photons are gathered in them near to points alone: `--sampler vpm`" in smoke
+    known = "photons are gathered in them near to points alone: `--sampler vpm`, `--sampler gvpm`"
+    assert f"media whose density varies: {known}" in smoke
     assert "`--sampler bre` refuses: there are media whose density varies" in smoke and "density varies" not in haze

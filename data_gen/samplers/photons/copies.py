@@ -227,9 +227,7 @@ def known_of_media(scene, fog, photons, j, photon: Photon, origin) -> Through:
     if fog.media.grids:
         trace, back, none = segments.next_surface(scene), media.shortened(back, reach), mi.UInt32(0)
         steps = none, mi.Float(1), none, mi.Bool(True)
-        τ, _, _, medium, M, _ = collisions.cross(
-            fog.media.passes, trace, back, medium, reach, photon.channel, *steps
-        )
+        τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, photon.channel, *steps)
         key, n, N_c = (dr.gather(type(v), v, j) for v in (photons.key, photons.nulls, photons.N_c))
         return Through(medium, media.pick(τ, photon.channel), photon.channel, Collisions(key, n, M, N_c))
     if not fog.media.boundaries:

@@ -107,8 +107,8 @@ class VPM(PPM):
         lights = LightEnds(scene, self.name)
         self.fog = Fog(scene, lights, self.name, self.grids) if media_of(scene) else None
         if self.fog and self.fog.media.grids:
-            # Φ / σs of each vertex
-            self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * 3 * 4
+            # Null collisions of each vertex, twice; and Φ / σs
+            self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * (3 + 3 + 3) * 4
         passed = media.index_matched if self.fog else lambda shape: False
         materials = Materials(scene, self.threshold, passed, media=self.fog is not None)
         return Passes(self, scene, lights, materials, pixel_width(scene))
