@@ -10,7 +10,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("export/**/*.md")])
 PAGES = [page for page in PAGES if "node_modules" not in page.parts]
-PICTURES = sorted(path for path in ROOT.glob("docs/images/*") if path.suffix in (".png", ".jpg", ".svg"))
+PICTURES = sorted(path for path in ROOT.glob("docs/images/*") if path.suffix in (".png", ".jpg", ".svg", ".webp"))
 # Made by commands, which wrap no lines.
 GENERATED = re.compile(r"-table\.md$|RELIABILITY\.md$|RESULTS\.md$")
 

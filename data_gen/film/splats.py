@@ -41,6 +41,17 @@ class Splats:
         splats.pixels, splats.channels, (splats.sums, splats.lost) = pixels, channels, sums
         return splats
 
+    def zeros(self) -> tuple:
+        """Sums of nothing, for ``on``."""
+        sums = dr.zeros(type(self.sums), dr.width(self.sums)), dr.zeros(mi.UInt32, self.pixels)
+        dr.make_opaque(sums)
+        return sums
+
+    def take(self, sums: tuple) -> None:
+        """Adds all that others hold."""
+        self.sums, self.lost = self.sums + sums[0], self.lost + sums[1]
+        dr.eval(self.sums, self.lost)
+
     def add(self, pixel: mi.UInt32, components: list, active) -> None:
         """Adds a value of a Float for each channel to the ``pixel`` of each lane that is ``active``."""
         Int64, Float64 = dr.int64_array_t(mi.Float), dr.float64_array_t(mi.Float)

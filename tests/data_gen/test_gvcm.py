@@ -160,39 +160,49 @@ def taken_all(values, taken, dr):
     return found
 
 
+class Beside:
+    """The pairs of vertex ``t``, with a photon beside each on the same surface, and what merging finds of them."""
+
+    def __init__(self, copies, t, radius, number=4096):
+        import drjit as dr
+
+        from data_gen.samplers.vcm.differences import ShiftedMerging
+        from data_gen.samplers.vcm.merging import Map, Photons
+
+        mi = copies.mi
+        self.pairs = pairs_of(copies, t, number)
+        z = self.pairs[0][0]
+        self.n = n = dr.width(z.depth)
+        kept, turned = Map.empty(n, 1), np.random.default_rng(0).normal(size=(3, n)).astype(np.float32)
+        d = -dr.normalize(z.si.n * 1.2 + dr.normalize(mi.Vector3f(turned)))
+        aside = dr.cross(z.si.n, dr.normalize(mi.Vector3f(turned))) * 0.02
+        fields = {"o": z.si.p + aside - d, "d": d, "t": 1, "n": z.si.n, "β": 1.0, "vcm": 1, "vc": 0.3, "depth": 2}
+        for name, value in fields.items():
+            old = getattr(kept.vertices, name)
+            setattr(kept.vertices, name, type(old)(value) + dr.zeros(type(old), n))
+        kept.photon = dr.full(mi.UInt32, 1, n)
+        self.photons = Photons(kept, radius, n)
+        self.places = np.array(z.si.p).T, np.array(z.si.p + aside).T
+        self.merging = ShiftedMerging(self.photons, copies.materials, 12)
+
+    def found(self, end, η=1.0):
+        """L and Δ of the base paths of that ``end``, 0 or 1, where paths merge with this η: (3, n) of each."""
+        import drjit as dr
+        import mitsuba as mi
+
+        x, shifted = self.pairs[end]
+        self.photons.η = dr.opaque(mi.Float, η)
+        shifted, everywhere = replace(shifted, Δ=dr.zeros(mi.Spectrum, self.n)), dr.full(mi.Bool, True, self.n)
+        L, (Δ,) = self.merging.differences(x, x.si.bsdf(), everywhere, [shifted])
+        return np.array(L, np.float64), np.array(Δ, np.float64)
+
+
 @np.errstate(divide="ignore", invalid="ignore")
 def check_pairs(copies, t):
     """Δ(y) = -Δ(x), where r r' = 1: at a vertex of the copy's own, and at the one where it joins."""
-    import drjit as dr
-
-    from data_gen.samplers.vcm.differences import ShiftedMerging
-    from data_gen.samplers.vcm.merging import Map, Photons
-
-    mi = copies.mi
-    (z, offset), (own, back) = pairs_of(copies, t)
-    n = dr.width(z.depth)
-    # A photon beside each of the vertices, on the same surface
-    rng = np.random.default_rng(0)
-    kept = Map.empty(n, 1)
-    turned = mi.Vector3f(rng.normal(size=(3, n)).astype(np.float32))
-    d = -dr.normalize(z.si.n * 1.2 + dr.normalize(turned))
-    aside = dr.cross(z.si.n, dr.normalize(turned)) * 0.02
-    fields = {"o": z.si.p + aside - d, "d": d, "t": 1, "n": z.si.n, "β": 1.0, "vcm": 1, "vc": 0.3, "depth": 2}
-    for name, value in fields.items():
-        old = getattr(kept.vertices, name)
-        setattr(kept.vertices, name, type(old)(value) + dr.zeros(type(old), n))
-    kept.photon = dr.full(mi.UInt32, 1, n)
     # So wide that disks of neighbouring pixels overlap
-    photons = Photons(kept, 0.4 if t == 1 else 0.05, n)
-    photons.η = dr.opaque(mi.Float, 1)
-    merging, everywhere = ShiftedMerging(photons, copies.materials, 12), dr.full(mi.Bool, True, n)
-
-    def Δ(x, shifted):
-        shifted = replace(shifted, Δ=dr.zeros(mi.Spectrum, n))
-        L, (difference,) = merging.differences(x, x.si.bsdf(), everywhere, [shifted])
-        return np.array(L, np.float64), np.array(difference, np.float64)
-
-    (L, there), (L1, back_again) = Δ(z, offset), Δ(own, back)
+    beside = Beside(copies, t, 0.4 if t == 1 else 0.05)
+    (L, there), (L1, back_again) = beside.found(0), beside.found(1)
     # Some photons may not be near to both, and light may have no way to the copy.
     lit = (L.max(axis=0) > 0) & (L1.max(axis=0) > 0)
     whole = lit & (np.abs(there + 2 * L).max(axis=0) > 1e-3 * L.max(axis=0))
@@ -203,6 +213,37 @@ def check_pairs(copies, t):
     else:
         error = np.abs(there + back_again) / (np.abs(there) + L)
     assert np.median(error[:, whole]) < 1e-5 and np.quantile(error[:, whole], 0.85) < 1e-2
+
+
+def check_shared_weight(copies):
+    """Δ = 2 (b' - b) / (W(x) + r W(y)) at the vertex where copies join, of points with one photon near by."""
+    from scipy.spatial import cKDTree
+
+    beside = Beside(copies, 2, 0.025, number=600)
+    points, photons = beside.places
+    alone = np.array([len(near) == 1 for near in cKDTree(photons).query_ball_point(points, 0.026)])
+    # Where η is beyond all bounds merging has all the weight, W = 1.
+    (L, Δ), (L1, _), (b, _), (b1, _) = beside.found(0), beside.found(1), beside.found(0, 1e30), beside.found(1, 1e30)
+    r = np.array(beside.pairs[0][1].r, np.float64)
+    good = alone & (L.min(axis=0) > 0) & (L1.min(axis=0) > 0)
+    assert good.sum() > 100
+    W, W1 = (b / L)[:, good], (b1 / L1)[:, good]
+    expected = 2 * (r * b1 - b)[:, good] / (W + r[good] * W1)
+    error = np.abs(Δ[:, good] - expected) / (b[:, good] / W)
+    assert np.median(error) < 1e-4 and np.quantile(error, 0.95) < 1e-2, np.quantile(error, [0.5, 0.95])
+
+
+def test_pairs_at_shared_vertices_have_the_weight_of_all_strategies(copies):
+    check_shared_weight(copies)
+
+
+def test_weights_of_merging_alone_are_found_at_shared_vertices(copies, monkeypatch):
+    from data_gen.samplers.gbdpt.pairs import difference_of_one
+    from data_gen.samplers.vcm import differences
+
+    monkeypatch.setattr(differences, "difference", difference_of_one)
+    with pytest.raises(AssertionError):
+        check_shared_weight(copies)
 
 
 @pytest.mark.parametrize("t", [1, 2])
@@ -239,8 +280,11 @@ def test_differences_are_those_of_the_image(renderer, name, pixels, radius):
 
 @pytest.mark.slow
 def test_where_nothing_merges_it_is_gbdpt(renderer):
-    """With a radius of nearly nothing: the same paths, splats and shifts from the same random numbers."""
-    scene = load(renderer, SCENES["glass"], (12, 12))
+    """With a radius of nearly nothing: the same paths, splats and shifts from the same random numbers.
+
+    Without glass, through which ``gbdpt`` walks camera paths.
+    """
+    scene = load(renderer, lambda: {k: v for k, v in SCENES["areas"]().items() if k != "glass"}, (12, 12))
     ours = passes(scene, 2, 1, "gvcm", radius=1e-5, joined_depth=10)
     theirs = passes(scene, 2, 1, "gbdpt")
     for layer in (light_of_gradients, itemgetter("dx"), itemgetter("dy")):

@@ -110,7 +110,8 @@ def shots(rooms):
     return cache(lambda name, change: [values for _, values in rooms(name, change).frames()])
 
 
-SHOTS = [("diffuse", "things"), ("diffuse", "lamp"), pytest.param(("glossy", "lamp"), marks=pytest.mark.slow)]
+GLOSSY = pytest.param(("glossy", "lamp"), marks=pytest.mark.slow)
+SHOTS = [("diffuse", "lamp"), pytest.param(("diffuse", "things"), marks=pytest.mark.slow), GLOSSY]
 
 
 @pytest.mark.parametrize("shot", SHOTS)
@@ -171,7 +172,7 @@ def stale(room, frame, of):
     return stage
 
 
-@pytest.mark.parametrize("shot", SHOTS)
+@pytest.mark.parametrize("shot", [("diffuse", "lamp"), ("diffuse", "things"), GLOSSY])
 def test_carried_to_a_scene_of_the_same_state_a_path_is_the_same(rooms, shot):
     from data_gen.samplers.restir.carry import Carry
     from data_gen.samplers.restir.record import STUCK
@@ -191,7 +192,7 @@ def test_carried_to_a_scene_of_the_same_state_a_path_is_the_same(rooms, shot):
     room.pan = PAN
 
 
-@pytest.mark.parametrize("shot", SHOTS)
+@pytest.mark.parametrize("shot", [("diffuse", "lamp"), ("diffuse", "things"), GLOSSY])
 def test_carried_there_and_back_a_path_is_what_it_was(rooms, shot):
     """r(T x) r(x) = 1, through a change of the scene and to another pixel."""
     import drjit as dr

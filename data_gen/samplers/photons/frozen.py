@@ -24,8 +24,11 @@ class Frozen:
         self.state = [scene, *map(arrays, owners)]
         self.functions: dict[Callable, Callable] = {}
 
-    def __call__(self, f: Callable, *args: Any, fixed: bool = False) -> Any:
-        """``fixed``: all calls of f have arrays of the same widths."""
+    def __call__(self, f: Callable, *args: Any, fixed: bool = False, sums: Callable | None = None) -> Any:
+        """``fixed``: all calls of f have arrays of the same widths. ``sums`` makes the last argument, which f adds to.
+
+        A call that fails may have added already: the next try has others.
+        """
         if f not in self.functions:
             # Not bound to ``self``: what is in no circle goes when the render does.
             state = self.state
@@ -33,12 +36,12 @@ class Frozen:
             options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
             self.functions[f] = dr.freeze(f if fixed else without_constants(f), **options)
         try:
-            return self.functions[f](*args)
+            return self.functions[f](*args, *([sums()] if sums else []))
         except RuntimeError:
             # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does, be it of
             # another scene. It records anew where scenes come and go, so this may be later than at the first call.
             self.functions[f] = f
-            return f(*args)
+            return f(*args, *([sums()] if sums else []))
 
 
 def without_constants(f: Callable) -> Callable:

@@ -83,14 +83,13 @@ class GVCM(VCM):
         for shift in (self.straight_splats, self.bent_splats):
             if not dr.width(lanes):
                 return
-            some, sums = camera.at(lanes), [(one.sums, one.lost) for one in splats]
+            some = camera.at(lanes)
             seen = some.lens, some.time, some.wavelength, some.random, some.rays()[:2], depths
             dr.eval(seen)
-            dr.make_opaque(sums)
-            sums, is_bent = passes.frozen(shift, *ends, *seen, η, sums)
+            sums, is_bent = passes.frozen(shift, *ends, *seen, η, sums=lambda: [one.zeros() for one in splats])
             dr.eval(sums, is_bent)
-            for one, (total, lost) in zip(splats, sums, strict=True):
-                one.sums, one.lost = total, lost
+            for one, added in zip(splats, sums, strict=True):
+                one.take(added)
             if passes.materials.all_connectable:
                 return
             few = dr.compress(is_bent)

@@ -148,12 +148,12 @@ class VCM(BDPT):
     def light_paths(self, passes: Passes, camera: CameraSamples, random, ray, importance, splats: Splats) -> tuple:
         """Traces and splats them: random numbers to go on by, the photons, and the splatter's state."""
         n, radius = dr.width(camera.pixel), self.radius * passes.width * shrunk(camera.first)
-        kept, η, sums = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n)), (splats.sums, splats.lost)
-        dr.make_opaque(sums)
+        kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
         ends = passes.scene, passes.lights, passes.materials, camera.sensor, camera.lens
-        numbers, sums, kept, state = passes.frozen(self.lit, *ends, random, ray, importance, kept, η, sums, fixed=True)
+        path = random, ray, importance, kept, η
+        numbers, sums, kept, state = passes.frozen(self.lit, *ends, *path, fixed=True, sums=splats.zeros)
         dr.eval(numbers, sums, kept, state)
-        splats.sums, splats.lost = sums
+        splats.take(sums)
         return type(random)(numbers), Photons(kept, radius, n), state
 
     def lit(self, scene, lights, materials, sensor, lens, random, ray, importance, kept: Map, η, sums: tuple) -> tuple:

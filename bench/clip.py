@@ -1,0 +1,66 @@
+"""A clip of a moving camera: paths without gradients, results frame by frame and over time, side by side.
+
+    python -m bench.clip --scene glossy --cache out/clip --picture docs/images/shot.webp
+
+All three take about the same time: ``--spp`` samples with gradients, ``--plain`` without. The camera moves as in
+``bench.sequences``.
+"""
+
+import argparse
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+
+import ngpt
+from bench.sequences import SPEEDS, sideways
+from ngpt.report.display import auto_exposure, to_srgb8
+from ngpt.temporal import Temporal
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scene", default="glossy", help="a file, or a built-in scene")
+    parser.add_argument("--shot", default="slow", choices=SPEEDS)
+    parser.add_argument("--method", default="ngpt-fast")
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--size", default="176x132")
+    parser.add_argument("--spp", type=int, default=8)
+    parser.add_argument("--plain", type=int, default=16)
+    parser.add_argument("--cache", type=Path, required=True, help="folder for what is rendered; files there are kept")
+    parser.add_argument("--picture", type=Path, required=True)
+    args = parser.parse_args()
+    pages = [Image.fromarray(page) for page in frames(args)]
+    args.picture.parent.mkdir(parents=True, exist_ok=True)
+    pages[0].save(args.picture, save_all=True, append_images=pages[1:], duration=125, loop=0, quality=80, method=6)
+
+
+def frames(args: argparse.Namespace) -> Iterator[np.ndarray]:
+    """(H, 3 W, 3) bytes of each frame."""
+    from data_gen.backend import DEFAULT_VARIANT, use_variant
+
+    use_variant(DEFAULT_VARIANT)
+    from data_gen.frames.sequence import Shot, render_sequence
+
+    size = tuple(map(int, args.size.split("x")))
+    path = sideways(Shot(lambda frame: (args.scene, {}), size).at(0), SPEEDS[args.shot])
+    shot = Shot(lambda frame: (args.scene, {}), size, path)
+    kinds = []
+    for sampler, spp in (("gpt", args.spp), ("primal", args.plain)):
+        files = [args.cache / sampler / f"{frame:04d}.exr" for frame in range(args.frames)]
+        files[0].parent.mkdir(parents=True, exist_ok=True)
+        there = [file.exists() for file in files]
+        for frame, stack in render_sequence(shot, range(args.frames), spp, 1, skip=there.__getitem__, sampler=sampler):
+            ngpt.write(files[frame], stack)
+        kinds.append([ngpt.read(file) for file in files])
+    temporal, exposure = Temporal(), None
+    for stack, noisy in zip(*kinds, strict=True):
+        image = ngpt.denoise(stack, method=args.method)
+        blended = temporal.next(stack, image)
+        exposure = auto_exposure(blended) if exposure is None else exposure
+        yield to_srgb8(np.concatenate([noisy["primal"], image, blended], axis=1), exposure)
+
+
+if __name__ == "__main__":
+    main()
