@@ -245,13 +245,15 @@ def test_memory_stays_within_its_budget(renderer, name):
 
     scene = scene_for(renderer, name, (64, 48))
     spp = 8 if SAMPLERS[name].batch == 1 else 100
+    # Photons with copies along rays need more for any pass at all.
+    memory = 60 if SAMPLERS[name].batch == 1 else 40
     whole = render_stack(scene, spp, 1, name)
     dr.flush_malloc_cache()
     dr.detail.malloc_clear_statistics()
     before = dr.detail.malloc_watermark(dr.JitBackend.LLVM)
     calls = []
-    stack = render_stack(scene, spp, 1, name, lambda *call: calls.append(call), memory=40)
-    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before < 40 * 2**20
+    stack = render_stack(scene, spp, 1, name, lambda *call: calls.append(call), memory=memory)
+    assert dr.detail.malloc_watermark(dr.JitBackend.LLVM) - before < memory * 2**20
     assert len(calls) > 5
     same(whole, stack)
 
