@@ -136,6 +136,7 @@ def test_differences_by_planes_are_those_of_the_image(renderer, name, pixels):
     assert_no_bias(stacks, pixels)
 
 
+@pytest.mark.slow
 def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
     from data_gen.samplers.photons import gplanes
 

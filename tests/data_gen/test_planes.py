@@ -74,6 +74,7 @@ def light_of_planes(renderer, monkeypatch, spp=4, batches=8, **options):
     return np.stack([stack["primal"] for stack in ours]), np.stack(references)
 
 
+@pytest.mark.slow
 def test_light_by_planes_has_no_bias(renderer, monkeypatch):
     """Through boundaries, past what is in the way, with extinctions of each colour; some of the light paths swept."""
     ours, references = light_of_planes(renderer, monkeypatch, planes=128)

@@ -73,8 +73,8 @@ def toy():
 NAMES = [*SAMPLERS, "toy"]
 
 
-# Passes of chains take long to start, and some laws take many; beams are photons along rays to these laws.
-LONG = ("gmlt", "beams", "gbeams", "planes", "gplanes", "gvcm")
+# Passes of chains take long to start, and some laws take many. Of photons `ppm`, `gpm` and `bre` stand for all others.
+LONG = ("gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
 
 
 def long_slow(names):
