@@ -73,8 +73,9 @@ def toy():
 NAMES = [*SAMPLERS, "toy"]
 
 
-# Passes of chains take long to start, and some laws take many. Of photons `ppm`, `gpm` and `bre` stand for all others.
-LONG = ("gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
+# Passes of chains and of paths from both ends take long to start, and some laws take many. Of photons `ppm`, `gpm` and
+# `bre` stand for all others.
+LONG = ("bdpt", "gbdpt", "gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
 
 
 def long_slow(names):
@@ -192,7 +193,7 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
 
 
 # 64 renders of these take long. Their film is that of the others.
-DEAR = ("gbdpt", "gmlt", "ppm", "gpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
+DEAR = (*LONG, "ppm", "gpm", "bre")
 SLOW = [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in NAMES]
 
 
