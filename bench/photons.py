@@ -66,7 +66,8 @@ METHODS_IN_MEDIA = {
 TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1), "planes": ("gplanes", 0)}
 PHOTONS = (*TWINS, *(twin for twin, _ in TWINS.values()))
 TWINS |= {"vcm": ("gvcm", 2)}
-# Samplers with one sample of each pixel in a pass, or a few
+# Samplers whose passes take long; and those with one sample of each pixel in a pass, or a few
+LONG = ("beams", "gbeams", "planes", "gplanes")
 IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
 DEFAULT = (*PHOTONS, "vcm", "gvcm", "gbdpt", "gpt", "primal")
 # Columns of the picture: samplers on surfaces and in media, and the method
@@ -182,7 +183,10 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
         render_stack(scene, spp, 1, sampler, **samplers[sampler])
         return time.process_time() - start
 
-    counts = {sampler: (3, 9) if sampler in IN_PASSES else (16, 64) for sampler in samplers}
+    def turns(sampler: str) -> tuple[int, int]:
+        return (1, 3) if sampler in LONG else (3, 9) if sampler in IN_PASSES else (16, 64)
+
+    counts = {sampler: turns(sampler) for sampler in samplers}
     found: dict[str, tuple[float, float]] = {}
     for turn in range(1 + rounds):
         for sampler, (few, many) in list(counts.items()):
