@@ -51,10 +51,9 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
     assert np.abs(images[0] - images[1]).mean() < 0.02 * images[0].mean()
 
 
-@pytest.mark.parametrize("name", ["wisps", pytest.param("coloured_smoke", marks=pytest.mark.slow)])
-def test_rays_go_through_grids(renderer, name):
+def test_rays_go_through_grids(renderer):
     """Up to a collision, by null ones; colours of the grid apart, density not blurred, in mist."""
-    alike(renderer, getattr(media_scenes, name), radius=0.3, photons=64, block=8, references=32)
+    alike(renderer, media_scenes.wisps, radius=0.3, photons=64, block=8, references=32)
 
 
 def test_paths_in_media_are_no_longer_than_the_scene_says(renderer):
