@@ -172,8 +172,9 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
 
 
 def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tuple[float, float]]:
-    """Of samplers with their options: seconds of a render of no samples, and of a sample; the least of some rounds.
+    """Of samplers with their options: seconds of a render of no samples, and of a sample.
 
+    By the least of some rounds of a short render and of a long one: of their differences, the least would be chance.
     Samplers take turns. Those that refuse the scene are left out.
     """
     from data_gen.render import render_stack
@@ -187,7 +188,7 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
         return (1, 3) if sampler in LONG else (3, 9) if sampler in IN_PASSES else (16, 64)
 
     counts = {sampler: turns(sampler) for sampler in samplers}
-    found: dict[str, tuple[float, float]] = {}
+    least: dict[str, tuple[float, float]] = {}
     for turn in range(1 + rounds):
         for sampler, (few, many) in list(counts.items()):
             try:
@@ -198,10 +199,13 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
                 continue
             # The first turn compiles the kernels.
             if turn:
-                each = max(cost(sampler, many) - short, 1e-3) / (many - few)
-                found[sampler] = min(
-                    found.get(sampler, (np.inf, np.inf)), (short - few * each, each), key=lambda c: c[1]
-                )
+                before = least.get(sampler, (np.inf, np.inf))
+                least[sampler] = min(before[0], short), min(before[1], cost(sampler, many))
+    found = {}
+    for sampler, (short, long) in least.items():
+        few, many = counts[sampler]
+        each = max(long - short, 1e-3) / (many - few)
+        found[sampler] = short - few * each, each
     return found
 
 
