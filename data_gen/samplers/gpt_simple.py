@@ -39,7 +39,7 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from, consistent
 from data_gen.samplers.common import GradientIntegrator, like_path
 from ngpt.errors import NgptError
 
@@ -159,7 +159,7 @@ def base_step(scene, random, x, β, active) -> Step:
 
     # ------------------------ BSDF sampling -----------------------
     sample, f_p = x.bsdf().sample(mi.BSDFContext(), x, random.next_1d(), random.next_2d(), active)
-    wo, p = sample.wo, sample.pdf
+    wo, p = sample.wo, consistent(x.bsdf(), x, sample, f_p, active).pdf
     goes_on = active & (p > 0)
     β1 = dr.select(goes_on, β * f_p, 0)
     ray = x.spawn_ray(x.to_world(wo))

@@ -51,7 +51,7 @@ from ngpt.errors import NgptError
 
 SIDES = (2, 4)
 # Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
-_LANE_BYTES, _CONNECTION_BYTES = 224, 44
+_LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
 
 class GPTTiles(GPTSimple):
@@ -90,18 +90,15 @@ class Tiles:
         self.lane_bytes = _LANE_BYTES + _CONNECTION_BYTES * self.side**2
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        camera = in_step(camera)
+        keep_in_step(camera)
         Le, paths = self.trace(camera)
         grid = Grid(camera, self.side)
-        own = paths.own
-        within = [(grid.self, own), *((link, self.connect(camera, paths, link)) for link in grid.others())]
-        I = balanced(within)  # noqa: E741 - the symbol of the equations
-        del within
+        I = self.shared(camera, paths, grid.others())  # noqa: E741 - the symbol of the equations
         film.put("primal", I + rgb(Le))
         film.put("direct", rgb(Le))
         for axis, name in enumerate(("dx+", "dy+")):
             across = grid.across(axis)
-            beyond = balanced([(grid.self, own), (across, self.connect(camera, paths, across))])
+            beyond = self.shared(camera, paths, [across])
             # Either end of a pair would say the same: it is put once.
             next_one = grid.neighbour(*SHIFTS[name])
             crosses = across.active & (across.lane == next_one.lane)
@@ -110,8 +107,19 @@ class Tiles:
             Δ = dr.select(crosses, beyond, inner) - here
             dr.eval(Δ, next_one.active)
             film.put(name, Δ, next_one.active)
-        del paths, own
+        del paths
         film.put_all(features(self.scene, camera.sensor, camera.random.clone(), camera.rays()[0]))
+
+    def shared(self, camera: CameraSamples, paths: Paths, links: list[Link]) -> mi.Color3f:
+        """I of each pixel, of its own path and those of the pixels that ``links`` lead to."""
+        members, direct, count = [(None, paths.own)], paths.direct, dr.select(paths.lives, mi.Float(1), 0)
+        for link in links:
+            connection, light = self.connect(camera, paths, link)
+            direct = direct + light
+            dr.eval(connection, direct)
+            members.append((link, connection))
+            count += dr.select(paths.both(link), mi.Float(1), 0)
+        return balanced(members) + dr.select(count > 0, direct / count, 0)
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
         """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and what it is worth here."""
@@ -135,19 +143,15 @@ class Tiles:
         C2 = C * second.β1 * second.p * (second.L_bsdf + R)
         q1 = dr.select(first.goes_on, first.p, 0)
         q2 = dr.select(second.goes_on, q1 * second.p, 0)
-        own = Connection(rgb(C1), rgb(C2), q1, q2, rgb(importance * first.L_light), lives)
+        own, direct = Connection(rgb(C1), rgb(C2), q1, q2), rgb(importance * first.L_light)
 
         # ------------------------ The suffix -------------------------
-        # Materials sample directions below the horizon, or from behind, whose density they then deny. Others who are
-        # asked for it would leave it out of D, so such a suffix is nobody else's.
-        (_, p1), (_, p2) = evaluate(x.bsdf(), x, first.wo), evaluate(s.bsdf(), s, second.wo)
-        shared = first.goes_on & first.smooth & (p1 > 0) & materials.connectable(x.bsdf())
+        shared = first.goes_on & first.smooth & materials.connectable(x.bsdf())
         shared &= ~s.is_valid() | materials.connectable(s.bsdf())
         to_s, light = x.spawn_ray(x.to_world(first.wo)), second.light
         suffix = Suffix(
             shared=shared,
             u_light=first.u_light,
-            x=x.p,
             o=to_s.o,
             d=to_s.d,
             s=first.hit,
@@ -155,25 +159,27 @@ class Tiles:
             light_p=light.p,
             light_delta=mi.Bool(light.delta),
             light_weight=light.weight,
-            goes_on=second.goes_on & second.smooth & (p2 > 0),
+            goes_on=second.goes_on & second.smooth,
             wo=second.wo,
             Le=second.Le,
             p_light=second.p_light,
             R=R,
         )
         # One kernel for all of it
-        dr.eval(Le, hit, own, *vars(suffix).values())
-        return Le, Paths(hit, suffix, own)
+        dr.eval(Le, hit, lives, own, direct, *vars(suffix).values())
+        return Le, Paths(hit, lives, suffix, own, direct)
 
-    def connect(self, camera: CameraSamples, paths: Paths, link: Link) -> Connection:
-        """The first vertex of each pixel, connected to the suffix of the pixel that ``link`` leads to."""
+    def connect(self, camera: CameraSamples, paths: Paths, link: Link) -> tuple[Connection, mi.Color3f]:
+        """The first vertex of each pixel, connected to the suffix of the pixel that ``link`` leads to.
+
+        Also what emitter sampling finds there with that pixel's numbers.
+        """
         scene, materials = self.scene, self.materials
         # --------------- The vertices, from what is kept of them ---------------
         ray, importance, _ = camera.rays()
         ray = mi.Ray3f(ray)
         y = paths.hit.compute_surface_interaction(ray)
-        there = link.active & paths.own.there
-        there &= dr.gather(mi.Bool, paths.own.there, link.lane, there)
+        there = paths.both(link)
         suffix = paths.suffix.at(link.lane, there)
         s = suffix.s.compute_surface_interaction(mi.Ray3f(suffix.o, suffix.d, ray.time, ray.wavelengths))
 
@@ -183,7 +189,7 @@ class Tiles:
         # ----------------------- Reconnection, from y to s ---------------------
         reaches = s.is_valid()
         direction = dr.select(reaches, dr.normalize(s.p - y.p), suffix.d)
-        J = dr.select(reaches, reconnection_jacobian(suffix.x, y.p, s.p, s.n), 1)
+        J = dr.select(reaches, reconnection_jacobian(suffix.o, y.p, s.p, s.n), 1)
         f, p = evaluate(y.bsdf(), y, y.to_local(direction))
         good = there & suffix.shared & materials.connectable(y.bsdf()) & (p > 0) & dr.isfinite(J)
         shadow = dr.select(reaches, y.spawn_ray_to(s.p), y.spawn_ray(direction))
@@ -200,9 +206,7 @@ class Tiles:
         goes_on = good & suffix.goes_on & (p > 0)
         q2 = dr.select(goes_on, q1 * p, 0)
         C2 = dr.select(goes_on, C * f * (suffix.Le * mis_weight(p, suffix.p_light) + suffix.R), 0)
-        connection = Connection(rgb(C1), rgb(C2), q1, q2, rgb(dr.select(there, importance * direct, 0)), there)
-        dr.eval(connection)
-        return connection
+        return Connection(rgb(C1), rgb(C2), q1, q2), rgb(dr.select(there, importance * direct, 0))
 
 
 @dataclass
@@ -211,7 +215,6 @@ class Suffix:
 
     shared: mi.Bool  # whether others may
     u_light: mi.Point2f  # the numbers of emitter sampling at the first vertex
-    x: mi.Point3f  # that vertex
     o: mi.Point3f  # the ray from there to s
     d: mi.Vector3f
     s: mi.PreliminaryIntersection3f
@@ -236,24 +239,27 @@ class Suffix:
 
 @dataclass
 class Connection:
-    """What one suffix is worth to one pixel: contributions, densities and direct light; all in the lane of the pixel.
-
-    ``there`` says whether both pixels have a first vertex.
-    """
+    """What one suffix is worth to one pixel: contributions and densities, in the lane of the pixel."""
 
     C1: mi.Color3f
     C2: mi.Color3f
     q1: mi.Float
     q2: mi.Float
-    direct: mi.Color3f
-    there: mi.Bool
 
 
 @dataclass
 class Paths:
-    hit: mi.PreliminaryIntersection3f  # first vertices
+    """One path of each pixel."""
+
+    hit: mi.PreliminaryIntersection3f  # its first vertex
+    lives: mi.Bool  # whether it has one
     suffix: Suffix
-    own: Connection
+    own: Connection  # of the suffix to its own pixel
+    direct: mi.Color3f  # what emitter sampling found at the first vertex
+
+    def both(self, link: Link) -> mi.Bool:
+        """Whether a pixel and the one that ``link`` leads to have a first vertex."""
+        return self.lives & dr.gather(mi.Bool, self.lives, link.lane, link.active)
 
 
 @dataclass
@@ -270,7 +276,6 @@ class Grid:
     def __init__(self, camera: CameraSamples, side: int):
         self.camera, self.side = camera, side
         self.lane = dr.arange(mi.UInt32, dr.width(camera.pixel))
-        self.self = Link(self.lane, mi.Bool(True))
         width, height = camera.size
         self.place = camera.pixel % dr.opaque(mi.UInt32, width), camera.pixel // dr.opaque(mi.UInt32, width)
         self.size = width, height
@@ -282,7 +287,9 @@ class Grid:
 
     def others(self) -> list[Link]:
         """To all other pixels of the tile. Places are paired by an exclusive or, so that links lead back."""
-        pairs = [(x, y) for y in range(self.side) for x in range(self.side)][1:]
+        # Opaque: all connections are one kernel.
+        all_bits = [dr.opaque(mi.UInt32, bits) for bits in range(self.side)]
+        pairs = [(x, y) for y in all_bits for x in all_bits][1:]
         return [
             self.neighbour(*((mi.Int32(slot ^ bits) - mi.Int32(slot)) * self.stride for slot, bits in pair))
             for pair in (zip(self.slot, bits, strict=True) for bits in pairs)
@@ -304,42 +311,39 @@ class Grid:
         active = (there_x >= 0) & (there_x < width) & (there_y >= 0) & (there_y < height)
         block = dr.opaque(mi.Int32, self.camera.block)
         lane = mi.UInt32(dr.select(active, mi.Int32(self.lane) + block * (x + width * y), 0))
-        # So that all connections are one kernel
-        dr.eval(lane, active)
         return Link(lane, active)
 
 
-def in_step(camera: CameraSamples) -> CameraSamples:
-    """The same samples, but all pixels have the first one's place in the pixel, point on the lens and time.
+def keep_in_step(camera: CameraSamples) -> None:
+    """Gives all pixels the place in the pixel, the point on the lens and the time of the first one's sample.
 
     Within a pixel things look different from place to place, which would be the most of the noise of a difference.
     """
     leader = dr.arange(mi.UInt32, dr.width(camera.pixel)) - camera.pixel * dr.opaque(mi.UInt32, camera.block)
     same = camera.at(leader)
-    same.random = camera.random
-    same.position = mi.Point2f(camera.pixel % camera.size.x, camera.pixel // camera.size.x) + same.position
-    dr.eval(same.position, same.lens, same.time)
-    return same
+    camera.position = mi.Point2f(camera.pixel % camera.size.x, camera.pixel // camera.size.x) + same.position
+    camera.lens, camera.time = same.lens, same.time
+    dr.eval(camera.position, camera.lens, camera.time)
 
 
-def balanced(members: list[tuple[Link, Connection]]) -> mi.Color3f:
-    """I of each pixel, by the balance heuristic over the pixels that its ``members`` link it to, itself among them."""
+def balanced(members: list[tuple[Link | None, Connection]]) -> mi.Color3f:
+    """Σ_j C_i(s_j) / D(s_j) of each pixel i, by the balance heuristic over the ``members`` of its tile.
 
-    def summed(values: list) -> mi.Float:
-        return sum(values[1:], values[0])
+    A link leads to the pixel that made the suffix; that of a pixel to itself is None.
+    """
+
+    def of(link: Link | None, values: mi.Float) -> mi.Float:
+        return dr.gather(mi.Float, values, link.lane, link.active) if link else values
 
     # As the maker of a suffix: densities with which the others would have made it, each in the lane of the other.
-    D1, D2 = (
-        summed([dr.gather(mi.Float, getattr(c, q), link.lane, link.active) for link, c in members])
-        for q in ("q1", "q2")
-    )
-    count = summed([dr.select(c.there, mi.Float(1), 0) for _, c in members])
+    D1, D2 = mi.Float(0), mi.Float(0)
+    for link, c in members:
+        D1, D2 = D1 + of(link, c.q1), D2 + of(link, c.q2)
     dr.eval(D1, D2)
     I = mi.Color3f(0)  # noqa: E741
     for link, c in members:
         for C, q, D in ((c.C1, c.q1, D1), (c.C2, c.q2, D2)):
-            I += dr.select(q > 0, C / dr.gather(mi.Float, D, link.lane, link.active), 0)  # noqa: E741
-        I += dr.select(c.there, c.direct / count, 0)  # noqa: E741
+            I += dr.select(q > 0, C / of(link, D), 0)  # noqa: E741
     dr.eval(I)
     return I
 

@@ -75,7 +75,21 @@ NAMES = [*SAMPLERS, "toy"]
 
 # Passes of chains and of paths from both ends take long to start, and some laws take many. Of photons `ppm`, `gpm` and
 # `bre` stand for all others.
-LONG = ("bdpt", "gbdpt", "gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
+LONG = (
+    "bdpt",
+    "gbdpt",
+    "gmlt",
+    "vpm",
+    "gvpm",
+    "gbre",
+    "beams",
+    "gbeams",
+    "planes",
+    "gplanes",
+    "vcm",
+    "gvcm",
+    "gpt-tiles",
+)
 
 
 def long_slow(names):
