@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import evaluate, consistent
+from data_gen.paths.vertex import consistent, evaluate
 from data_gen.scenes.facts import media_of
 
 

@@ -39,7 +39,7 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from, consistent
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, consistent, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator, like_path
 from ngpt.errors import NgptError
 
