@@ -346,7 +346,7 @@ for _sampler in (
     ),
     Sampler(
         "gpt-tiles",
-        "gradients of paths that the pixels of a tile share (light over many surfaces, few samples)",
+        "gradients of paths that the pixels of a tile share (matte rooms, images that are not denoised)",
         _from_module(_TILES),
         lambda facts: _refused_but_for_surfaces(facts, "gpt-tiles"),
         _notes_on_tiles,
