@@ -10,15 +10,19 @@ short. The reference is made by photons, in two halves with their own seeds, of 
 light paths for each pixel, gathered within 1 pixel at first: path tracing does not find all the light here. Its blur is
 that of the photon maps, a little, on the photons' side. Errors are the trimmed relMSE.
 
-Scenes with media have `vpm`, `bre` and `beams` for `ppm`, and their gradient twins. Samplers that refuse a scene are
-left out of it. With --reference-by the reference is by another sampler: `primal` or `bdpt`, which are right where they
-find the light, of --reference-spp samples. With --samplers others are compared. The picture has a row for each scene.
-Scenes that are in the cache are not rendered again, so scenes with references of several kinds are several calls; the
-last one names them all. --docs puts the tables into the page.
+Scenes with media have `vpm`, `bre`, `beams` and `planes` for `ppm`, and their gradient twins. Samplers that refuse a
+scene are left out of it. With --reference-by the reference is by another sampler: `primal` or `bdpt`, which are right
+where they find the light, of --reference-spp samples. With --samplers others are compared. With --seeds each is
+rendered so often: errors are the medians, and those of all seeds are in the file.
+
+Scenes of the file that are not named stay as they are, each with its own setup, so scenes with references of several
+kinds are several calls. Scenes that are in the cache are not rendered again. The picture has a row for each scene of
+the call. --docs puts the tables into the page.
 """
 
 import argparse
 import json
+import statistics
 import time
 from pathlib import Path
 
@@ -40,7 +44,7 @@ METHODS = {
     "ppm": ("primal", "oidn"),
     "gpm": ("primal", "l1", "wcv"),
     "gpt": ("l1", "wcv"),
-    "primal": ("oidn",),
+    "primal": ("primal", "oidn"),
     "bdpt": ("primal", "oidn"),
     "vcm": ("primal", "oidn"),
     "gvcm": ("primal", "l1", "wcv"),
@@ -61,9 +65,11 @@ METHODS_IN_MEDIA = {
 # Each photon sampler, its gradient twin, and the dimensions in which it blurs, in media
 TWINS = {"ppm": ("gpm", 2), "vpm": ("gvpm", 3), "bre": ("gbre", 2), "beams": ("gbeams", 1), "planes": ("gplanes", 0)}
 PHOTONS = (*TWINS, *(twin for twin, _ in TWINS.values()))
-# Samplers with one sample of each pixel in a pass, or a few
+TWINS |= {"vcm": ("gvcm", 2)}
+# Samplers whose passes take long; and those with one sample of each pixel in a pass, or a few
+LONG = ("beams", "gbeams", "planes", "gplanes")
 IN_PASSES = (*PHOTONS, "bdpt", "gbdpt", "vcm", "gvcm")
-DEFAULT = (*PHOTONS, "gpt", "primal")
+DEFAULT = (*PHOTONS, "vcm", "gvcm", "gbdpt", "gpt", "primal")
 # Columns of the picture: samplers on surfaces and in media, and the method
 SHOWN = (
     (("ppm", "vpm"), "primal"),
@@ -72,7 +78,7 @@ SHOWN = (
     (("primal", "primal"), "oidn"),
 )
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
-SETUP = ("size", "seconds", "radius", "photons")
+SETUP = ("size", "seconds", "seeds", "radius", "photons")
 REFERENCE = {"radius": 1.0, "photons": 16}
 PAGE = Path("docs/photons.md")
 MARKS = "<!-- python -m bench.photons -->", "<!-- ends here -->"
@@ -84,6 +90,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=[])
     parser.add_argument("--size", type=int, nargs=2, default=(96, 54), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--seconds", type=float, default=8.0, help="processor time of a render")
+    parser.add_argument("--seeds", type=int, default=1, help="renders of each sampler (default: %(default)s)")
     parser.add_argument("--reference-spp", type=int, default=96, help="of each half")
     parser.add_argument("--reference-by", metavar="SAMPLER", help="default: ppm, or bre in media")
     parser.add_argument("--samplers", nargs="+", default=DEFAULT, help="default: %(default)s")
@@ -103,8 +110,8 @@ def main() -> None:
     from data_gen.backend import use_variant
 
     use_variant()
-    setup = {name: getattr(args, name) for name in SETUP}
-    result: dict = {"benchmark": "photons"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
+    before = json.loads(args.output.read_text())["scenes"] if args.output.exists() else {}
+    result: dict = {"benchmark": "photons", "metadata": metadata("mitsuba"), "scenes": before}
     rows = []
     for scene in args.scenes:
         folder = args.cache / scene_name(scene)
@@ -141,7 +148,8 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
         render_stack(scene, args.reference_spp, 1 << 20 | i, by, **options)["primal"].astype(np.float64)
         for i in range(2)
     ]
-    row: dict = {"reference": by, "error of half a reference": relmse_trimmed(halves[0], halves[1])}
+    row: dict = {name: getattr(args, name) for name in SETUP}
+    row |= {"media": foggy, "reference": by, "error of half a reference": relmse_trimmed(halves[0], halves[1])}
     wanted = {
         sampler: {"radius": args.radius, "photons": args.photons} if sampler in PHOTONS else {}
         for sampler in (METHODS_IN_MEDIA if foggy else METHODS)
@@ -152,11 +160,13 @@ def bench_scene(path: str, args: argparse.Namespace) -> tuple[dict, list[np.ndar
     shown = {}
     for sampler, (_, each) in costs_of(scene, wanted).items():
         spp = max(2, round(args.seconds / each))
-        stack = render_stack(scene, spp, 0, sampler, **wanted[sampler])
-        row[sampler] = {"spp": spp, "milliseconds": round(1e3 * each, 3)}
+        stacks = [render_stack(scene, spp, seed, sampler, **wanted[sampler]) for seed in range(args.seeds)]
+        row[sampler] = {"spp": spp, "milliseconds": round(1e3 * each, 3), "seeds": {}}
         for method in METHODS_IN_MEDIA[sampler] if foggy else METHODS[sampler]:
-            image = shown[sampler, method] = denoise(stack, method)
-            row[sampler][method] = float(f"{relmse_trimmed(image, *halves):.4g}")
+            made = [denoise(stack, method) for stack in stacks]
+            shown[sampler, method] = made[0]
+            errors = row[sampler]["seeds"][method] = [float(f"{relmse_trimmed(i, *halves):.4g}") for i in made]
+            row[sampler][method] = statistics.median(errors)
     columns = [(samplers[foggy], method) for samplers, method in SHOWN]
     return row, [shown[which] for which in columns if which in shown] + [(halves[0] + halves[1]) / 2]
 
@@ -173,7 +183,10 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
         render_stack(scene, spp, 1, sampler, **samplers[sampler])
         return time.process_time() - start
 
-    counts = {sampler: (3, 9) if sampler in IN_PASSES else (16, 64) for sampler in samplers}
+    def turns(sampler: str) -> tuple[int, int]:
+        return (1, 3) if sampler in LONG else (3, 9) if sampler in IN_PASSES else (16, 64)
+
+    counts = {sampler: turns(sampler) for sampler in samplers}
     found: dict[str, tuple[float, float]] = {}
     for turn in range(1 + rounds):
         for sampler, (few, many) in list(counts.items()):
@@ -193,21 +206,13 @@ def costs_of(scene, samplers: dict[str, dict], rounds: int = 2) -> dict[str, tup
 
 
 def table(result: dict) -> str:
-    """Two tables in Markdown: errors; and those of photons alone, in brackets with OIDN, over their twins'."""
+    """Tables in Markdown: errors in media and on surfaces; and those of photons alone, in brackets with OIDN, over
+    their twins'."""
     scenes = result["scenes"]
-    lines = ["| method | " + " | ".join(scenes) + " |", "|---|" + "--:|" * len(scenes)]
-    methods = dict.fromkeys([*METHODS_IN_MEDIA.items(), *METHODS.items()])
-    found = [(s, m) for s, several in methods for m in several if any(m in row.get(s, {}) for row in scenes.values())]
-    least = {name: min(row[s][m] for s, m in found if m in row.get(s, {})) for name, row in scenes.items()}
-    for sampler, method in dict.fromkeys(found):
-        title = f"`{TITLES['primal'] if sampler == 'primal' else sampler}`"
-        cells = []
-        for name, row in scenes.items():
-            error = row.get(sampler, {}).get(method)
-            cells.append("" if error is None else f"**{error:.2g}**" if error == least[name] else f"{error:.2g}")
-        lines.append(f"| {title}{'' if method == 'primal' else f' and {TITLES[method]}'} | {' | '.join(cells)} |")
-    halves = (f"{row['error of half a reference']:.2g}, `{row['reference']}`" for row in scenes.values())
-    lines += ["| half a reference | " + " | ".join(halves) + " |", ""]
+    lines = []
+    for foggy, methods in ((True, METHODS_IN_MEDIA), (False, METHODS)):
+        if rows := {name: row for name, row in scenes.items() if row["media"] == foggy}:
+            lines += [*errors_of(rows, methods), ""]
     lines += [
         "| scene | photons | blurred in | passes | cost of a pass | `l1` | `wcv` |",
         "|---|---|--:|--:|--:|--:|--:|",
@@ -227,6 +232,32 @@ def table(result: dict) -> str:
                 )
                 lines.append(f"| {name} | " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+def errors_of(scenes: dict[str, dict], methods: dict[str, tuple]) -> list[str]:
+    """The lines of a table of errors, a column for each scene: of several seeds the median, and in the last line the
+    largest over the least, the median and the largest such ratio of all methods."""
+    lines = ["| method | " + " | ".join(scenes) + " |", "|---|" + "--:|" * len(scenes)]
+    found = [(s, m) for s, several in methods.items() for m in several]
+    found = [(s, m) for s, m in found if any(m in row.get(s, {}) for row in scenes.values())]
+    least = {name: min(row[s][m] for s, m in found if m in row.get(s, {})) for name, row in scenes.items()}
+    for sampler, method in found:
+        title = f"`{TITLES['primal'] if sampler == 'primal' else sampler}`"
+        cells = []
+        for name, row in scenes.items():
+            error = row.get(sampler, {}).get(method)
+            cells.append("" if error is None else f"**{error:.2g}**" if error == least[name] else f"{error:.2g}")
+        lines.append(f"| {title}{'' if method == 'primal' else f' and {TITLES[method]}'} | {' | '.join(cells)} |")
+    spreads = []
+    for row in scenes.values():
+        seeds = [row[s]["seeds"][m] for s, m in found if m in row.get(s, {}).get("seeds", {})]
+        ratios = [max(errors) / min(errors) for errors in seeds if len(errors) > 1]
+        spreads.append(f"{statistics.median(ratios):.2g}, {max(ratios):.2g}" if ratios else "")
+    halves = (f"{row['error of half a reference']:.2g}, `{row['reference']}`" for row in scenes.values())
+    setups = (f"{'x'.join(map(str, row['size']))}, {row['seconds']:g} s, {row['seeds']}" for row in scenes.values())
+    lines.append(f"| most of the seeds over the least: median, worst | {' | '.join(spreads)} |")
+    lines.append(f"| half a reference | {' | '.join(halves)} |")
+    return [*lines, f"| size, time, seeds | {' | '.join(setups)} |"]
 
 
 def picture(rows: list[list[np.ndarray]]) -> np.ndarray:

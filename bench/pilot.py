@@ -1,85 +1,125 @@
-"""Is the sampler that a pilot chooses within 1.3 times of the best one: scene by scene, against a long render.
+"""Is the sampler that a pilot chooses about the best one: scene by scene, at equal time, against a long render.
 
-    python -m bench.pilot --scenes diffuse glossy SCENE.xml ... [--size 96 64]
+    python -m bench.pilot --scenes diffuse glossy SCENE.xml ... [--size 96 64] [--seconds 4]
+    python -m bench.pilot --also vcm gvcm --reference-by vcm --scenes bench/scenes/mirror-caustic/scene.xml
 
-    pilot     seconds to the error that the scene's own sampler has after --spp samples, over the least, as
-              `--sampler auto` estimates them (data_gen/pilot.py)
-    measured  the same from renders of --spp samples, reconstructed as the pilot does: their trimmed relMSE against two
-              halves of a reference, times their seconds. The reference is that of the sampler with the least noise, of
-              as many samples as --reference-spp.
-    loss      the measured time of the sampler that the pilot chooses, over that of the best
+Time is processor time of all threads together, so that other work on the machine does not change the comparison.
 
-Renders of the samplers take turns; seconds are the least of --seeds.
+    trial     seconds of each sampler's trial in the pilot, kernels recorded and compiled
+    pilot     seconds to the error that the scene's own sampler has in the end, over the least, as `--sampler auto`
+              estimates them (data_gen/pilot.py)
+    relMSE    of renders of as many samples as --seconds buy, reconstructed as the pilot does, trimmed, the geometric
+              mean over --seeds; kernels are recorded before
+    loss      that of the sampler that the pilot chooses, over the least
+
+Of each: without the samplers that are named by --also, and with them tried last. The pilot's images may have a size of
+their own (--pilot-size), and what a render takes is scaled with the pixels. The reference is two halves of
+--reference-spp samples each by --reference-by; photons are gathered within half a pixel at first there.
 """
 
 import argparse
 import math
 import statistics
+import time
 
 from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import reconstruct
 
+REFERENCE_RADIUS = 0.5
+
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", nargs="+", required=True)
+    parser.add_argument("--also", nargs="*", default=[], metavar="SAMPLER", help="tried after all those of a pilot")
     parser.add_argument("--size", type=int, nargs=2, default=(96, 64), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--spp", type=int, default=32)
+    parser.add_argument("--pilot-size", type=int, nargs=2, metavar=("WIDTH", "HEIGHT"), help="default: --size")
+    parser.add_argument("--seconds", type=float, default=4.0, help="processor time of a render")
     parser.add_argument("--seeds", type=int, default=2)
-    parser.add_argument("--reference-spp", type=int, default=512)
+    parser.add_argument("--reference-spp", type=int, default=512, help="of each half")
+    parser.add_argument("--reference-by", metavar="SAMPLER", default="primal", help="default: %(default)s")
     parser.add_argument("-o", "--output", default="bench/results/pilot.json")
     args = parser.parse_args()
+    args.pilot_size = args.pilot_size or args.size
 
     from data_gen.backend import use_variant
 
     use_variant()
-    setup = {"size": list(args.size), "spp": args.spp, "seeds": args.seeds, "reference spp": args.reference_spp}
+    names = ("size", "pilot_size", "seconds", "seeds", "also")
+    setup = {name.replace("_", " "): getattr(args, name) for name in names}
     result: dict = {"benchmark": "pilot"} | setup | {"metadata": metadata("mitsuba"), "scenes": {}}
     for scene in args.scenes:
         row = result["scenes"][scene_name(scene)] = bench_scene(scene, args)
         save(args.output, result)
-        ratios = [f"{name} {row['pilot'][name]:.3g} / {row['measured'][name]:.3g}" for name in row["pilot"]]
-        print(f"{scene_name(scene):16} {row['choice']:8} loss {row['loss']:.2f}  {',  '.join(ratios)}", flush=True)
-    losses = [row["loss"] for row in result["scenes"].values()]
-    print(f"within 1.3: {sum(loss <= 1.3 for loss in losses)} of {len(losses)}, worst {max(losses):.2f}")
+        print(scene_name(scene), row, flush=True)
 
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
-    """The choice, its loss, and times over the least by sampler."""
+    """The choices, their losses, and errors and times by sampler."""
     from data_gen.pilot import best_of, seen, simple, times_to_the_end
     from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
-    from data_gen.trials import candidates, try_all
+    from data_gen.trials import candidates, try_out
+
+    small = load_scene(path, tuple(args.pilot_size))
+    usual = candidates(small, biased=True)
+    trials, took = {}, {}
+    for name in dict.fromkeys([*usual, *args.also]):
+        start = time.process_time()
+        if (trial := try_out(small, name, time.process_time)) is not None:
+            trials[name], took[name] = trial, round(time.process_time() - start, 2)
+    seconds = args.seconds * math.prod(args.pilot_size) / math.prod(args.size)
 
     scene = load_scene(path, tuple(args.size))
-    trials = try_all(scene, candidates(scene))
-    expected = seen(trials)
-    seconds = args.spp * expected[0].seconds
-    pilot = times_to_the_end(expected, seconds)
-    choice, reason = best_of(expected, seconds)
-    stacks: dict[str, list] = {name: [] for name in trials}
-    for seed in range(args.seeds):
-        for name, rendered in stacks.items():
-            rendered.append(render_stack(scene, args.spp, seed, name))
-    quietest = min(stacks, key=lambda name: relmse_trimmed(*(stack["primal"] for stack in stacks[name][:2])))
-    halves = [render_stack(scene, args.reference_spp // 2, 1 << 20 | i, quietest)["primal"] for i in range(2)]
-    errors, measured = {}, {}
-    for name, rendered in stacks.items():
-        logs = [math.log(max(relmse_trimmed(reconstruct(s, simple(name)).image, *halves), 1e-9)) for s in rendered]
+    options = {"radius": REFERENCE_RADIUS} if SAMPLERS[args.reference_by].biased else {}
+    halves = [
+        render_stack(scene, args.reference_spp, 1 << 20 | i, args.reference_by, **options)["primal"] for i in range(2)
+    ]
+    errors, samples = {}, {}
+    for name in trials:
+        batch = SAMPLERS[name].batch
+        spp = samples[name] = max(2, 2 * batch, round(args.seconds / cost(scene, name)))
+        stacks = [render_stack(scene, spp, seed, name) for seed in range(args.seeds)]
+        logs = [math.log(max(relmse_trimmed(reconstruct(s, simple(name)).image, *halves), 1e-9)) for s in stacks]
         errors[name] = math.exp(statistics.mean(logs))
-        measured[name] = errors[name] * min(float(stack.attributes["ngpt:seconds"]) for stack in rendered)
-    least = {"pilot": min(pilot.values()), "measured": min(measured.values())}
-    return {
-        "choice": choice,
-        "reason": reason,
-        "loss": measured[choice] / least["measured"],
-        "pilot": {name: value / least["pilot"] for name, value in pilot.items()},
-        "measured": {name: value / least["measured"] for name, value in measured.items()},
-        "relMSE": errors,
-        "reference": quietest,
+    row: dict = {
+        "trial": took,
+        "samples": samples,
+        "relMSE": {name: float(f"{error:.4g}") for name, error in errors.items()},
+        "reference": args.reference_by,
+        "error of half a reference": relmse_trimmed(*halves),
     }
+    for which, names in (("without", [n for n in trials if n in usual and n not in args.also]), ("with", list(trials))):
+        expected = seen({name: trials[name] for name in names})
+        times = times_to_the_end(expected, seconds)
+        choice, reason = best_of(expected, seconds)
+        row[which] = {
+            "choice": choice,
+            "reason": reason,
+            "loss": round(errors[choice] / min(errors[name] for name in trials), 3),
+            "pilot": {name: float(f"{t / min(times.values()):.3g}") for name, t in times.items()},
+            "expected": {p.sampler: [float(f"{v:.3g}") for v in (p.error, p.doubt, p.seconds)] for p in expected},
+        }
+    return row
+
+
+def cost(scene, sampler: str) -> float:
+    """Processor seconds of a sample: by two renders, of which the first samples are not counted."""
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS
+
+    def took(spp: int) -> float:
+        start = time.process_time()
+        render_stack(scene, spp, 1, sampler)
+        return time.process_time() - start
+
+    batch = SAMPLERS[sampler].batch
+    few, many = (batch, 3 * batch) if batch > 1 else (3, 9) if batch else (16, 64)
+    took(few)  # compiles
+    return max(took(many) - took(few), 1e-3) / (many - few)
 
 
 if __name__ == "__main__":

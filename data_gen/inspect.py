@@ -99,8 +99,8 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
-    if facts.grids and (able := _commands(("vpm", "gvpm"), facts)):
-        lines.append(f"media whose density varies: photons are gathered in them near to points alone: {able}")
+    if facts.grids and (able := _commands(("vpm", "gvpm", "bre", "beams"), facts)):
+        lines.append(f"media whose density varies: photons are gathered in them by {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
         lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
     if any(name in plugins["BSDF"] for name in ("mask", "null")):

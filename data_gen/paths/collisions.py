@@ -64,6 +64,31 @@ def extent(medium: mi.MediumPtr, ray: mi.Ray3f) -> tuple[mi.Spectrum, mi.Bool, m
     return μ, grid, dr.select(grid & met, dr.maximum(near, 0), 0), dr.select(grid, dr.select(met, far, 0), dr.inf)
 
 
+@dataclass
+class Stop:
+    """How far a path goes in a piece of a ray, up to a collision of the majorant in a grid or to the end."""
+
+    t: mi.Float
+    grid: mi.Bool  # whether the medium is one
+    collides: mi.Bool
+    passed: mi.Float  # the majorant's optical depth up to there, in grids
+    null: mi.Spectrum  # σn / σn_c of a collision that is null
+    real: mi.Spectrum  # the probability that it is real
+
+
+def next_stop(ray, length: mi.Float, medium, channel, ahead: mi.Float, active) -> Stop:
+    """Of a piece of that ``length``, with the optical depth ``ahead`` to the next collision."""
+    μ, grid, near, far = extent(medium, ray)
+    grid, μ_c = active & grid, pick(μ, channel)
+    end = dr.minimum(length, far)
+    t = dr.select(grid & (μ_c > 0), near + ahead / μ_c, dr.inf)
+    collides = grid & (t < end)
+    stop = dr.select(collides, t, length)
+    null, real = null_and_real(medium, ray, t, μ_c, collides)
+    null_c, passed = pick(null, channel), dr.select(grid, μ_c * dr.maximum(dr.minimum(stop, end) - near, 0), 0)
+    return Stop(stop, grid, collides, passed, dr.select(null_c > 0, null / null_c, 0), real)
+
+
 def null_and_real(medium, ray, t, μ_c, active) -> tuple[mi.Spectrum, mi.Spectrum]:
     """σn / μ_c and σ / μ_c at distance ``t``."""
     where = dr.zeros(mi.MediumInteraction3f, dr.width(t))

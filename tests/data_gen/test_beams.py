@@ -32,6 +32,12 @@ def test_small_radii_have_the_image_of_volpath(renderer, name):
 
 
 @pytest.mark.slow
+def test_beams_go_through_grids(renderer):
+    """Up to where their light path scatters, by its null collisions; colours of the grid apart, in mist."""
+    alike(renderer, media_scenes.wisps, radius=0.3, photons=24, block=8)
+
+
+@pytest.mark.slow
 def test_beams_go_on_behind_boundaries(renderer):
     """In from outside, where the lamp is, and out again."""
     alike(renderer, fog)

@@ -12,10 +12,10 @@ from test_photons import assert_alike
 from unbiased import light_of_gradients, load, render_ours
 
 
-def alike(renderer, scene, radius=0.4, photons=96, block=4, batches=6):
+def alike(renderer, scene, radius=0.4, photons=96, block=4, batches=6, references=128):
     scene = load(renderer, scene, (16, 16))
     ours = render_ours(scene, "bre", batches=batches, spp=1, radius=radius, photons=photons)
-    theirs = render_ours(scene, "primal", batches=batches, spp=128)
+    theirs = render_ours(scene, "primal", batches=batches, spp=references)
     # Light that is seen directly is its expectation in ours, and has its own edges.
     images, references = (np.stack([light_of_gradients(s) for s in stacks]) for stacks in (ours, theirs))
     assert references.mean() > 0.01
@@ -49,6 +49,11 @@ def test_boundaries_within_one_medium_change_nothing(renderer):
         images.append(render_ours(load(renderer, scene, (16, 16)), "bre", 1, 3, radius=1.0, photons=8)[0]["primal"])
     # What lies in front of the same photons; the lamp's rays pass another surface, and end in the last bits elsewhere.
     assert np.abs(images[0] - images[1]).mean() < 0.02 * images[0].mean()
+
+
+def test_rays_go_through_grids(renderer):
+    """Up to a collision, by null ones; colours of the grid apart, density not blurred, in mist."""
+    alike(renderer, media_scenes.wisps, radius=0.3, photons=64, block=8, references=32)
 
 
 def test_paths_in_media_are_no_longer_than_the_scene_says(renderer):

@@ -65,7 +65,7 @@ def test_density_is_not_blurred_in_grids(renderer):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["vpm", "gvpm"])
+@pytest.mark.parametrize("name", ["vpm", "gvpm", "bre", "beams"])
 def test_the_same_seed_has_the_same_bits_in_grids(renderer, name):
     scene = load(renderer, media_scenes.wisps, (8, 8))
     once, again = (render_ours(scene, name, batches=1, spp=3)[0] for _ in range(2))
@@ -88,14 +88,15 @@ def test_what_is_lost_along_the_edges_of_grids_falls_like_the_radius(renderer):
 
 
 @pytest.mark.slow
-def test_lamps_and_skies_behind_grids_are_seen(renderer):
+@pytest.mark.parametrize("name", ["vpm", "bre"])
+def test_lamps_and_skies_behind_grids_are_seen(renderer, name):
     """Of paths of one edge, before any photon: the light that comes through, as ``volpath`` has it."""
 
     def seen():
         return media_scenes.before_the_sky() | {"integrator": {"type": "volpath", "max_depth": 1}}
 
     scene = load(renderer, seen, (16, 16))
-    ours, references = render_ours(scene, "vpm", batches=8, spp=12), render_references(renderer, scene, 8, 64)
+    ours, references = render_ours(scene, name, batches=8, spp=12), render_references(renderer, scene, 8, 64)
     ((_, result),) = gradient_tests([{"primal": stack["primal"]} for stack in ours], references)
     assert result.passed, result
 
@@ -146,10 +147,10 @@ def test_media_and_lights_that_vpm_refuses(renderer):
     from data_gen.scenes.facts import Facts
 
     with pytest.raises(
-        NgptError, match=r"'bre' .* media whose density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"
+        NgptError, match=r"'gbeams' .* media whose density varies.* use --sampler gpt, .*vpm \(no gradients\), or gvpm"
     ):
-        render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "bre")
-    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies; use --sampler gpt, or vpm or gvpm"):
+        render_stack(load(renderer, media_scenes.smoke, (8, 8)), 1, 0, "gbeams")
+    with pytest.raises(NgptError, match=r"'gbre' .* media whose density varies; use --sampler gpt, or gvpm, vpm, bre"):
         renderer.load_dict({"type": "gbre"}).prepare(load(renderer, media_scenes.smoke, (8, 8)))
 
     def endless():
@@ -165,6 +166,6 @@ def test_a_report_on_grids_names_the_sampler_of_photons(renderer):
     from data_gen.inspect import inspect_scene
 
     smoke, haze = ("\n".join(inspect_scene(name)["plan"]) for name in ("smoke", "haze"))
-    known = "photons are gathered in them near to points alone: `--sampler vpm`, `--sampler gvpm`"
+    known = "photons are gathered in them by `--sampler vpm`, `--sampler gvpm`, `--sampler bre`, `--sampler beams`"
     assert f"media whose density varies: {known}" in smoke
-    assert "`--sampler bre` refuses: there are media whose density varies" in smoke and "density varies" not in haze
+    assert "`--sampler gbre` refuses: there are media whose density varies" in smoke and "density varies" not in haze

@@ -39,7 +39,11 @@ def least(network, size=(333, 497)):
     return int(str(caught.value).split("takes ")[1].split()[0])
 
 
-@pytest.mark.parametrize(("tiles", "batch"), [(1.7, 1), (1.3, 1), (1, 1), (1.3, 2), (1.3, 3)])
+# The smallest tiles are mostly overlap, and take long.
+SMALLEST = [pytest.param(1, 1, marks=pytest.mark.slow), pytest.param(1.3, 2, marks=pytest.mark.slow)]
+
+
+@pytest.mark.parametrize(("tiles", "batch"), [(1.7, 1), (1.3, 1), (1.3, 3), *SMALLEST])
 def test_tiles_do_not_show(network, image, tiles, batch):
     """In memory for so many of the smallest tiles."""
     layers, whole = image
@@ -72,7 +76,7 @@ def test_a_file_that_is_on_disk_twice_is_loaded_twice_and_once_otherwise(tmp_pat
 
 def test_progress_and_stop(network, image):
     layers, _ = image
-    calls, memory = [], least(network)
+    calls, memory = [], int(1.7 * least(network))
     network.reconstruct(layers, memory=memory, progress=lambda *call: calls.append(call))
     total = calls[0][1]
     assert total > 3 and calls == [(i, total) for i in range(total + 1)]
@@ -87,7 +91,7 @@ def test_memory_that_does_not_hold_a_tile_is_refused_with_what_would(network, im
     assert str(least(network)) in str(caught.value) and network.plan(333, 497, least(network))[0]
 
 
-@pytest.mark.parametrize("bound", [150, 400])
+@pytest.mark.parametrize("bound", [pytest.param(150, marks=pytest.mark.slow), 400])
 def test_memory_stays_within_the_bound(bound):
     """In a process of its own, by the largest size it ever had."""
     code = f"""

@@ -11,6 +11,9 @@ A light path leaves one photon where it scatters, and light all along its edges.
 photons, and what is blurred is one-dimensional. A beam ends with its edge: that edges come so far has the density
 T_c(s).
 
+In media whose density varies a beam goes by the null collisions of its edge up to where the light path scatters: it
+comes so far with the probability T. There Φ is without σs, which is taken where the ray is nearest.
+
 Beams are cut into parts, which lie in the ``Grid`` by their middles. Where a beam and a ray are nearest to each other,
 there is one part alone.
 
@@ -29,9 +32,9 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.passes import SamplePass
-from data_gen.paths import media
+from data_gen.paths import collisions, media
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.bre import BALL, BRE, Both, seen_along
+from data_gen.samplers.photons.bre import BALL, BRE, Both, scattering_along, seen_along
 from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.ppm import Gathering, Passes
@@ -61,7 +64,7 @@ def parts_class(variant: str) -> type:
         half: mi.Float  # of its length; 0 of an empty place
         before: mi.Float  # from the middle back to where the beam enters the medium
         after: mi.Float  # from there on to where it ends, or leaves the medium
-        Φ: mi.Spectrum  # at the middle, times σs
+        Φ: mi.Spectrum  # at the middle, times σs but in scenes with grids
         σ: mi.Spectrum  # by which it falls along the beam
         medium: mi.MediumPtr
         depth: mi.UInt32  # edges from the light, that of the beam included
@@ -83,7 +86,10 @@ def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, p
     low, size = part
     ray, medium, Φ = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins), mi.Spectrum(edges.power)
     number, alive, edge = mi.UInt32(first), edges.bounce > 0, dr.arange(mi.UInt32, len(edges))
-    scatters = (edges.t > 0) & (dr.squared_norm(edges.n) == 0)
+    scatters, grids = (edges.t > 0) & (dr.squared_norm(edges.n) == 0), fog.media.grids
+    nulls, ahead = mi.UInt32(0), mi.Float(0)
+    if dr.hint(grids, mode="scalar"):
+        ahead = collisions.step(edges.key, nulls)
     left = dr.select(scatters, dr.dot(edges.p - edges.o, edges.e), dr.inf)
     while dr.hint(alive, label="beams"):
         hit = scene.ray_intersect_preliminary(media.shortened(ray, left), active=alive)
@@ -94,6 +100,14 @@ def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, p
         σs, σ = dr.select(inside, σs, 0), dr.select(inside, σ, 0)
         # Where the path has gone so far, with that density
         falls, length = σ - media.pick(σ, edges.colour), dr.select(found, hit.t, left)
+        skips, null = mi.Bool(False), mi.Spectrum(1)
+        if dr.hint(grids, mode="scalar"):
+            stop = collisions.next_stop(ray, length, medium, edges.colour, ahead, inside)
+            skips = stop.collides & (nulls < edges.nulls)
+            # Between null collisions a beam keeps its colours.
+            σs, falls = dr.select(inside, mi.Spectrum(1), 0), dr.select(stop.grid, 0, falls)
+            length, null = dr.select(skips, stop.t, length), stop.null
+            found &= ~skips
         parts_here = mi.UInt32(dr.minimum(dr.ceil(length * rate), 1 << 16))
         lit = inside & (dr.max(Φ * σs) > 0) & (length > 0) & dr.isfinite(length)
         parts_here = dr.select(lit, dr.maximum(parts_here, 1), 0)
@@ -106,10 +120,14 @@ def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, p
                 put(parts, type(parts)(*there, medium, edges.bounce, edge), at, at < size)
                 k += 1
         number += parts_here
-        Φ = dr.select(found, Φ * dr.exp(-media.depth(falls, hit.t)), 0)
+        Φ = dr.select(found, Φ * dr.exp(-media.depth(falls, hit.t)), dr.select(skips, Φ * null, 0))
         left -= length
-        alive = found & fog.media.passes(hit.shape) & (dr.max(Φ) > 0)
-        if alive:
+        alive = (skips | found & fog.media.passes(hit.shape)) & (dr.max(Φ) > 0)
+        if dr.hint(grids, mode="scalar"):
+            nulls = dr.select(skips, nulls + 1, nulls)
+            ahead = dr.select(skips, collisions.step(edges.key, nulls), ahead - stop.passed)
+            ray = dr.select(skips, mi.Ray3f(ray(length), ray.d, ray.time, ray.wavelengths), ray)
+        if alive & found:
             ray, medium = media.beyond(ray, hit, medium)
     return number - first
 
@@ -124,9 +142,10 @@ class AlongBeams:
     reach: mi.Float
     K: mi.Float
     max_depth: mi.UInt32
+    grids: bool
 
-    def __init__(self, parts, radius: float, paths: int, max_depth: int):
-        self.parts = parts
+    def __init__(self, parts, radius: float, paths: int, max_depth: int, grids: bool = False):
+        self.parts, self.grids = parts, grids
         # What is near to a ray has its middle no further away.
         reach = radius * (1 + PART / 2)
         self.grid = Grid(parts.p, parts.half > 0, BALL * reach)
@@ -159,6 +178,7 @@ class AlongBeams:
         """
         parts, longest = self.parts, self.max_depth - depth
         phase, seen = medium.phase_function(), seen_along(ray, medium)
+        scattering = scattering_along(ray, medium) if self.grids else None
 
         def add(sums, i, near):
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
@@ -167,6 +187,8 @@ class AlongBeams:
             d = dr.gather(mi.Vector3f, parts.d, j, near)
             s, t, _, sin = nearest(ray.o, ray.d, dr.gather(mi.Point3f, self.grid.p, i, near), d)
             Φ, falls = dr.gather(mi.Spectrum, parts.Φ, j, near), dr.gather(mi.Spectrum, parts.σ, j, near)
+            if dr.hint(self.grids, mode="scalar"):
+                Φ *= scattering(t, near)
             f, _ = phase.eval_pdf(mi.PhaseFunctionContext(), seen, -d, near)
             return (sums[0] + dr.select(near, f * Φ * dr.exp(-σ * t - falls * s) / sin, 0),)
 
@@ -188,7 +210,7 @@ def nearest(o, d, p, e) -> tuple:
 
 
 class BEAMS(BRE):
-    """Progressive photon beams in homogeneous media, and photons on surfaces; no gradients.
+    """Progressive photon beams in media, and photons on surfaces; no gradients.
 
     Plugin ``beams``. Parameters and what is not handled are those of ``vpm``. Biased, and consistent; in media the
     ``radius`` shrinks faster.
@@ -212,7 +234,7 @@ class BEAMS(BRE):
         radius = self.radius * passes.width
         on_surfaces = Gathering(photons, radius * shrunk(number), paths, self.max_depth)
         for parts in parts_of(passes, self.fog, photons, radius * shrunk(number, 1), PARTS * paths):
-            beams = AlongBeams(parts, radius * shrunk(number, 1), paths, self.max_depth)
+            beams = AlongBeams(parts, radius * shrunk(number, 1), paths, self.max_depth, self.fog.media.grids)
             yield Both(on_surfaces, beams)
             on_surfaces = None
 

@@ -8,11 +8,16 @@ r"""The beam radiance estimate: photons in media are gathered along whole rays, 
 Camera paths go through media up to the next surface. So no distance is sampled, each segment gathers from all of its
 length, and what is blurred is two-dimensional: less noise, and less bias, than with ``vpm``, of the same photons.
 
-[Jarosz et al. 2008, "The Beam Radiance Estimate for Volumetric Photon Mapping"; the radius: radius.py]
+In media whose density varies T is not known. Rays go through them by null collisions, and end at the first real one: a
+ray comes so far with the probability T. Photons count as Φ / σs of their place there, times σs beside them on the ray.
+
+[Jarosz et al. 2008, "The Beam Radiance Estimate for Volumetric Photon Mapping"; Křivánek et al. 2014, "Unifying Points,
+Beams, and Paths in Volumetric Light Transport Simulation", short beams; the radius: radius.py]
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,10 +26,11 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.passes import SamplePass
-from data_gen.paths import media
+from data_gen.paths import collisions, media
 from data_gen.paths.vertex import NULL, SMOOTH, event_kind
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.ppm import Gathering
 from data_gen.samplers.photons.radius import shrunk
@@ -39,13 +45,16 @@ class AlongRays:
     """The photons of a map in media, gathered within ``radius`` of rays; ``paths`` light paths have brought them."""
 
     photons: Any
+    Φ: mi.Spectrum
     grid: Grid
     radius2: mi.Float
     K: mi.Float
     max_depth: mi.UInt32
+    grids: bool
 
-    def __init__(self, photons, radius: float, paths: int, max_depth: int):
-        self.photons = photons
+    def __init__(self, fog: Fog, photons, radius: float, paths: int, max_depth: int):
+        self.photons, self.Φ, self.grids = photons, fog.power(photons), fog.media.grids
+        dr.eval(self.Φ)
         scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
         self.grid = Grid(photons.p, scattered, BALL * radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
@@ -59,14 +68,16 @@ class AlongRays:
         """
         photons, longest = self.photons, self.max_depth - depth
         phase = medium.phase_function()
-        seen = seen_along(ray, medium)
+        seen, scattering = seen_along(ray, medium), scattering_along(ray, medium) if self.grids else None
 
         def add(sums, i, near):
             j = dr.gather(mi.UInt32, self.grid.index, i, near)
             near = near & (dr.gather(mi.MediumPtr, photons.medium, j, near) == medium)
             near &= dr.gather(mi.UInt32, photons.depth, j, near) <= longest
-            d, Φ = dr.gather(mi.Vector3f, photons.d, j, near), dr.gather(mi.Spectrum, photons.β, j, near)
+            d, Φ = dr.gather(mi.Vector3f, photons.d, j, near), dr.gather(mi.Spectrum, self.Φ, j, near)
             t = dr.dot(dr.gather(mi.Point3f, self.grid.p, i, near) - ray.o, ray.d)
+            if dr.hint(self.grids, mode="scalar"):
+                Φ *= scattering(t, near)
             f, _ = phase.eval_pdf(mi.PhaseFunctionContext(), seen, -d, near)
             return (sums[0] + dr.select(near, f * Φ * dr.exp(-σ * t), 0),)
 
@@ -82,6 +93,18 @@ def seen_along(ray, medium: mi.MediumPtr) -> mi.MediumInteraction3f:
     return seen
 
 
+def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool], mi.Spectrum]:
+    """(distance, active) -> σs of a ``medium`` along a ray; a grid is empty outside of its box."""
+    _, _, near, far = collisions.extent(medium, ray)
+
+    def scattering(t: mi.Float, active: mi.Bool) -> mi.Spectrum:
+        here, active = dr.zeros(mi.MediumInteraction3f, dr.width(t)), active & (t >= near) & (t <= far)
+        here.t, here.p, here.wavelengths, here.medium = t, ray(t), ray.wavelengths, medium
+        return mi.Spectrum(dr.select(active, medium.get_scattering_coefficients(here, active)[0], 0))
+
+    return scattering
+
+
 @dataclass
 class Both:
     """Photons on surfaces, and photons in media."""
@@ -91,21 +114,19 @@ class Both:
 
 
 class BRE(VPM):
-    """Progressive photon mapping by the beam radiance estimate in homogeneous media, and on surfaces; no gradients.
+    """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
-    Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``; nor are media whose
-    density varies.
+    Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``.
     """
 
     name = "bre"
-    grids = False
 
     def gathering(self, photons, width: float, number: int, paths: int):
         if self.fog is None:
             return super().gathering(photons, width, number, paths)
         radius = self.radius * width * shrunk(number)
         near = photons, radius, paths, self.max_depth
-        return Both(Gathering(*near), AlongRays(*near))
+        return Both(Gathering(*near), AlongRays(self.fog, *near))
 
     def light(self, scene, materials, random, ray, importance, near, emission: bool):
         if self.fog is None:
@@ -126,6 +147,10 @@ class BRE(VPM):
         β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
         # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
         sky_seen, active = mi.Bool(not self.hide_emitters), mi.Bool(True)
+        grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
+        shown = not self.hide_emitters and self.max_depth > 0
+        if dr.hint(grids, mode="scalar"):
+            channel = media.choose_channel(random.next_1d())
         while dr.hint(active, label="camera path"):
             # ------------------ A piece of a segment ------------------
             first = depth == 1
@@ -138,12 +163,26 @@ class BRE(VPM):
             si = hit.compute_surface_interaction(ray, active=active)
             σ, found = media.extinction(medium, ray), active & hit.is_valid()
             length = dr.select(found, hit.t, dr.inf)
+            if dr.hint(grids, mode="scalar"):
+                ahead, u_real = -dr.log(1 - random.next_1d()), random.next_1d()
+                stop = collisions.next_stop(ray, length, medium, channel, ahead, active)
+                σ, length = dr.select(stop.grid, 0, σ), stop.t
             if dr.hint(along is not None, mode="scalar"):
                 inside = active & (medium != None)  # noqa: E711 - an array of pointers
                 L += β * along(ray, length, medium, σ, depth, inside)
             β *= dr.exp(-media.depth(σ, length))
+            if dr.hint(grids, mode="scalar"):
+                real = stop.collides & (u_real < media.pick(stop.real, channel))
+                skips = stop.collides & ~real
+                β = dr.select(skips, β * stop.null, β)
+                active &= ~stop.collides
+                found &= active
             if dr.hint(emission, mode="scalar"):
                 met = active & ~first & (found | sky_seen)
+                if dr.hint(grids and shown, mode="scalar"):
+                    # What comes through a grid is not in Le, nor is the sky: see ``behind_grids()``.
+                    behind |= stop.passed > 0
+                    met |= active & first & (behind | ~found)
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
 
             # ------------------ The vertex at its end -----------------
@@ -159,16 +198,21 @@ class BRE(VPM):
             active &= (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
             sky_seen |= active & (kind != NULL)
             η = dr.select(active, η * sample.eta, η)
-            β = dr.select(passes, β, β * f_p)
+            straight = passes | skips
+            β = dr.select(straight, β, β * f_p)
             # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
             survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
             active &= (dr.max(β) > 0) & (u_survival < survival)
-            β = dr.select(passes, β, β / survival)
+            β = dr.select(straight, β, β / survival)
             depth = dr.select(active, depth + 1, depth)
             d = dr.select(passes, ray.d, si.to_world(sample.wo))
             changes = found & si.is_medium_transition()
             medium = dr.select(changes, si.target_medium(d), medium)
-            ray, active = si.spawn_ray(d), active | passes
+            onward = si.spawn_ray(d)
+            if dr.hint(grids, mode="scalar"):
+                skips &= dr.max(β) > 0
+                onward = dr.select(skips, mi.Ray3f(ray(length), ray.d, ray.time, ray.wavelengths), onward)
+            ray, active = onward, active | passes | skips
         return L, Le
 
 

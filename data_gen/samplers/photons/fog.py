@@ -24,7 +24,7 @@ class Fog:
         if self.media.grids and not grids:
             raise NgptError(
                 f"sampler '{sampler}' cannot render this scene: there are media whose density varies; "
-                "use --sampler gpt, or vpm or gvpm for photons"
+                "use --sampler gpt, or gvpm, vpm, bre or beams for photons"
             )
         sensor = scene.sensors()[0]
         self.within = mi.MediumPtr(sensor.get_medium())

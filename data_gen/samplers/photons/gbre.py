@@ -199,6 +199,7 @@ class GBRE(BRE):
     """
 
     name = "gbre"
+    grids = False
     pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def __init__(self, props: mi.Properties):

@@ -231,6 +231,7 @@ class PLANES(BEAMS):
     """
 
     name = "planes"
+    grids = False
     map_bytes = BEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
     def __init__(self, props: mi.Properties):

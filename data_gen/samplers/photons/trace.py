@@ -103,11 +103,13 @@ def kind_of_vertices(fog: Fog | None) -> type:
 
 
 @cache
-def vertices_and_edges_class(variant: str) -> type:
+def vertices_and_edges_class(variant: str, grids: bool = False) -> type:
     """The same where the edges of light paths are kept, too."""
 
     @dataclass
-    class VerticesAndEdges(vertices_in_media_class(variant)):  # type: ignore[misc]
+    class VerticesAndEdges(  # type: ignore[misc]
+        vertices_in_grids_class(variant) if grids else vertices_in_media_class(variant)
+    ):
         """The edge that leads to a vertex, in the same place, or to nothing: 12 words more."""
 
         o: mi.Point3f  # where it begins
@@ -176,7 +178,7 @@ def _start(scene, lights: LightEnds, random, fog) -> tuple:
 
 
 def _maps(scene, paths: _Paths, random, receives, depths: tuple, fog, frozen, edges: bool) -> Iterator[Any]:
-    kind = vertices_and_edges_class(mi.variant()) if edges else kind_of_vertices(fog)
+    kind = vertices_and_edges_class(mi.variant(), fog.media.grids) if edges else kind_of_vertices(fog)
     map_before = None
     while dr.width(lanes := dr.compress(paths.alive)):
         paths, random = _at(paths, lanes), random.at(lanes)
@@ -221,6 +223,10 @@ def _walk(scene, paths: _Paths, random, receives, depths: tuple, fog, photons, p
             hit, where, β = segment.hit, segment.place, β * segment.weight
             exists, scatters = alive & si.is_valid() & (dr.max(β) > 0), where.scatters
             nulls = segment.nulls
+            if dr.hint(nulls is not None and hasattr(photons, "bounce"), mode="scalar"):
+                # Of edges that lead to nothing as well
+                dr.scatter(photons.key, nulls.key, place, alive)
+                dr.scatter(photons.nulls, nulls.n, place, alive)
             around = where.medium, channel, *((nulls.key, nulls.n, nulls.N_c) if nulls else ())
         else:
             hit = scene.ray_intersect_preliminary(ray, active=alive)
