@@ -23,6 +23,8 @@ PATH_BYTES = 256
 # Of one that splats all four differences as well, which are kept per pixel: an eighth of it for a lane, of 8 a pass
 # and the list of vertices that the camera sees, some of them for each lane
 _GBDPT_BYTES = PATH_BYTES + 224
+# And of nine vertices of the light path the light and the pixel, by which they are chosen for shifts
+_ROULETTE_BYTES = 9 * 8
 # Integrators that render media, of those that samplers of ours follow
 VOLUMETRIC = ("volpath", "volpathmis")
 
@@ -380,7 +382,7 @@ for _sampler in (
             "roughness_threshold": "the microfacet roughness above which materials are connectable",
         },
         batch=8,
-        lane_bytes=_GBDPT_BYTES,
+        lane_bytes=_GBDPT_BYTES + _ROULETTE_BYTES,
         module=_GBDPT,
     ),
     Sampler(

@@ -493,6 +493,88 @@ def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, modules, fu
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
+@pytest.fixture
+def rough_roulette(monkeypatch):
+    """Few survive."""
+    from data_gen.samplers.gbdpt import roulette
+
+    monkeypatch.setattr(roulette, "SHARE", 0.4)
+
+
+def shares_lost(renderer, monkeypatch, seeds=6):
+    """For each seed the share of the differences without roulette that is missing with it: of the same paths, so that
+    the noise is that of the roulette alone. Its mean is 0."""
+    from data_gen.samplers.gbdpt import integrator
+
+    def gradients():
+        stacks = render_ours(load(renderer, "diffuse", (16, 16)), "gbdpt", seeds, 64, FAR)
+        return np.stack([np.stack([stack["dx"], stack["dy"]]) for stack in stacks]).astype(np.float64)
+
+    with_it = gradients()
+    all_survive = lambda camera, rater, lane, depth, threshold: (lane, depth, renderer.Float(1))  # noqa: E731
+    with monkeypatch.context() as patch:
+        patch.setattr(integrator, "survivors", all_survive)
+        without = gradients()
+    mean = without.mean(axis=0)
+    return ((with_it - without) * mean).sum(axis=(1, 2, 3, 4)) / (mean**2).sum()
+
+
+def z_of(values):
+    return values.mean() / (values.std(ddof=1) / np.sqrt(len(values)))
+
+
+def test_roulette_leaves_differences_as_they_are(renderer, long_passes, rough_roulette, monkeypatch):
+    """And a mutant that counts survivors once loses some of them."""
+    from data_gen.samplers.gbdpt import integrator
+
+    lost = shares_lost(renderer, monkeypatch)
+    # Student's t, 5 degrees of freedom: p = 0.001
+    assert 0 < np.abs(lost).max() < 0.1 and abs(z_of(lost)) < 6.9, lost
+    survivors = integrator.survivors
+    monkeypatch.setattr(integrator, "survivors", lambda *args: (*survivors(*args)[:2], renderer.Float(1)))
+    lost = shares_lost(renderer, monkeypatch)
+    assert lost.mean() < -0.02 and z_of(lost) < -6.9, lost
+
+
+def test_who_survives(renderer):
+    """By 1 / p, as ``roulette`` has it, and by numbers of their own for each vertex and seed."""
+    import drjit as dr
+
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.samplers.gbdpt.roulette import LEAST, RATED, SHARE, Rater, survivors
+
+    mi, sensor = renderer, load(renderer, "diffuse", (32, 32)).sensors()[0]
+    n, places = 32 * 32 * 8, np.random.default_rng(5)
+    worth = places.exponential(1, n * RATED).astype(np.float32)
+    pixel = places.integers(0, 32 * 32, n * RATED).astype(np.uint32)
+    threshold = places.exponential(4, 32 * 32).astype(np.float32)
+    threshold[:64] = 0
+    rater = Rater(None, None, None, mi.Float(worth), mi.UInt32(pixel), dr.opaque(mi.UInt32, n))
+    lane = np.tile(np.arange(n, dtype=np.uint32), RATED + 1)
+    depth = np.repeat(np.arange(1, RATED + 2, dtype=np.uint32), n)
+    with np.errstate(divide="ignore"):
+        p = np.clip(SHARE * worth / threshold[pixel], LEAST, 1)
+    p = np.concatenate([p, np.ones(n)])  # the vertices behind those that are rated
+    found = []
+    for seed in range(2):
+        camera = CameraSamples(sensor, seed, 8)
+        lanes, depths, times = survivors(camera, rater, mi.UInt32(lane), mi.UInt32(depth), mi.Float(threshold))
+        place = (np.array(depths) - 1) * n + np.array(lanes)
+        assert np.allclose(np.array(times), 1 / p[place], rtol=1e-5)
+        kept = np.zeros(len(p))
+        kept[place] = 1
+        found.append(kept)
+        for some in (p < 1, p < 1.01 * LEAST, depth == 1, depth == RATED, np.arange(len(p)) % 2 == 0):
+            z = (kept - p)[some].sum() / np.sqrt((p * (1 - p))[some].sum())
+            assert abs(z) < 4.5, z
+        assert kept[p == 1].all()
+    # Two seeds and two depths are independent.
+    rest = (np.array(found) - p) / np.sqrt(np.maximum(p * (1 - p), 1e-9))
+    pairs = [rest[0] * rest[1], rest[0][:n] * rest[0][n : 2 * n]]
+    for product in pairs:
+        assert abs(product.sum()) < 4.5 * np.sqrt((product**2).sum())
+
+
 @pytest.mark.parametrize("name", ["lens", "glossy"])
 def test_what_the_camera_has_seen_is_found_again(renderer, name):
     """The second kernel splats what the first one has splatted, and never a vertex that was not seen."""

@@ -91,16 +91,25 @@ class Step:
 
 
 def base_step(
-    scene, plan: Plan, random, z: Vertex, active, η: mi.Float, sky_seen: mi.Bool, brightest_offset: mi.Float
+    scene,
+    plan: Plan,
+    random,
+    z: Vertex,
+    active,
+    η: mi.Float,
+    sky_seen: mi.Bool,
+    brightest_offset: mi.Float,
+    completed: mi.Bool | bool = True,
 ) -> tuple[Step, mi.Float, mi.Bool]:
-    """Samples an emitter and the next vertex from vertex ``z``; returns the step and the two last arguments' next.
+    """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the next ``η`` and ``sky_seen``.
 
     ``η`` is the product of all indices of refraction, ``sky_seen`` whether an escape sees the environment, and
-    ``brightest_offset`` the most that any offset path may yet bring: Russian roulette is to starve none.
+    ``brightest_offset`` the most that any offset path may yet bring: Russian roulette is to starve none. Light is asked
+    for where paths are ``completed`` at z; random numbers are drawn all the same.
     """
     lights, materials = plan.lights, plan.materials
     si, end, bsdf = z.si, z.end, z.si.bsdf()
-    smooth = active & scatters_smoothly(bsdf)
+    smooth = active & completed & scatters_smoothly(bsdf)
     joins = z.depth + 1 <= plan.longest
 
     # ------------------------ To a light -------------------------

@@ -86,6 +86,11 @@ def matters(course: Course | None, chain: Chain | None) -> mi.Bool:
     return course.ahead | course.second | course.bent
 
 
+def completes(course: Course | None, chain: Chain | None) -> mi.Bool:
+    """Whether what joins a path that is here to light has a share in Δ, or in the image."""
+    return mi.Bool(True) if course is None or chain is None else course.bent
+
+
 @dataclass
 class Chain:
     """The way of a base path from x1 on, up to y."""

@@ -52,11 +52,12 @@ from data_gen.samplers.bdpt.vertex import (
 )
 from data_gen.samplers.common import like_path
 from data_gen.samplers.gbdpt.base_path import Plan, base_step
-from data_gen.samplers.gbdpt.chain_shift import along, matters, no_chain, straight
-from data_gen.samplers.gbdpt.light_again import Marker, Unseen, marked
+from data_gen.samplers.gbdpt.chain_shift import along, completes, matters, no_chain, straight
+from data_gen.samplers.gbdpt.light_again import Unseen, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
 from data_gen.samplers.gbdpt.offset_path import brightest, connect, start, take_step, with_differences
 from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
+from data_gen.samplers.gbdpt.roulette import Rater, survivors, thresholds
 
 
 class GBDPT(BDPT):
@@ -86,22 +87,27 @@ class GBDPT(BDPT):
         ray, importance, _ = camera.rays()
         inside = [camera.rays(shift)[2] for shift in SHIFTS.values()]
         splats = {name: film.splats(name) for name in ("primal", *SHIFTS)} if plan.joins else {}
-        marker = Marker(splats["primal"], ray, importance) if plan.joins else None
-        L, Le, Δ, marks, bent = self.both_paths(scene, plan, camera, marker)
+        rater = None
+        if plan.joins:
+            rater = Rater.of(splats["primal"], ray, importance, dr.width(camera.pixel), plan.longest)
+        L, Le, Δ, marks, bent = self.both_paths(scene, plan, camera, rater)
         Le = self.emission_in_pixel(scene, camera, Le)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         # One kernel for all of it: each value read on its own would trace the paths again.
         dr.eval(values, Δ, inside, marks, bent)
-        if plan.joins:
-            self.shift_splats(scene, plan, camera, splats, marks)
+        if rater is not None:
+            light = values["primal"] - values["direct"]
+            self.shift_splats(scene, plan, camera, splats, rater, marks, light)
         if not plan.materials.all_connectable:
             self.shift_bent(scene, plan, camera, bent, Δ)
         film.put_all(values)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
-    def both_paths(self, scene, plan: Plan, camera: CameraSamples, visitor: Visitor, alone: mi.Bool | None = None):
+    def both_paths(
+        self, scene, plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone: mi.Bool | None = None
+    ):
         """L, Le, and for each of SHIFTS Δ, as colours, of the path from the camera, joined to one from a light; the
         state of the light path's ``visitor``, and whether the camera path is bent.
 
@@ -119,7 +125,8 @@ class GBDPT(BDPT):
 
     def shift_bent(self, scene, plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
         """Adds to Δ the differences of ``bent`` camera paths, which are traced anew: see ``chain_shift``."""
-        lanes, exists = map(mi.UInt32, in_packets(np.array(dr.compress(bent)), camera))
+        # Copies: kernels tell arrays by how their memory is aligned, and NumPy's is so or so.
+        lanes, exists = (dr.opaque(mi.UInt32(part)) for part in in_packets(np.array(dr.compress(bent)), camera))
         if not dr.width(lanes):
             return
         alone = exists != 0
@@ -130,20 +137,27 @@ class GBDPT(BDPT):
             for channel, value in zip(total, added, strict=True):
                 dr.scatter_add(channel, value, lanes, alone)
 
-    def shift_splats(self, scene, plan: Plan, camera: CameraSamples, splats, marks: mi.UInt64) -> None:
-        """Splats the differences of light paths that end at ``marked`` vertices.
+    def shift_splats(
+        self, scene, plan: Plan, camera: CameraSamples, splats, rater: Rater, marks: mi.UInt64, light: mi.Color3f
+    ) -> None:
+        """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``;
+        ``light`` is that of camera paths.
 
         Those behind mirrors or glass are few, and their walks long: in the kernel of all most lanes would wait.
         """
         lanes, depths = marked(marks, plan.longest)
         if not dr.width(lanes):
             return
-        bent = splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats)
+        threshold = thresholds(camera, light, splats["primal"])
+        lanes, depths, times = survivors(camera, rater, lanes, depths, threshold)
+        if not dr.width(lanes):
+            return
+        bent = splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats, times=times)
         dr.eval(bent)
         if plan.materials.all_connectable or not dr.width(few := dr.compress(bent)):
             return
-        lanes, depths = dr.gather(mi.UInt32, lanes, few), dr.gather(mi.UInt32, depths, few)
-        dr.eval(splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats, bent=True))
+        lanes, depths, times = (dr.gather(type(value), value, few) for value in (lanes, depths, times))
+        dr.eval(splat_differences(scene, plan, camera.at(lanes), depths, self.first_hit, splats, True, times))
 
     @dr.syntax
     def shifted_camera_path(
@@ -183,11 +197,12 @@ class GBDPT(BDPT):
         end = mis.begin_camera(density[0], cosine(si, ray.d))
         while dr.hint(active, label="camera path"):
             z = Vertex(si, β, end, depth)
-            step, η, sky_seen = base_step(scene, plan, random, z, active, η, sky_seen, brightest(offsets))
+            wanted = completes(course, chain)
+            step, η, sky_seen = base_step(scene, plan, random, z, active, η, sky_seen, brightest(offsets), wanted)
             L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
             came, (step, course, chain) = course, along(scene, plan, step, course, chain)
             if dr.hint(kept is not None, mode="scalar"):
-                joins = active & scatters_smoothly(si.bsdf()) & step.joins
+                joins = active & wanted & scatters_smoothly(si.bsdf()) & step.joins
                 u = random.next_1d()
                 L, Δ = self.shifted_connection(scene, plan, step, joins, kept, count, ray, u, L, offsets)
                 offsets = with_differences(offsets, Δ)

@@ -35,10 +35,13 @@ class Marker:
     def start(self) -> mi.UInt64:
         return mi.UInt64(0)
 
+    def light(self, seen: Seen) -> mi.Color3f:
+        """What it splats."""
+        return to_rgb(weighted(seen.C, seen.others) * self.importance, self.ray.wavelengths)
+
     def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
         lit = dr.max(seen.C) > 0
-        light = to_rgb(weighted(seen.C, seen.others) * self.importance, self.ray.wavelengths)
-        self.splats.add(seen.pixel, list(light), lit)
+        self.splats.add(seen.pixel, list(self.light(seen)), lit)
         return state | dr.select(lit, mi.UInt64(1) << mi.UInt64(seen.y.depth), 0)
 
 

@@ -55,11 +55,12 @@ def splat_differences(
     first_hit: Callable,
     splats: dict[str, Splats],
     bent: bool = False,
+    times: mi.Float | float = 1.0,
 ) -> mi.Bool:
     """Splats the differences of light paths that end at vertices that the camera sees, one for each of its samples.
 
-    Those at ``depth`` edges from the light. Bent is what ends behind mirrors or glass: with ``bent`` its differences
-    alone are splatted, else all others. Returns which are bent.
+    Those at ``depth`` edges from the light, each so many ``times``. Bent is what ends behind mirrors or glass: with
+    ``bent`` its differences alone are splatted, else all others. Returns which are bent.
     """
     ray, importance, _ = camera.rays()
     random = camera.random.clone()
@@ -83,7 +84,7 @@ def splat_differences(
     Δ = differences(scene, plan, camera, path, first_hit, is_bent if bent else lit & ~is_bent, bent)
     pixel = pixel_at(uv, camera.size)
     for name, (one, on_film) in Δ.items():
-        splats[name].add(pixel, list(to_rgb(one * importance, ray.wavelengths)), on_film)
+        splats[name].add(pixel, list(to_rgb(one * importance * times, ray.wavelengths)), on_film)
     return is_bent
 
 
