@@ -1,4 +1,4 @@
-"""Metropolis chains at equal time: `gmlt` beside other samplers, each with the methods that suit it.
+"""Samplers at equal time, each with the methods that suit it: `gmlt` and `gpt-tiles` beside others.
 
     python -m bench.metropolis --scenes ajar keyhole lantern diffuse --seconds 20
 
@@ -10,6 +10,7 @@ over seeds. Scenes are built-in ones, files, and these, which are made here:
     keyhole    the same, 1 cm, and the lamp five times as bright
     lantern    the same, 20 cm, and the lamp is in a ball of clear glass, which no connection goes through
     bulb       a room whose only lamp is in a ball of clear glass
+    cove       a matte room whose lamp shines at the ceiling
 
 --table prints the table of the file.
 """
@@ -34,7 +35,8 @@ from ngpt.methods import METHODS, reconstruct
 COLUMNS = {
     "gmlt": ("primal", "l1", "wcv", "oidn", "ngpt-fast", "ngpt-combine"),
     "gpt": ("primal", "l1", "wcv", "ngpt-fast", "ngpt-combine"),
-    "primal": ("oidn", "ngpt-primal"),
+    "gpt-tiles": ("primal", "l1", "wcv", "oidn", "ngpt-combine"),
+    "primal": ("primal", "oidn", "ngpt-primal"),
     "gbdpt": ("primal", "l1", "wcv", "ngpt-fast", "ngpt-combine"),
     "bdpt": ("oidn",),
     "gpm": ("primal", "l1", "wcv"),
@@ -90,6 +92,13 @@ def bulb() -> dict:
     return scene | _bulb([0, 1.9, -0.2], 0.05, (1600, 1400, 1200))
 
 
+def cove() -> dict:
+    """The room of `diffuse`, whose lamp is turned around: all light that the camera sees has met the ceiling."""
+    from data_gen.scenes.builtin import _light, diffuse
+
+    return diffuse() | {"lamp": _light([0, 1.9, -0.2], [0, 1, 0], (0.8, 0.6), (60, 52, 40))}
+
+
 def _bulb(center: list[float], radius: float, radiance: tuple[float, float, float]) -> dict:
     from data_gen.scenes.builtin import _rgb, _sphere
 
@@ -98,7 +107,13 @@ def _bulb(center: list[float], radius: float, radiance: tuple[float, float, floa
     return {"lamp": inner, "bulb": _sphere(center, 3 * radius, {"type": "dielectric", "int_ior": 1.5})}
 
 
-MADE = {"ajar": ajar, "keyhole": lambda: ajar(0.01, light=5), "lantern": lambda: ajar(0.2, True), "bulb": bulb}
+MADE = {
+    "ajar": ajar,
+    "keyhole": lambda: ajar(0.01, light=5),
+    "lantern": lambda: ajar(0.2, True),
+    "bulb": bulb,
+    "cove": cove,
+}
 
 
 def main() -> None:

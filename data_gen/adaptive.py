@@ -76,8 +76,8 @@ def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int
         raise NgptError(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
     if spp is not None and spp < LEAST:
         raise NgptError(f"{spp} samples per pixel are too few to be shared out; from {LEAST} on they can be")
-    if sampler.batch:
-        able = ", ".join(name for name, other in SAMPLERS.items() if not other.batch)
+    if sampler.even:
+        able = ", ".join(name for name, other in SAMPLERS.items() if not other.even)
         raise NgptError(
             f"the samples of '{sampler.name}' depend on each other, so all pixels have as many; for others use: {able}"
         )

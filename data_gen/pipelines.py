@@ -177,7 +177,7 @@ def measure(
                 two = math.sqrt(two * one * 2 ** usual_fall(name, method))
             pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)
-            if shared and not SAMPLERS[name].batch:
+            if shared and not SAMPLERS[name].even:
                 if need is None:
                     need = _need(merge(halves), clock)
                 found.append(replace(pipeline, adaptive=need[0], choosing=need[1]))

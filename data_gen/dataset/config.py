@@ -85,7 +85,7 @@ class Config:
             (not 0 < self.adaptive <= 1, "the share of inputs whose samples are shared out, 0 to 1"),
             (self.frames > 1, "frames of shots have even samples; leave it out"),
             (self.spp[1] < LEAST, f"fewer than {LEAST} samples cannot be shared out; spp goes up to {self.spp[1]}"),
-            (name != "auto" and find(name).batch > 0, f"the samples of '{name}' depend on each other; use 'gpt'"),
+            (name != "auto" and find(name).even, f"the samples of '{name}' depend on each other; use 'gpt'"),
         ):
             if bad:
                 raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")

@@ -268,13 +268,18 @@ class GradientFilm:
 
         The difference between pixel p and its successor is sampled from p by the forward shift and, independently,
         from the successor by the backward shift. Either is a part of the difference, and not an estimate of all of it:
-        where one end has more samples, its part has less variance, and not more weight.
+        where one end has more samples, its part has less variance, and not more weight. What is put for the forward
+        shift alone is the whole difference.
         """
         x, y = SHIFTS[f"{layer}+"]
         behind, ahead = np.s_[: self.height - y, : self.width - x], np.s_[y:, x:]
         gradient = np.zeros((self.height, self.width, 3))
         variance = np.zeros((self.height, self.width, 3))
-        (_, one, one_var), (_, other, other_var) = self._statistics(f"{layer}+"), self._statistics(f"{layer}-")
+        _, one, one_var = self._statistics(f"{layer}+")
+        if f"{layer}-" not in self.moments:
+            gradient[behind], variance[behind] = self._image(one)[behind], self._image(one_var)[behind]
+            return gradient, variance
+        _, other, other_var = self._statistics(f"{layer}-")
         gradient[behind] = 0.5 * (self._image(one)[behind] - self._image(other)[ahead])
         variance[behind] = 0.25 * (self._image(one_var)[behind] + self._image(other_var)[ahead])
         return gradient, variance

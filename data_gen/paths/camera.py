@@ -20,9 +20,9 @@ class CameraSamples:
 
     Lanes are ordered by blocks of ``block`` samples (default: one block of them all), within a block pixel by pixel,
     within a pixel by sample; ``spp`` is a multiple of ``block``. Sample i of a pixel is the same for a given seed,
-    whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row. ``random`` holds the
-    random numbers of the paths to come. Cloning it replays them, which is what correlates a path with its shifted
-    copies.
+    whatever else is rendered with it. ``pixel`` is the number of each lane's pixel, row by row, and ``sample`` that of
+    its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them, which is what
+    correlates a path with its shifted copies.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """
@@ -49,8 +49,8 @@ class CameraSamples:
         else:
             pixel, first = dr.gather(mi.UInt32, some, pixel), dr.gather(mi.UInt32, first, pixel)
         self.pixel = pixel
-        sample = lane // in_block * in_pixel + lane % in_pixel + first
-        self._draw(seed, pixel, sample)
+        self.sample = lane // in_block * in_pixel + lane % in_pixel + first
+        self._draw(seed, pixel, self.sample)
         corner = mi.Point2f(pixel % self.size.x, pixel // self.size.x)
         self.position = corner + self.position
         dr.schedule(self.position, self.lens, self.time, self.wavelength)

@@ -14,7 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import evaluate
+from data_gen.paths.vertex import consistent, evaluate
 from data_gen.scenes.facts import media_of
 
 
@@ -110,8 +110,10 @@ def sample_vertex(
 ) -> tuple[mi.BSDFSample3f, mi.Spectrum]:
     """A direction at a vertex, and f / p: what a material's ``sample()`` returns. In a medium it is a smooth event."""
     if place is None:
-        return bsdf.sample(mi.BSDFContext(), x, u_lobe, u_direction)
+        sample, f_p = bsdf.sample(mi.BSDFContext(), x, u_lobe, u_direction)
+        return consistent(bsdf, x, sample, f_p), f_p
     sample, f_p = bsdf.sample(mi.BSDFContext(), x, u_lobe, u_direction, ~place.scatters)
+    sample = consistent(bsdf, x, sample, f_p, ~place.scatters)
     return scattered(x, place, u_lobe, u_direction, sample, f_p)
 
 
@@ -126,8 +128,10 @@ def evaluate_and_sample(
     """Both at once: materials are virtual functions, and calls to them dear."""
     context = mi.BSDFContext()
     if place is None:
-        return bsdf.eval_pdf_sample(context, x, wo, u_lobe, u_direction)
+        f, p, sample, f_p = bsdf.eval_pdf_sample(context, x, wo, u_lobe, u_direction)
+        return f, p, consistent(bsdf, x, sample, f_p), f_p
     f, p, sample, f_p = bsdf.eval_pdf_sample(context, x, wo, u_lobe, u_direction, ~place.scatters)
+    sample = consistent(bsdf, x, sample, f_p, ~place.scatters)
     phase = place.medium.phase_function()
     f_phase, p_phase = phase.eval_pdf(mi.PhaseFunctionContext(), in_medium(x, place), wo, place.scatters)
     f, p = dr.select(place.scatters, f_phase, f), dr.select(place.scatters, p_phase, p)

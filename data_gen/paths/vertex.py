@@ -112,6 +112,25 @@ def seen_from(si: mi.SurfaceInteraction3f, direction: mi.Vector3f) -> mi.Surface
     return other
 
 
+def consistent(
+    bsdf: mi.BSDFPtr,
+    si: mi.SurfaceInteraction3f,
+    sample: mi.BSDFSample3f,
+    f_p: mi.Spectrum,
+    active: bool | mi.Bool = True,
+) -> mi.BSDFSample3f:
+    """A BSDF sample, with density 0 where the material says so of the direction that it sampled.
+
+    Diffuse materials seen from behind, and rough metal below its horizon, sample directions with a density above 0 and
+    f / p = 0, of which ``evaluate`` says 0. A shift has that 0 for the path it leads to, and the density of the sample
+    for the path it comes from: the weights of the pair then add up to more than 1.
+    """
+    asked = active & (event_kind(sample.sampled_type) == SMOOTH) & (sample.pdf > 0) & (dr.max(f_p) == 0)
+    _, p = evaluate(bsdf, si, sample.wo, asked)
+    sample.pdf = dr.select(asked & (p == 0), 0, sample.pdf)
+    return sample
+
+
 def evaluate(
     bsdf: mi.BSDFPtr, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: bool | mi.Bool = True
 ) -> tuple[mi.Spectrum, mi.Float]:

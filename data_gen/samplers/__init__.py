@@ -45,6 +45,7 @@ class Sampler:
     ``tried``       whether the pilot of "auto" tries it too, where it can render the scene (``data_gen.pilot``)
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
+    ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
     ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
     ``module``      where its Mitsuba classes are, imported anew with each variant; "" if it has none
@@ -60,9 +61,15 @@ class Sampler:
     rank: int = 0
     tried: bool = True
     batch: int = 0
+    together: bool = False
     lane_bytes: int = PATH_BYTES
     biased: bool = False
     module: str = ""
+
+    @property
+    def even(self) -> bool:
+        """Whether all pixels must have as many samples."""
+        return bool(self.batch) or self.together
 
 
 @dataclass(frozen=True)
@@ -185,6 +192,16 @@ def _notes_on_replay(facts: Facts) -> list[str]:
     return lines
 
 
+def _notes_on_tiles(facts: Facts) -> list[str]:
+    lines = [
+        f"transport: Mitsuba's '{facts.integrator}', paths are shared in tiles where materials are rough",
+        "noise: correlated within tiles, which denoisers of independent noise do not expect",
+    ]
+    if facts.mirrors:
+        lines.append("mirrors or clear glass: nothing is shared there, and gradients are as noisy as pixels")
+    return lines
+
+
 def _notes_on_gpt(facts: Facts) -> list[str]:
     lines = [f"transport: Mitsuba's '{facts.integrator}', offset paths join it where materials are rough"]
     if facts.mirrors:
@@ -237,6 +254,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _GPT,
     _BASIC,
     _SIMPLE,
+    _TILES,
     _BDPT,
     _GBDPT,
     _GMLT,
@@ -259,6 +277,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "gpt.integrator",
         "gpt_basic",
         "gpt_simple",
+        "gpt_tiles",
         "bdpt.integrator",
         "gbdpt.integrator",
         "gmlt.integrator",
@@ -326,6 +345,20 @@ for _sampler in (
         lambda facts: [f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex"],
         tried=False,
         module=_SIMPLE,
+    ),
+    Sampler(
+        "gpt-tiles",
+        "gradients of paths that the pixels of a tile share (matte rooms, images that are not denoised)",
+        _from_module(_TILES),
+        lambda facts: _refused_but_for_surfaces(facts, "gpt-tiles"),
+        _notes_on_tiles,
+        {
+            "tile": "pixels along a side of a tile: 2 or 4 (2)",
+            "roughness_threshold": "the microfacet roughness above which materials are connectable",
+        },
+        tried=False,
+        together=True,
+        module=_TILES,
     ),
     Sampler(
         "bdpt",

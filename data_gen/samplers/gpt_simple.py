@@ -39,7 +39,7 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from
+from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, consistent, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator, like_path
 from ngpt.errors import NgptError
 
@@ -136,6 +136,8 @@ class Step:
     Le: mi.Spectrum  # emitted at x1 toward x
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
+    smooth: mi.Bool  # no mirror, no hole
+    hit: mi.PreliminaryIntersection3f  # x1 before all of it is known
 
 
 @dataclass
@@ -157,13 +159,16 @@ def base_step(scene, random, x, β, active) -> Step:
 
     # ------------------------ BSDF sampling -----------------------
     sample, f_p = x.bsdf().sample(mi.BSDFContext(), x, random.next_1d(), random.next_2d(), active)
-    wo, p = sample.wo, sample.pdf
+    wo, p = sample.wo, consistent(x.bsdf(), x, sample, f_p, active).pdf
     goes_on = active & (p > 0)
     β1 = dr.select(goes_on, β * f_p, 0)
-    x1 = scene.ray_intersect(x.spawn_ray(x.to_world(wo)), goes_on)
-    Le, p_light = emission(scene, x1, x, goes_on, goes_on)
+    ray = x.spawn_ray(x.to_world(wo))
+    hit = scene.ray_intersect_preliminary(ray, active=goes_on)
+    x1 = hit.compute_surface_interaction(ray)
+    smooth = ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    Le, p_light = emission(scene, x1, x, goes_on, goes_on & smooth)
     L_bsdf = Le * mis_weight(p, p_light)
-    return Step(x, β, u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf)
+    return Step(x, β, u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf, smooth, hit)
 
 
 def reflected(light: LightSample, x) -> mi.Spectrum:

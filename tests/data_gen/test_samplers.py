@@ -76,6 +76,8 @@ NAMES = [*SAMPLERS, "toy"]
 # Passes of chains and of paths from both ends take long to start, and some laws take many. Of photons `ppm`, `gpm` and
 # `bre` stand for all others; the toy's are those of a film with splats, which has tests.
 LONG = ("bdpt", "gbdpt", "gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm", "toy")
+# Of tiles the z-test is among their own.
+LONG = (*LONG, "gpt-tiles")
 
 
 def long_slow(names):
