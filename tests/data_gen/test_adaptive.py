@@ -160,6 +160,7 @@ def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
     assert mean < -0.03 and mean < -5 * error
 
 
+@pytest.mark.slow
 def test_gradients_are_shared_out_by_what_is_quick(renderer):
     """Where no method is named: those of a network would cost more than they gain."""
     stack = render(renderer, 32, method="auto")

@@ -13,7 +13,7 @@ from unbiased import REFERENCES, load, render_ours, render_references
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
-QUICK = ("points", "sky", "glass", "bumps")
+QUICK = ("sky", "glass")
 
 
 def check(mi, description, **options):
@@ -36,11 +36,12 @@ def test_unbiased_on_more_scenes(renderer, name):
     check(renderer, SCENES[name])
 
 
-@pytest.mark.parametrize("joined_depth", [1, 3])
+@pytest.mark.parametrize("joined_depth", [1, pytest.param(3, marks=pytest.mark.slow)])
 def test_longer_paths_come_from_the_camera_alone(renderer, joined_depth):
     check(renderer, SCENES["areas"], joined_depth=joined_depth)
 
 
+@pytest.mark.slow
 def test_spectral_and_monochromatic_variants(renderer):
     from data_gen.backend import use_variant
 

@@ -52,7 +52,7 @@ def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     assert np.array(r).ravel().tolist() == [1]
 
 
-@pytest.mark.parametrize("name", ["sky", "bumps"])
+@pytest.mark.parametrize("name", ["sky", pytest.param("bumps", marks=pytest.mark.slow)])
 def test_unbiased_far_away(renderer, long_passes, name):
     """All kinds of lights, where ``diffuse`` has none but a rectangle; and normals that shapes do not know."""
     check(renderer, SCENES[name])

@@ -254,7 +254,7 @@ def test_a_wrong_jacobian_is_found(renderer, monkeypatch):
         assert_no_bias(stacks, 4)
 
 
-@pytest.mark.parametrize("name", ["glass", "glossy", "hidden_sky"])
+@pytest.mark.parametrize("name", ["glass", "hidden_sky"])
 def test_the_primal_is_that_of_ppm(renderer, name):
     """The same camera paths and photons; Russian roulette alone looks at five paths instead of one."""
 
@@ -307,6 +307,7 @@ def test_photons_have_copies_and_differences_little_noise(renderer):
     assert mean > 5 and median > 30
 
 
+@pytest.mark.slow
 def test_caustics_have_less_noise_in_differences(renderer):
     """Photons from glass are near to both of two pixels, as long as the radius is wide. No other photon has a copy."""
     scene = load(renderer, SCENES["caustics"], (32, 32))

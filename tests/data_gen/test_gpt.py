@@ -21,7 +21,7 @@ def verdicts(stacks, references, pixels=1):
     return {name: result.passed for name, result in gradient_tests(stacks, references, pixels=pixels)}
 
 
-@pytest.mark.parametrize("scene", SCENES[3:])  # the first is the one of all samplers' law (test_samplers.py)
+@pytest.mark.parametrize("scene", SCENES[3:6])  # the first is the one of all samplers' law
 def test_unbiased(renderer, scene):
     scene = load(renderer, scene, (32, 32))
     references = render_references(renderer, scene, spp=128)
@@ -40,7 +40,7 @@ def test_unbiased_with_a_large_budget(renderer, scene):
         assert result.passed, f"{name}: {result}"
 
 
-@pytest.mark.parametrize("threshold", [0.0, 10.0])
+@pytest.mark.parametrize("threshold", [0.0, pytest.param(10.0, marks=pytest.mark.slow)])
 def test_unbiased_whatever_is_connectable(renderer, threshold):
     """All that is not a mirror, and nothing at all, which leaves random sequence replay."""
     scene = load(renderer, plenty, (32, 32))
@@ -88,7 +88,9 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
-@pytest.mark.parametrize("mutant", ["emission at the joint", "light at the joint"])
+@pytest.mark.parametrize(
+    "mutant", ["emission at the joint", pytest.param("light at the joint", marks=pytest.mark.slow)]
+)
 def test_mutants_that_only_far_shifts_see(renderer, mutant, monkeypatch):
     """Weights that are nearly right between neighbours: the z-test passes over one pixel, and fails over eight."""
     from data_gen.paths import shift

@@ -30,7 +30,7 @@ from ngpt.testing import z_test
 
 SIZE, PIXELS = (16, 16), 4
 # Not with large budgets: those tell `volpathmis` from `volpath`.
-FAST = [haze, colours, smoke, by_mis(colours), by_mis(coloured_smoke), before_the_sky, hiding]
+FAST = [haze, by_mis(colours), by_mis(coloured_smoke), before_the_sky, hiding]
 SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, before_the_sky, fog, within_fog]
 SLOW += [hiding, hiding_outside]
 

@@ -174,7 +174,8 @@ def mostly(condition):
     return np.array(condition).mean() > 0.99
 
 
-@pytest.mark.parametrize("scene", ["glossy", pytest.param(plenty, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["glossy", plenty])
 def test_the_primal_of_base_and_offset_paths_is_unbiased(renderer, scene):
     from data_gen.samplers.gpt.integrator import stand_in
 

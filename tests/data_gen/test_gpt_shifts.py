@@ -196,6 +196,7 @@ def mutants_of_rules(mi, dr):
     ]
 
 
+@pytest.mark.slow
 def test_round_trips_see_wrong_rules(renderer, monkeypatch):
     import drjit as dr
 

@@ -88,7 +88,7 @@ def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     [
         ("diffuse", 0.02, {}, 0.05),
         ("diffuse", 0.0, {"lamp": (0.04, 0, 0)}, 0.05),
-        ("glossy", 0.02, {}, 0.5),
+        pytest.param("glossy", 0.02, {}, 0.5, marks=pytest.mark.slow),
         ("glossy", 0.0, {"gold": (0.03, 0, 0)}, 0.5),
     ],
 )

@@ -194,7 +194,7 @@ def assert_alike(images, references, block):
     assert off.max() < 0.03 * theirs.mean(), (off.max(), theirs.mean())
 
 
-@pytest.mark.parametrize("name", ["areas", "sky", "glass", "points"])
+@pytest.mark.parametrize("name", ["areas", "sky", "glass", pytest.param("points", marks=pytest.mark.slow)])
 def test_small_radii_have_the_image_of_paths(renderer, name):
     """All lights and chains; within what a radius of a third of a pixel blurs. Of points, that of ``bdpt``."""
     scene = load(renderer, SCENES[name], (24, 24))
