@@ -50,7 +50,7 @@ def test_nothing_is_lost(renderer):
 @pytest.mark.parametrize(
     "mutant",
     [
-        {"ends_late": lambda smooth, connectable, sharp_next: smooth},
+        pytest.param({"ends_late": lambda smooth, connectable, sharp_next: smooth}, marks=pytest.mark.slow),
         {
             "ends_late": lambda smooth, connectable, sharp_next: smooth & ~smooth,
             "classes": lambda rough, late, found, kind, connectable: (rough, late & ~late),
