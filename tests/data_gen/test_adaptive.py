@@ -128,13 +128,14 @@ def test_samples_go_where_the_error_is(renderer):
     scene = load(renderer, "glossy", (48, 32))
     halves = [render_stack(scene, 512, 100 + i, "primal", with_features=False)["primal"] for i in range(2)]
     errors = []
-    for seed in range(4):
+    for seed in range(3):
         stacks = (render_stack(scene, 96, seed, "gpt"), render(renderer, 96, seed, scene))
         errors.append([relmse_trimmed(reconstruct(stack, "wcv").image, *halves) for stack in stacks])
     even, adaptive = np.mean(errors, axis=0)
     assert adaptive < 0.95 * even
 
 
+@pytest.mark.slow
 def test_samples_that_choose_hardly_bias_the_mean(renderer, monkeypatch):
     """They stay in the means: were each pixel judged by its own noise alone, the image would be too dark."""
     from data_gen import adaptive

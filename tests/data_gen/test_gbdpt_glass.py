@@ -329,6 +329,7 @@ def test_less_noise_than_without(renderer, long_passes, monkeypatch):
     assert followed < 0.5 * without, (followed, without)
 
 
+@pytest.mark.slow
 def test_the_same_bits_whatever_the_passes(renderer, monkeypatch):
     from data_gen import passes
     from data_gen.render import render_stack

@@ -270,6 +270,7 @@ def test_the_primal_is_that_of_ppm(renderer, name):
         assert np.allclose(ours[layer], theirs[layer], rtol=1e-4, atol=1e-6), layer
 
 
+@pytest.mark.slow
 def test_shifts_by_nothing_find_no_difference(renderer):
     """The copy of a path through its own pixel is the path."""
     layers = render_ours(load(renderer, SCENES["glass"], (16, 16)), "gpm", 1, 2, pixels=1)[0]

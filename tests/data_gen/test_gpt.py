@@ -49,6 +49,7 @@ def test_unbiased_whatever_is_connectable(renderer, threshold):
         assert result.passed, f"{name}: {result}"
 
 
+@pytest.mark.slow
 def test_agrees_with_the_teaching_sampler(renderer):
     scene = load(renderer, plenty, (32, 32))
     ours, theirs = render_ours(scene, "gpt"), render_ours(scene, "gpt-basic")
@@ -62,9 +63,9 @@ def test_agrees_with_the_teaching_sampler(renderer):
     [
         ("reconnection_jacobian", lambda mi, dr, *geometry: mi.Float(1)),
         ("gradient_weight", lambda mi, dr, r, good: dr.select(good, 2 / (1 + r), 1)),
-        ("gradient_weight", lambda mi, dr, r, good: mi.Float(1)),
+        pytest.param("gradient_weight", lambda mi, dr, r, good: mi.Float(1), marks=pytest.mark.slow),
         ("SHIFTS", {"dx+": (2, 0), "dx-": (-1, 0), "dy+": (0, 1), "dy-": (0, -1)}),
-        ("SHIFTS", {"dx+": (1, 0), "dx-": (-1, 0), "dy+": (0, -1), "dy-": (0, 1)}),
+        pytest.param("SHIFTS", {"dx+": (1, 0), "dx-": (-1, 0), "dy+": (0, -1), "dy-": (0, 1)}, marks=pytest.mark.slow),
     ],
     ids=[
         "no Jacobian",

@@ -32,6 +32,7 @@ def test_unbiased_with_a_large_budget(renderer, scene):
         assert result.passed, f"{name}: {result}"
 
 
+@pytest.mark.slow
 def test_the_z_test_would_see_a_wrong_gradient(renderer):
     stacks, references = render_both(renderer, load(renderer, "diffuse", (32, 32)))
 
@@ -55,6 +56,7 @@ def test_gradients_have_less_variance_than_differences_of_pixels(renderer):
     assert correlated.mean() < 0.3 * independent.mean()
 
 
+@pytest.mark.slow
 def test_variances_predict_the_spread(renderer):
     from data_gen.render import render_stack
 

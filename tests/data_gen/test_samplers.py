@@ -73,9 +73,10 @@ def toy():
 NAMES = [*SAMPLERS, "toy"]
 
 
-# Passes of chains and of paths from both ends take long to start, and some laws take many. Of photons `ppm`, `gpm` and
-# `bre` stand for all others; the toy's are those of a film with splats, which has tests.
-LONG = ("bdpt", "gbdpt", "gmlt", "vpm", "gvpm", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm", "toy")
+# Passes of chains, of photons and of paths from both ends take long to start, and some laws take many. Of photons `ppm`
+# stands for all others; the toy's are those of a film with splats, which has tests.
+PHOTONS = ("gpm", "vpm", "gvpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
+LONG = ("bdpt", "gbdpt", "gmlt", "toy", *PHOTONS)
 # Of tiles the z-test is among their own.
 LONG = (*LONG, "gpt-tiles")
 
@@ -195,7 +196,7 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
 
 
 # 64 renders of these take long. Their film is that of the others.
-DEAR = (*LONG, "ppm", "gpm", "bre")
+DEAR = (*LONG, "ppm", "gpt-basic", "gpt-simple")
 SLOW = [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in NAMES]
 
 

@@ -79,7 +79,10 @@ def test_what_ends_it_is_not_seen(renderer, rng, monkeypatch):
     same(stopped, render(renderer, scene, blocks, most=int(done)))
 
 
-@pytest.mark.parametrize(("scene", "sampler"), [("diffuse", "gpt"), ("glossy", "gpt"), ("diffuse", "gpt-simple")])
+@pytest.mark.parametrize(
+    ("scene", "sampler"),
+    [("diffuse", "gpt"), pytest.param("glossy", "gpt", marks=pytest.mark.slow), ("diffuse", "gpt-simple")],
+)
 def test_uneven_counts_are_unbiased(renderer, rng, scene, sampler):
     """Also where one end of a pair has five times the samples of the other; and variances are those of the means."""
     loaded, blocks = load(renderer, scene, SIZE), uneven(rng)

@@ -133,7 +133,11 @@ def assert_close(ours, theirs, tolerance=1e-4):
     assert (np.abs(ours - theirs) <= tolerance * (np.abs(theirs) + 1e-2 * np.abs(theirs).max())).all()
 
 
-@pytest.fixture(scope="module", params=list(CONFIGS))
+# Of what others have parts of
+MORE = ("with a choice", "relative to its base", "converging", "without gradients")
+
+
+@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if c in MORE else c for c in CONFIGS])
 def pair(request, weights):
     """A file of weights and its ONNX session."""
     path = weights / f"{request.param}.safetensors"

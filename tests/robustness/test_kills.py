@@ -57,7 +57,7 @@ def kill_campaign(kind, folder, kills):
     )
 
 
-@pytest.mark.parametrize(("kind", "kills"), [("denoise", 4), ("train", 2)])
+@pytest.mark.parametrize(("kind", "kills"), [("denoise", 4), pytest.param("train", 2, marks=pytest.mark.slow)])
 def test_a_few_kills(tmp_path, kind, kills):
     kill_campaign(kind, tmp_path, kills)
 

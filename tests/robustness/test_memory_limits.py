@@ -51,6 +51,7 @@ def address_space_campaign(folder, limits):
     return outcomes
 
 
+@pytest.mark.slow
 def test_little_address_space(tmp_path):
     outcomes = address_space_campaign(tmp_path, [100, 512, 700])
     assert min(outcomes.values()) >= 1

@@ -154,6 +154,7 @@ def test_the_shipped_network_is_fine_tuned_in_one_command(train, tmp_path):
     assert 0 < change.mean() < 0.05
 
 
+@pytest.mark.slow
 def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_path):
     changes = {
         "data.folders": ["configs/data-tiny.toml"],
