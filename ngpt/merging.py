@@ -21,7 +21,7 @@ from ngpt.layers import DIFFERENCES
 from ngpt.stack import GradientStack
 
 # Layers with a variance, and the layers that hold it.
-VARIANCES = {"primal": "primal_var", "dx": "dx_var", "dy": "dy_var", "caustic": "caustic_var", "dt": "dt_var"}
+VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
 # Channels beside the layers that are means over samples too.
 DIAGNOSTICS = "diagnostics."
 

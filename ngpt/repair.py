@@ -29,6 +29,8 @@ class Repaired:
     ``caustic``  (H, W, 3) the light that was taken out of image since gradients hold none of it, finite, to be denoised
                  by itself and added back; None where there is none
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN where
+                 not known: those that the stack holds
     """
 
     image: np.ndarray
@@ -43,6 +45,7 @@ class Repaired:
     noise: np.ndarray | None = None
     caustic: np.ndarray | None = None
     caustic_var: np.ndarray | None = None
+    parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def known_variances(self) -> dict[str, np.ndarray]:
         """Those of image, dx and dy that the stack holds, by the names of its layers; see ``variances``."""
@@ -83,10 +86,10 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
     known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
-    apart: dict[str, Any] = {}
+    apart: dict[str, Any] = {"parts": _parts(stack, good)}
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
-        apart = {"caustic": caustic, "caustic_var": variance}
+        apart |= {"caustic": caustic, "caustic_var": variance}
     if "dx" not in stack or "dy" not in stack:
         return Repaired(image, direct, None, None, None, None, int(np.sum(~good)), 0, features, noise, **apart)
     differences, trusted = [], []
@@ -110,6 +113,15 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         variances = (noise, _where(trusted[0], stack["dx_var"]), _where(trusted[1], stack["dy_var"]))
     dx, dy = differences
     return Repaired(image, direct, dx, dy, flags, variances, int(np.sum(~good)), lost, features, noise, **apart)
+
+
+def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
+    """``Repaired.parts``: pixels that are not ``good``, or lack a part, come from their neighbours as the image does."""
+    held = [name for name in ("diffuse", "specular") if name in stack]
+    for name in held:
+        good = good & _finite_pixels(stack[name])
+    parts = {name: stack[name] if good.all() else _from_neighbours(stack[name], good) for name in held}
+    return parts | {f"{name}_var": _where(good, stack[f"{name}_var"]) for name in held if f"{name}_var" in stack}
 
 
 def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndarray:

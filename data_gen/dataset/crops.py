@@ -236,6 +236,7 @@ def finite(stack: GradientStack) -> tuple[GradientStack, int]:
         layers["primal"] = layers["primal"] + layers["caustic"]
     if whole.dx is not None:
         layers |= {"dx": whole.dx, "dy": whole.dy}
+    layers |= {name: part for name, part in whole.parts.items() if not name.endswith("_var")}
     bad = whole.pixels + whole.gradients
     for name in [name for name in layers if name != "direct"]:
         variance = stack[f"{name}_var"]

@@ -22,7 +22,9 @@ SHIFTS = {
 DIAGNOSTICS = {"shift_failures": "diagnostics.shiftFailures"}
 DISCARDED = "diagnostics.discarded"
 
-_WITH_VARIANCE = frozenset({"primal", "caustic", *SHIFTS})
+# Parts of the primal, by the lobe of the first scattering event
+_SPLIT = ("diffuse", "specular")
+_WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
@@ -215,6 +217,9 @@ class GradientFilm:
             # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
             variances["caustic_var"] = self._image(self._statistics("caustic")[2])
+        for layer in _SPLIT:
+            if layer in layers:
+                variances[f"{layer}_var"] = self._image(self._statistics(layer)[2])
         for layer in DIFFERENCES:
             if f"{layer}+" in self.moments:
                 layers[layer], variances[f"{layer}_var"] = self._gradient(layer)

@@ -271,6 +271,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     _VCM,
     _GVCM,
     _PRIMAL,
+    _SPLIT,
 ) = (
     f"data_gen.samplers.{name}"
     for name in (
@@ -294,6 +295,7 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
         "vcm.integrator",
         "vcm.gvcm",
         "primal",
+        "split",
     )
 )
 
@@ -549,6 +551,15 @@ for _sampler in (
         _from_module(_PRIMAL),
         options={"features": "false: the primal alone"},
         gradients=False,
+    ),
+    Sampler(
+        "split",
+        "paths whose light is in two layers, diffuse and specular, without gradients (kernel-predicting networks)",
+        _from_module(_SPLIT),
+        lambda facts: _refused_but_for_surfaces(facts, "split"),
+        lambda facts: [f"transport: Mitsuba's '{facts.integrator}', split by the lobe of the first scattering event"],
+        gradients=False,
+        tried=False,
     ),
 ):
     register(_sampler)

@@ -137,6 +137,7 @@ class Step:
     p_light: mi.Float  # density with which emitter sampling would have found x1
     L_bsdf: mi.Spectrum  # m Le
     smooth: mi.Bool  # no mirror, no hole
+    hole: mi.Bool  # the path goes on as if nothing were there
     hit: mi.PreliminaryIntersection3f  # x1 before all of it is known
 
 
@@ -166,9 +167,10 @@ def base_step(scene, random, x, β, active) -> Step:
     hit = scene.ray_intersect_preliminary(ray, active=goes_on)
     x1 = hit.compute_surface_interaction(ray)
     smooth = ~mi.has_flag(sample.sampled_type, mi.BSDFFlags.Delta)
+    hole = mi.has_flag(sample.sampled_type, mi.BSDFFlags.Null)
     Le, p_light = emission(scene, x1, x, goes_on, goes_on & smooth)
     L_bsdf = Le * mis_weight(p, p_light)
-    return Step(x, β, u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf, smooth, hit)
+    return Step(x, β, u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf, smooth, hole, hit)
 
 
 def reflected(light: LightSample, x) -> mi.Spectrum:

@@ -26,9 +26,11 @@ class Alias(NamedTuple):
 # moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
 # V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
-    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic", "error")),
+    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic", "diffuse", "specular", "error")),
     Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
     Alias("caustic", "ngpt", "caustic", "in files of ngpt, or beside dx, dy or caustic_var: elsewhere it is any light"),
+    Alias("diffuse", "ngpt", "diffuse", "in files of ngpt, or beside diffuse_var: elsewhere it is a colour, or other light"),
+    Alias("specular", "ngpt", "specular", "in files of ngpt, or beside specular_var: elsewhere it is other light"),
     Alias("error", "ngpt", "error", "in results: of the reconstruction"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
     Alias("primal", "Cycles", "Combined", "denoised already if Cycles denoised and stored no Noisy Image"),
@@ -91,6 +93,7 @@ _LOOKS = {
 }
 # Names that mean something else in files that are not ours, and what shows that a file is.
 _OWN = {"direct": {"dx", "dy"}, "caustic": {"dx", "dy", "caustic_var"}}
+_OWN |= {name: {f"{name}_var"} for name in ("diffuse", "specular")}
 # How names of variances and errors end.
 _NOISE = ("var", "variance", "mse", "error")
 

@@ -4,11 +4,13 @@
     dx, dy       3   sgn(x) ln(1 + |x|)
     albedo       3   as it is, [0, 1]
     normal       3   as it is, camera space, [-1, 1]
+    diffuse, specular
+                 3   as primal: light by the lobe of its first scattering event
     depth        1   over the image's largest, [0, 1]; 0 where the path escapes
     base         3   as primal: a classical reconstruction the network starts from
     denoised, denoised_base
                  3   as primal: another denoiser's image of the primal, and of the base, see ``ngpt.network.inputs``
-    primal_se, dx_se, dy_se
+    primal_se, dx_se, dy_se, diffuse_se, specular_se
                  1   ln(1 + standard error of the layer of that name, mean over RGB)
 
 Relative to an image D, with L the signed log, and enlarged: what tells small differences apart in 16 bits. D is the
@@ -43,12 +45,16 @@ CHANNELS = {
     "albedo": 3,
     "normal": 3,
     "depth": 1,
+    "diffuse": 3,
+    "specular": 3,
     "base": 3,
     "denoised": 3,
     "denoised_base": 3,
     "primal_se": 1,
     "dx_se": 1,
     "dy_se": 1,
+    "diffuse_se": 1,
+    "specular_se": 1,
     "primal_change": 3,
     "base_change": 3,
     "denoised_base_change": 3,
@@ -77,10 +83,16 @@ SOURCES = {
 }
 
 # The layers that grow with the light of the scene.
-RADIANCE = frozenset({"primal", "dx", "dy", "base", "denoised", "denoised_base", "primal_se", "dx_se", "dy_se"})
+RADIANCE = frozenset(
+    {"primal", "dx", "dy", "base", "denoised", "denoised_base", "primal_se", "dx_se", "dy_se"}
+    | {"diffuse", "specular", "diffuse_se", "specular_se"}
+)
 
 # Those that are images of the scene: what a network may start from.
 IMAGES = ("primal", *MADE)
+
+# Images of parts of its light.
+PARTS = ("diffuse", "specular")
 
 
 def channels(inputs: tuple[str, ...]) -> int:
@@ -134,7 +146,7 @@ def encode(layers: Mapping[str, Tensor], inputs: tuple[str, ...]) -> Tensor:
 
 
 def _encoded(name: str, layer: Tensor) -> Tensor:
-    if name in IMAGES:
+    if name in (*IMAGES, *PARTS):
         return torch.log1p(torch.clamp(layer, min=0))
     if name in ("dx", "dy"):
         return signed_log(layer)

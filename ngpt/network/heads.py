@@ -5,6 +5,7 @@
     Mixture    a weight for each of several images, and a correction of the logarithm of their mean
     Kernels    weights for the k x k pixels around, in all of the images: their mean, nothing added [Bako et al. 2017,
                "Kernel-predicting convolutional networks", section 4.2; for several images Vogels et al. 2018]
+    SplitKernels  kernels for diffuse and for specular light, see ``ngpt.network.kpcn``
     Pyramid     kernels at several resolutions, of one image, blended from coarse to fine [Vogels et al. 2018,
                "Denoising with kernel prediction and asymmetric loss functions", section 4.3]
 
@@ -135,19 +136,9 @@ class Kernels(Head):
     def outputs(self) -> int:
         return len(self.start) * self.size**2
 
-    @property
-    def _taps(self) -> list[tuple[int, int, int]]:
-        """(image, row, column) of each channel of the prediction."""
-        side = range(self.size)
-        return [(i, y, x) for i in range(len(self.start)) for y in side for x in side]
-
     def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
-        height, width = prediction.shape[-2:]
-        weights = torch.softmax(prediction, 1)
-        mean = torch.zeros_like(images[0][..., :height, :width])
-        # One tap after the other: all of them at once would be size² images.
-        for tap, (i, y, x) in enumerate(self._taps):
-            mean = mean + weights[:, tap : tap + 1] * images[i][..., y : y + height, x : x + width]
+        parts = torch.softmax(prediction, 1).split(self.size**2, 1)
+        mean = torch.stack([averaged(part, image, self.size) for part, image in zip(parts, images, strict=True)]).sum(0)
         return signed_log(mean)
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
@@ -235,10 +226,7 @@ class Pyramid(Head):
         kernels = torch.softmax(
             logits + torch.cat([trust[..., y : y + height, x : x + width] for y, x in places], 1), 1
         )
-        total = torch.zeros_like(image[..., :height, :width])
-        for tap, (y, x) in enumerate(places):
-            total = total + kernels[:, tap : tap + 1] * image[..., y : y + height, x : x + width]
-        return total
+        return averaged(kernels, image, self.size)
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
         def part(x: Any, first: int, last: int) -> Any:
@@ -277,6 +265,21 @@ class Pyramid(Head):
                 change, None, doubled, mode="linear", coordinate_transformation_mode="half_pixel"
             )
         return op.signed_log(result * images[-1] if self.demodulate else result)
+
+
+def averaged(kernels: Tensor, image: Tensor, size: int) -> Tensor:
+    """The sum, in each pixel, of the ``size`` x ``size`` around it by ``kernels`` (N, size², H, W), row by row.
+
+    The image (N, C, H + size - 1, W + size - 1) has size // 2 pixels more on every side.
+    """
+    height, width = kernels.shape[-2:]
+    total = torch.zeros_like(image[..., :height, :width])
+    # One tap after the other: all of them at once would be size² images. Unbound, since the gradient of each slice would
+    # be a tensor of all.
+    for tap, kernel in enumerate(kernels.unbind(1)):
+        y, x = divmod(tap, size)
+        total = total + kernel[:, None] * image[..., y : y + height, x : x + width]
+    return total
 
 
 def mixed(weights: Tensor, images: list[Tensor]) -> Tensor:

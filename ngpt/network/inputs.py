@@ -1,8 +1,10 @@
 """What a network may read, gathered from a repaired stack: the same arrays for PyTorch and for ONNX Runtime.
 
     primal, dx, dy, albedo, normal, depth      layers of the stack
+    diffuse, specular                          the same: light by the lobe of its first scattering event
     primal_var, dx_var, dy_var                 variances of its layers, NaN where not known (ONNX graphs read these)
     primal_se, dx_se, dy_se                    standard errors, their roots, 0 where not known (PyTorch reads these)
+    diffuse_se, specular_se                    the same
     base                                       a classical reconstruction of ``ngpt.classical.bases``
     denoised, denoised_base                    OIDN's images of the primal and of the base
 
@@ -29,7 +31,10 @@ from ngpt.network.estimates import with_variances
 from ngpt.repair import Repaired
 
 # The layers of a stack that networks know, in the order in which they are listed.
-LAYERS = ("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var")
+LAYERS = (
+    *("primal", "dx", "dy", "albedo", "normal", "depth", "primal_var", "dx_var", "dy_var"),
+    *("diffuse", "specular", "diffuse_var", "specular_var"),
+)
 
 # Images made by another denoiser: of the primal, and of the base.
 DENOISED = ("denoised", "denoised_base")
@@ -87,7 +92,7 @@ def gather(
         data = with_variances(data, guide)
     primal = data.image + data.direct if emission else data.image
     held = {name: np.zeros((*primal.shape[:2], OPTIONAL[name]), np.float32) for name in optional}
-    held |= {"primal": primal, **data.features, **data.known_variances()}
+    held |= {"primal": primal, **data.features, **data.parts, **data.known_variances()}
     if data.dx is not None:
         held |= {"dx": data.dx, "dy": data.dy}
     if lacking := [name for name in wanted if name not in held]:

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields
 from typing import Any
 
 import torch
@@ -11,13 +11,13 @@ from torch.nn.functional import avg_pool2d
 
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import features, inputs, padding, poisson
+from ngpt.network import features, inputs, kpcn, padding, poisson
 from ngpt.network.heads import Head, head_of
 from ngpt.network.poisson import Poisson
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import DenseUNet, PlainUNet
 
-NETWORKS = ("dense", "plain")
+NETWORKS = ("dense", "plain", "kpcn")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Kernels reach no further than the padding.
@@ -32,9 +32,9 @@ WINDOW, DARK, HUGE = 15, 0.01, 1e15
 class ModelConfig:
     """What a reconstruction is made of.
 
-    ``network``   "dense" or "plain", see ``ngpt.network.unet``
-    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain)
-    ``units``     for each level, units on the way down and again on the way up (dense only)
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``, or "kpcn", see ``ngpt.network.kpcn``
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, of one level)
+    ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn)
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
     ``base``      the classical method whose result is its layer "base"; "" for none
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
@@ -44,7 +44,7 @@ class ModelConfig:
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
-                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel
+                  ``ngpt.network.heads``; odd; of kpcn those of both parts of the light. 0: it weighs and corrects them pixel by pixel
     ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of the
                   weighted mean of these images
     ``demodulate``  whether these average the image over the albedo, and multiply by it again; needs the input albedo,
@@ -98,7 +98,7 @@ class ModelConfig:
                 f"channels {list(self.channels)}: give a positive number for each level, "
                 f"up to {MAX_CHANNELS}, and at most {MAX_LEVELS} levels"
             )
-        if self.network == "dense" and (len(self.units) != levels or not _whole(self.units, MAX_UNITS)):
+        if self.network != "plain" and (len(self.units) != levels or not _whole(self.units, MAX_UNITS)):
             raise NgptError(
                 f"units {list(self.units)}: give a positive number, up to {MAX_UNITS}, for each of {levels} levels"
             )
@@ -113,6 +113,9 @@ class ModelConfig:
                 raise NgptError(
                     f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
                 )
+        if self.network == "kpcn":
+            self._check_kpcn()
+            return
         if type(self.kernel) is not int or self.kernel not in (0, *range(1, MAX_KERNEL + 1, 2)):
             raise NgptError(f"kernel = {self.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
         if self.kernel and not self.start:
@@ -142,9 +145,23 @@ class ModelConfig:
                 "are made of it and of primal_se"
             )
 
+    def _check_kpcn(self) -> None:
+        if missing := [name for name in kpcn.NEEDED if name not in self.inputs]:
+            raise NgptError(f"network 'kpcn' needs the inputs {', '.join(kpcn.NEEDED)}; lacks {', '.join(missing)}")
+        if type(self.kernel) is not int or self.kernel not in range(3, kpcn.MAX_KERNEL + 1, 2):
+            raise NgptError(f"kernel = {self.kernel!r}: of 'kpcn' it must be an odd number from 3 to {kpcn.MAX_KERNEL}")
+        if len(self.channels) > 1:
+            raise NgptError(f"channels {list(self.channels)}: 'kpcn' has one level; give one number")
+        defaults = {field.name: field.default for field in fields(self) if field.default is not MISSING}
+        others = [name for name, value in defaults.items() if name != "kernel" and getattr(self, name) != value]
+        if others:
+            raise NgptError(f"network 'kpcn' goes without {', '.join(others)}: leave it out")
+
     @property
     def head(self) -> Head:
         """What makes an image of the network's prediction."""
+        if self.network == "kpcn":
+            return kpcn.SplitKernels(size=self.kernel)
         head = head_of(self.start, self.kernel, self.scales, self.demodulate)
         return Poisson(self.start, head, self.sweeps) if self.sweeps else head
 
@@ -186,11 +203,13 @@ class Reconstructor(nn.Module):
         self.config = config
         channels, head = features.channels(config.inputs), config.head
         last: dict[str, Any] = {"outputs": head.outputs, "zero": head.neutral, "normalise": head.normalise}
-        self.network = (
-            DenseUNet(channels, config.channels, config.units, **last)
-            if config.network == "dense"
-            else PlainUNet(channels, config.channels, **last)
-        )
+        self.network: Any
+        if config.network == "dense":
+            self.network = DenseUNet(channels, config.channels, config.units, **last)
+        elif config.network == "plain":
+            self.network = PlainUNet(channels, config.channels, **last)
+        else:
+            self.network = kpcn.KPCN(config.inputs, config.channels[0], config.units[0], head.outputs)
 
     @property
     def alignment(self) -> int:

@@ -27,7 +27,7 @@ class Convolution(nn.Module):
     """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
 
     √2 keeps the variance of what passes leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
-    2015]. ``kind`` "1x1" and "3x3" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose
+    2015]. ``kind`` "1x1", "3x3" and "5x5" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose
     and doubles it.
     """
 
@@ -35,7 +35,7 @@ class Convolution(nn.Module):
         super().__init__()
         self.kind, self.activation = kind, activation
         self.transposed = kind == "unpool"
-        size = {"1x1": 1, "3x3": 3, "pool": 2, "unpool": 2}[kind]
+        size = {"1x1": 1, "3x3": 3, "5x5": 5, "pool": 2, "unpool": 2}[kind]
         shape = (inputs, outputs, size, size) if self.transposed else (outputs, inputs, size, size)
         self.v = nn.Parameter(torch.empty(shape))
         self.s = nn.Parameter(torch.ones(outputs))

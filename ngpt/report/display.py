@@ -84,7 +84,7 @@ def layer_view(name: str, layer: np.ndarray) -> np.ndarray:
     if name == "depth":
         finite = layer[np.isfinite(layer)]
         layer = layer / ((np.percentile(finite, 99.0) if finite.size else 0.0) or 1.0)
-    elif name in ("primal", "direct", "caustic") or name.endswith("_var"):
+    elif name in ("primal", "direct", "caustic", "diffuse", "specular") or name.endswith("_var"):
         return to_srgb8(layer, auto_exposure(layer))
     return to_srgb8(layer)
 

@@ -32,6 +32,7 @@ from ngpt.training.shards import (
     REFERENCE_CAUSTIC,
     REFERENCE_HALVES,
     SAMPLES,
+    SPLIT,
     Shard,
     tensor_names,
 )
@@ -226,7 +227,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     if not crops:
         return shard
     gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
-    optional = (REFERENCE_HALVES, MOTION, *SAMPLES)
+    optional = (REFERENCE_HALVES, MOTION, *SAMPLES, *SPLIT)
     names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names])
     missing = [name for name in names if name not in shard.names]
     if missing:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
+from ngpt.network.features import PARTS
 from ngpt.network.model import ModelConfig
 from ngpt.system.records import from_table, read_toml
 from ngpt.training.augment import Augmentation
@@ -121,6 +122,13 @@ def _check(settings: Settings, path: str) -> None:
     ):
         if value not in allowed:
             raise NgptError(f"{path}: {name} = '{value}': choose one of: {', '.join(allowed)}")
+    parts = [name for name in PARTS if name in settings.model.layers]
+    made = [name for name in ("quieter", "rarer") if getattr(settings.augmentation, name)]
+    if parts and made:
+        raise NgptError(
+            f"{path}: augmentation.{made[0]}: makes no {' and '.join(parts)} light, which the network reads, since "
+            "references are not split; leave it out"
+        )
     for name in ("steps", "batch", "log", "save", "validate"):
         if getattr(settings.run, name) < 1:
             raise NgptError(f"{path}: run.{name} = {getattr(settings.run, name)}: must be at least 1")

@@ -12,6 +12,7 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     reference_indirect, reference_direct    (N, H, W, 3)
     reference_halves            (N, 2, H, W, 3), optional: reference_indirect by each half of its samples
     samples                     optional: those of each pixel, where inputs have them in different numbers
+    diffuse, diffuse_se, specular, specular_se    all or none: parts of indirect, where the sampler splits it
     motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
 
@@ -41,7 +42,8 @@ GRADIENTS = {"dx": 3, "dy": 3, "dx_se": 3, "dy_se": 3}
 INPUTS = {"indirect": 3, "direct": 3, "albedo": 3, "normal": 3, "depth": 1, "primal_se": 3}
 CAUSTIC = {"caustic": 3, "caustic_se": 3}
 SAMPLES = {"samples": 1}
-OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC | SAMPLES
+SPLIT = {"diffuse": 3, "diffuse_se": 3, "specular": 3, "specular_se": 3}
+OF_INPUTS = INPUTS | GRADIENTS | CAUSTIC | SAMPLES | SPLIT
 REFERENCES = ("reference_indirect", "reference_direct")
 REFERENCE_CAUSTIC = "reference_caustic"
 REFERENCE_HALVES = "reference_halves"
@@ -97,7 +99,7 @@ def tensor_names(gradients: bool, caustic: bool = False, further: Sequence[str] 
 def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
     caustic = "caustic" in stack
     tensors = {"indirect": stack["primal"] - stack["direct"] - (stack["caustic"] if caustic else 0)}
-    optional = {"dx": GRADIENTS, "caustic": CAUSTIC, "samples": SAMPLES}
+    optional = {"dx": GRADIENTS, "caustic": CAUSTIC, "samples": SAMPLES, "diffuse": SPLIT}
     for name in (*INPUTS, *(name for layer, names in optional.items() if layer in stack for name in names)):
         if name.endswith("_se"):
             tensors[name] = np.sqrt(stack[name.removesuffix("_se") + "_var"])

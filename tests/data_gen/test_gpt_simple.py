@@ -188,9 +188,8 @@ class Pairs:
         β1 = dr.select(goes_on, β * f / p, 0)
         Le, p_light = emission(self.scene, x1, x, goes_on, goes_on)
         L_light, L_bsdf = reflected(light, x), Le * mis_weight(p, p_light)
-        return Step(
-            x, β, other.u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf, other.smooth, other.hit
-        )
+        kind = other.smooth, other.hole
+        return Step(x, β, other.u_light, light, L_light, wo, p, goes_on, β1, x1, Le, p_light, L_bsdf, *kind, other.hit)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,77 @@
+"""What share of the light that a material scatters comes from its diffuse lobes."""
+
+from __future__ import annotations
+
+import re
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.paths.vertex import dr_number
+
+# Materials that evaluate all of their lobes whatever ``BSDFContext.type_mask`` says, by the names of their classes.
+DEAF = ("Principled", "PrincipledThin")
+# Their parameters that weigh diffuse lobes against all others, as mi.traverse() spells them, at any nesting.
+_NOT_DIFFUSE = re.compile(r"(?:^|(.*)\.)(metallic|spec_trans)(?:\.value|\.data)?$")
+# Stands for: this material hears the mask.
+_HEARS = -1.0
+
+
+class Lobes:
+    """The share of diffuse lobes (``BSDFFlags.Diffuse``, reflection and transmission) in what a material scatters.
+
+    Materials evaluate some of their lobes alone where ``BSDFContext.type_mask`` asks for it, and those that hold others
+    (``twosided``, ``mask``, ``bumpmap``, ``normalmap``, ``blendbsdf``) hand the mask on. Principled materials do not
+    hear it. Of them, and of what holds one, the diffuse part is taken for Lambert's,
+
+        s ρ |cos θ| / π,   s = (1 - metallic) (1 - spec_trans)
+
+    with ρ their reflectance, ``eval_diffuse_reflectance()``, and never for more than all that they scatter. Textured
+    parameters count with their mean, and several such materials in one with the mean of their s. Those inside shape
+    groups are not listed by Mitsuba: all that principled ones scatter there counts as diffuse.
+    """
+
+    def __init__(self, scene: mi.Scene):
+        materials = {dr_number(shape.bsdf()): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+        table = np.full(max(materials, default=0) + 1, _HEARS, np.float32)
+        for number, bsdf in materials.items():
+            table[number] = _lambert(bsdf)
+        self.size = len(table)
+        self.lambert = mi.Float(table)
+        dr.eval(self.lambert)
+
+    def diffuse(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
+        """The share, in [0, 1] for each wavelength, of what goes from ``wo`` (local) into ``si.wi``; 0 of nothing.
+
+        For directions that were sampled or chosen otherwise, not for those of a Dirac delta, which are never diffuse.
+        """
+        bsdf = si.bsdf()
+        flags = bsdf.flags()
+        active = active & mi.has_flag(flags, mi.BSDFFlags.Diffuse)
+        f = bsdf.eval(mi.BSDFContext(), si, wo, active)
+        only = mi.BSDFContext()
+        only.type_mask = int(mi.BSDFFlags.Diffuse)
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        s = dr.gather(mi.Float, self.lambert, number, active & (number < self.size))
+        deaf = (number < self.size) & (s != _HEARS)
+        part = bsdf.eval(only, si, wo, active & ~deaf)
+        reaches = (si.wi.z * wo.z > 0) | mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission)
+        ρ = bsdf.eval_diffuse_reflectance(si, active & deaf & reaches)
+        part = dr.select(deaf, dr.select(reaches, s * dr.abs(wo.z) / dr.pi, 0) * ρ, part)
+        share = part / f
+        # ``roughplastic`` says NaN below its horizon.
+        return dr.select(active & (f > 0) & dr.isfinite(share), dr.clip(share, 0, 1), 0)
+
+
+def _lambert(bsdf: mi.BSDF) -> float:
+    """s of a material that is, or holds, one that does not hear the mask; ``_HEARS`` of all others."""
+    params = mi.traverse(bsdf)
+    if not any(getattr(node, "class_name", str)() in DEAF for node in params.hierarchy):
+        return _HEARS
+    shares: dict[str, float] = {}
+    for key in params.keys():  # noqa: SIM118 - not a dict: iterating it yields pairs
+        if match := _NOT_DIFFUSE.search(key):
+            inside = match[1] or ""
+            shares[inside] = shares.get(inside, 1.0) * (1 - float(np.mean(np.array(params[key]))))
+    return float(np.clip(np.mean(list(shares.values())), 0, 1))

@@ -1,0 +1,106 @@
+"""KPCN: kernels for diffuse and specular light, each predicted by a network of its own [Bako et al. 2017].
+
+    diffuse, its error, features ── 5x5 ── ... ── 5x5 ── 1x1 ── kernels of diffuse / (albedo + ε) ── x (albedo + ε) ─┐
+                                                                                                                     +
+    specular, its error, features ─ 5x5 ── ... ── 5x5 ── 1x1 ── kernels of ln(1 + specular) ──────── exp - 1 ────────┘
+
+"Kernel-Predicting Convolutional Networks for Denoising Monte Carlo Renderings", sections 4 and 5. Here the last
+convolution is 1x1 and reads normalised features, as before all softmax heads of ours, and convolutions are those of
+``ngpt.network.unet``. Both networks read logarithms, since one path may be a thousand times as bright as its pixel; but
+kernels average what the paper's do. Left out are the features' own gradients and variances among the inputs.
+"""
+
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+
+from ngpt.errors import NgptError
+from ngpt.network.features import CHANNELS, PARTS
+from ngpt.network.heads import Head, averaged
+from ngpt.network.transfer import signed_exp, signed_log
+from ngpt.network.unet import Convolution, LastConvolution
+
+# What is added to albedo before light is divided by it [section 5.1].
+EPSILON = 0.00316
+# The inputs that it cannot do without.
+NEEDED = ("primal", *PARTS, "albedo")
+# The paper's kernels; the pixels that they see beyond the padding repeat its border.
+MAX_KERNEL = 21
+# The largest logarithm of light that float32 still holds, over EPSILON.
+LARGEST = 80.0
+
+
+class KPCN(nn.Module):
+    """Both networks: channels (N, C, H, W), as ``ngpt.network.features.encode`` gives them, to the logits of kernels.
+
+    ``inputs``   the layers that these channels are, in order, ``NEEDED`` among them
+    ``width``    the channels of each 5x5 convolution, ``layers`` of them in each network
+    ``outputs``  the logits of both: first those of diffuse light. A network reads its own part of the light and of the
+                 errors, and all other inputs but the primal
+    """
+
+    alignment = 1
+
+    def __init__(self, inputs: tuple[str, ...], width: int, layers: int, outputs: int):
+        super().__init__()
+        self.inputs, self.radius = inputs, 2 * layers
+        self.bodies, self.heads = nn.ModuleDict(), nn.ModuleDict()
+        for part in PARTS:
+            channels = sum(CHANNELS[name] for name in self._read(part))
+            sizes = [channels, *[width] * layers]
+            convolutions = [Convolution(a, b, "5x5") for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+            self.bodies[part] = nn.Sequential(*convolutions)
+            self.heads[part] = LastConvolution(width, outputs // len(PARTS), zero=True, normalise=True)
+
+    def _read(self, part: str) -> list[str]:
+        others = {name for other in PARTS if other != part for name in (other, f"{other}_se")}
+        return [name for name in self.inputs if name != "primal" and name not in others]
+
+    def forward(self, x: Tensor) -> Tensor:
+        layers = dict(zip(self.inputs, x.split([CHANNELS[name] for name in self.inputs], 1), strict=True))
+        diffuse = torch.expm1(layers["diffuse"].clamp(max=LARGEST))
+        layers["diffuse"] = torch.log1p(diffuse / (layers["albedo"] + EPSILON))
+        logits = []
+        for part in PARTS:
+            read = torch.cat([layers[name] for name in self._read(part)], 1)
+            logits.append(self.heads[part](self.bodies[part](read.contiguous(memory_format=torch.channels_last))))
+        return torch.cat(logits, 1)
+
+
+@dataclass(frozen=True)
+class SplitKernels(Head):
+    """In each pixel weights (softmax) for ``size`` x ``size`` pixels, for each of the two parts of the light."""
+
+    start: tuple[str, ...] = PARTS
+    normalise: ClassVar[bool] = True
+
+    size: int = MAX_KERNEL
+
+    @property
+    def reads(self) -> tuple[str, ...]:
+        return (*self.start, "albedo")
+
+    @property
+    def radius(self) -> int:
+        return self.size // 2
+
+    @property
+    def outputs(self) -> int:
+        return len(self.start) * self.size**2
+
+    def forward(self, prediction: Tensor, images: list[Tensor]) -> Tensor:
+        height, width = prediction.shape[-2:]
+        diffuse, specular, albedo = images
+        of_diffuse, of_specular = (torch.softmax(logits, 1) for logits in prediction.chunk(2, 1))
+        reflectance = albedo + EPSILON
+        r = self.radius
+        light = averaged(of_diffuse, diffuse / reflectance, self.size) * reflectance[..., r : r + height, r : r + width]
+        return signed_log(light + signed_exp(averaged(of_specular, signed_log(specular), self.size)))
+
+    def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
+        raise NgptError(NO_GRAPH)
+
+
+NO_GRAPH = "a network 'kpcn' has no ONNX graph; run its weights in PyTorch: ngpt denoise --weights FILE.safetensors"
