@@ -76,7 +76,7 @@ NAMES = [*SAMPLERS, "toy"]
 # Passes of chains, of photons and of paths from both ends take long to start, and some laws take many. Of photons `ppm`
 # stands for all others; the toy's are those of a film with splats, which has tests, as tiles have of their bias.
 PHOTONS = ("gpm", "vpm", "gvpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
-LONG = ("bdpt", "gbdpt", "gmlt", "gpt-tiles", "toy", *PHOTONS)
+LONG = ("bdpt", "gbdpt", "gmlt", "gpt-tiles", "split", "toy", *PHOTONS)
 
 
 def long_slow(names):
