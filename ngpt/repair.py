@@ -29,8 +29,8 @@ class Repaired:
     ``caustic``  (H, W, 3) the light that was taken out of image since gradients hold none of it, finite, to be denoised
                  by itself and added back; None where there is none
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
-    ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN where
-                 not known: those that the stack holds
+    ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
+                 where not known: those that the stack holds
     """
 
     image: np.ndarray
@@ -116,7 +116,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
 
 
 def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
-    """``Repaired.parts``: pixels that are not ``good``, or lack a part, come from their neighbours as the image does."""
+    """``Repaired.parts``: pixels that are not ``good``, or lack a part, come from their neighbours."""
     held = [name for name in ("diffuse", "specular") if name in stack]
     for name in held:
         good = good & _finite_pixels(stack[name])

@@ -22,14 +22,22 @@ class Alias(NamedTuple):
     only: tuple[str, ...] = ()
 
 
+# Names of ours that mean something else in files that are not, and what shows that a file is.
+_OWN: dict[str, set[str]] = {
+    "direct": {"dx", "dy"},
+    "caustic": {"dx", "dy", "caustic_var"},
+    "diffuse": {"diffuse_var"},
+    "specular": {"specular_var"},
+}
+
 # The first name that a file holds wins, so order is preference. Absent on purpose: pbrt-v4's `Variance` and Mitsuba's
 # moments are variances of a sample, not of the pixel mean, half of what other renderers call `diffuse` is light, and
 # V-Ray's VRayZDepth is a shade of grey between two distances.
 ALIASES: tuple[Alias, ...] = (
-    *(Alias(name, "ngpt", name) for name in LAYERS if name not in ("direct", "caustic", "diffuse", "specular", "error")),
+    *(Alias(name, "ngpt", name) for name in LAYERS if name not in (*_OWN, "error")),
     Alias("direct", "ngpt", "direct", "in files of ngpt, or beside dx or dy: elsewhere `direct` is direct lighting"),
     Alias("caustic", "ngpt", "caustic", "in files of ngpt, or beside dx, dy or caustic_var: elsewhere it is any light"),
-    Alias("diffuse", "ngpt", "diffuse", "in files of ngpt, or beside diffuse_var: elsewhere it is a colour, or other light"),
+    Alias("diffuse", "ngpt", "diffuse", "in files of ngpt, or beside diffuse_var: elsewhere any light, or a colour"),
     Alias("specular", "ngpt", "specular", "in files of ngpt, or beside specular_var: elsewhere it is other light"),
     Alias("error", "ngpt", "error", "in results: of the reconstruction"),
     Alias("primal", "Cycles", "Noisy Image", "the render before Cycles' own denoiser"),
@@ -91,9 +99,6 @@ _LOOKS = {
     "dx": ("gradientx", "gradx"),
     "dy": ("gradienty", "grady"),
 }
-# Names that mean something else in files that are not ours, and what shows that a file is.
-_OWN = {"direct": {"dx", "dy"}, "caustic": {"dx", "dy", "caustic_var"}}
-_OWN |= {name: {f"{name}_var"} for name in ("diffuse", "specular")}
 # How names of variances and errors end.
 _NOISE = ("var", "variance", "mse", "error")
 

@@ -274,8 +274,8 @@ def averaged(kernels: Tensor, image: Tensor, size: int) -> Tensor:
     """
     height, width = kernels.shape[-2:]
     total = torch.zeros_like(image[..., :height, :width])
-    # One tap after the other: all of them at once would be size² images. Unbound, since the gradient of each slice would
-    # be a tensor of all.
+    # One tap after the other: all of them at once would be size² images. Unbound, since the gradient of each slice
+    # would be a tensor of all.
     for tap, kernel in enumerate(kernels.unbind(1)):
         y, x = divmod(tap, size)
         total = total + kernel[:, None] * image[..., y : y + height, x : x + width]

@@ -11,6 +11,7 @@ kernels average what the paper's do. Left out are the features' own gradients an
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, ClassVar
 
 import torch
@@ -50,7 +51,7 @@ class KPCN(nn.Module):
         for part in PARTS:
             channels = sum(CHANNELS[name] for name in self._read(part))
             sizes = [channels, *[width] * layers]
-            convolutions = [Convolution(a, b, "5x5") for a, b in zip(sizes[:-1], sizes[1:], strict=True)]
+            convolutions = [Convolution(a, b, "5x5") for a, b in pairwise(sizes)]
             self.bodies[part] = nn.Sequential(*convolutions)
             self.heads[part] = LastConvolution(width, outputs // len(PARTS), zero=True, normalise=True)
 

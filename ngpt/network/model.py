@@ -44,7 +44,8 @@ class ModelConfig:
                   base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
                   network says. Where the variance is 0, or not known, it does not. 0: nowhere
     ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
-                  ``ngpt.network.heads``; odd; of kpcn those of both parts of the light. 0: it weighs and corrects them pixel by pixel
+                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. Of
+                  kpcn those of both parts of the light
     ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of the
                   weighted mean of these images
     ``demodulate``  whether these average the image over the albedo, and multiply by it again; needs the input albedo,

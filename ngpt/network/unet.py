@@ -27,8 +27,8 @@ class Convolution(nn.Module):
     """A convolution with normalised weights, w = √2 s v / |v| for each output channel, and a bias.
 
     √2 keeps the variance of what passes leaky ReLUs from the first step on [Salimans and Kingma 2016, eq. 2; He et al.
-    2015]. ``kind`` "1x1", "3x3" and "5x5" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its transpose
-    and doubles it.
+    2015]. ``kind`` "1x1", "3x3" and "5x5" keep the size; "pool" is 2x2 with stride 2 and halves it, "unpool" is its
+    transpose and doubles it.
     """
 
     def __init__(self, inputs: int, outputs: int, kind: str, activation: bool = True):

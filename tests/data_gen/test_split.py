@@ -59,10 +59,12 @@ def principled(**values):
 
 def everything():
     """All that light may meet first: coats, mirrors, glass, metal, principled materials, bumps."""
-    bump = {"type": "bitmap", "raw": True, "bitmap": None}
     import mitsuba as mi
 
-    bump["bitmap"] = mi.Bitmap(np.random.default_rng(3).random((8, 8), np.float32))
+    from data_gen.scenes.builtin import _sphere
+
+    relief = mi.Bitmap(np.random.default_rng(3).random((8, 8), np.float32))
+    bump = {"type": "bitmap", "raw": True, "bitmap": relief}
     first = {**coats(), "paint": principled(metallic=0.2, clearcoat=0.5)}
     behind = {
         "mirror": {"type": "conductor"},
@@ -70,9 +72,8 @@ def everything():
         "frosted": {"type": "roughdielectric", "alpha": 0.2},
         "relief": {"type": "bumpmap", "texture": bump, "scale": 0.05, "nested": principled(metallic=0.5)["nested"]},
     }
-    from data_gen.scenes.builtin import _sphere
-
-    more = {name: _sphere([x, 1.0, -0.4], 0.33, bsdf) for x, (name, bsdf) in zip((-1, -0.3, 0.4, 1.1), behind.items())}
+    places = zip((-1, -0.3, 0.4, 1.1), behind.items(), strict=True)
+    more = {name: _sphere([x, 1.0, -0.4], 0.33, bsdf) for x, (name, bsdf) in places}
     more["paint"] = _sphere([0, 0.2, 1.2], 0.2, first.pop("paint"))
     # Without it ``path`` loses light behind holes.
     more["sky"] = {"type": "constant", "radiance": 0.2}
@@ -196,9 +197,15 @@ def test_materials_hear_the_mask_but_for_those_that_are_known_not_to(renderer):
     """The day a principled material fails this, it may go from ``lobes.DEAF``."""
     coated = {"type": "roughplastic", "alpha": 0.2}
     flat = renderer.Bitmap(np.full((4, 4), 0.5, np.float32))
+    blue = renderer.Bitmap(np.full((4, 4, 3), (0.5, 0.5, 1), np.float32))
     hearing = {
         **coats(),
         "bump": {"type": "bumpmap", "t": {"type": "bitmap", "bitmap": flat, "raw": True}, "nested": coated},
+        "normals": {
+            "type": "normalmap",
+            "normalmap": {"type": "bitmap", "bitmap": blue, "raw": True},
+            "nested": coated,
+        },
         "pplastic": {"type": "pplastic", "alpha": 0.2},
         "metal": {"type": "roughconductor", "alpha": 0.3},
         "frosted": {"type": "roughdielectric", "alpha": 0.3},

@@ -407,3 +407,12 @@ def test_the_alias_table_is_complete_and_printed_in_full():
     assert any("Denoising Albedo" in line and "Cycles" in line and line.startswith("albedo") for line in lines)
     for name in LAYERS:
         assert next(alias.name for alias in ALIASES if alias.layer == name) == name, "canonical names come first"
+
+
+@pytest.mark.parametrize("name", ["diffuse", "specular"])
+def test_parts_of_light_are_taken_in_files_of_ours_alone(name):
+    """Elsewhere names like these are any light, or a colour."""
+    channels = ["R", "G", "B", *(f"{name}.{c}" for c in "RGB")]
+    assert name not in resolve([("", channels)])
+    assert name in resolve([("", channels)], ours=True) and name in resolve([("", channels)], {name: name})
+    assert name in resolve([("", [*channels, *(f"{name}_var.{c}" for c in "RGB")])])
