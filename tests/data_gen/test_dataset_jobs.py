@@ -18,6 +18,7 @@ from full_stack import full_stack
 
 from ngpt.errors import NgptError
 from ngpt.methods import denoise
+from ngpt.stack import GradientStack
 from ngpt.training.dataset import Dataset, problems, read_manifest
 
 pytest.importorskip("safetensors")
@@ -320,3 +321,20 @@ def test_crops_keep_light_that_gradients_lack_apart():
     assert np.allclose(rest + light, denoise(stack, "wcv"), rtol=1e-5, atol=1e-5)
     plain = full_stack(20, 24)
     assert crops.references(plain, "wcv")[1] is None
+
+
+def test_crops_keep_split_light():
+    """Made finite as the rest is: pixels come from their neighbours, and what is not known of a variance is its own."""
+    stack = full_stack(20, 24)
+    layers = {"primal": stack["primal"], "direct": 0 * stack["primal"], "diffuse": stack["primal"] / 4}
+    layers |= {"specular": 0.75 * stack["primal"], "primal_var": stack["primal_var"]}
+    layers |= {f"{name}_var": 0.1 * layers[name] ** 2 for name in ("diffuse", "specular")}
+    layers |= {name: stack[name] for name in ("albedo", "normal", "depth")}
+    layers["specular"][3, 4], layers["diffuse_var"][10, 12] = np.nan, np.inf
+    made, bad = crops.finite(GradientStack(layers))
+    assert bad >= 2 and made.names == GradientStack(layers).names
+    assert all(np.isfinite(made[name]).all() for name in made.names)
+    around = layers["specular"][2:5, 3:6]
+    assert np.nanmin(around) < made["specular"][3, 4].mean() < np.nanmax(around)
+    assert np.allclose(made["diffuse_var"][10, 12], layers["diffuse"][10, 12] ** 2)
+    assert np.array_equal(made["diffuse"][:3], layers["diffuse"][:3])

@@ -197,15 +197,12 @@ def test_materials_hear_the_mask_but_for_those_that_are_known_not_to(renderer):
     """The day a principled material fails this, it may go from ``lobes.DEAF``."""
     coated = {"type": "roughplastic", "alpha": 0.2}
     flat = renderer.Bitmap(np.full((4, 4), 0.5, np.float32))
-    blue = renderer.Bitmap(np.full((4, 4, 3), (0.5, 0.5, 1), np.float32))
+    up = renderer.Bitmap(np.full((4, 4, 3), (0.5, 0.5, 1), np.float32))
+    up = {"type": "bitmap", "bitmap": up, "raw": True}
     hearing = {
         **coats(),
         "bump": {"type": "bumpmap", "t": {"type": "bitmap", "bitmap": flat, "raw": True}, "nested": coated},
-        "normals": {
-            "type": "normalmap",
-            "normalmap": {"type": "bitmap", "bitmap": blue, "raw": True},
-            "nested": coated,
-        },
+        "normals": {"type": "normalmap", "normalmap": up, "nested": coated},
         "pplastic": {"type": "pplastic", "alpha": 0.2},
         "metal": {"type": "roughconductor", "alpha": 0.3},
         "frosted": {"type": "roughdielectric", "alpha": 0.3},
