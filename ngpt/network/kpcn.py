@@ -40,11 +40,20 @@ class KPCN(nn.Module):
     ``width``    the channels of each 5x5 convolution, ``layers`` of them in each network
     ``outputs``  the logits of both: first those of diffuse light. A network reads its own part of the light and of the
                  errors, and all other inputs but the primal
+    ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius`` that of the receptive field
     """
 
     alignment = 1
 
-    def __init__(self, inputs: tuple[str, ...], width: int, layers: int, outputs: int):
+    def __init__(
+        self,
+        inputs: tuple[str, ...],
+        width: int,
+        layers: int,
+        outputs: int,
+        zero: bool = False,
+        normalise: bool = False,
+    ):
         super().__init__()
         self.inputs, self.radius = inputs, 2 * layers
         self.bodies, self.heads = nn.ModuleDict(), nn.ModuleDict()
@@ -53,7 +62,7 @@ class KPCN(nn.Module):
             sizes = [channels, *[width] * layers]
             convolutions = [Convolution(a, b, "5x5") for a, b in pairwise(sizes)]
             self.bodies[part] = nn.Sequential(*convolutions)
-            self.heads[part] = LastConvolution(width, outputs // len(PARTS), zero=True, normalise=True)
+            self.heads[part] = LastConvolution(width, outputs // len(PARTS), zero, normalise)
 
     def _read(self, part: str) -> list[str]:
         others = {name for other in PARTS if other != part for name in (other, f"{other}_se")}

@@ -210,7 +210,7 @@ class Reconstructor(nn.Module):
         elif config.network == "plain":
             self.network = PlainUNet(channels, config.channels, **last)
         else:
-            self.network = kpcn.KPCN(config.inputs, config.channels[0], config.units[0], head.outputs)
+            self.network = kpcn.KPCN(config.inputs, config.channels[0], config.units[0], **last)
 
     @property
     def alignment(self) -> int:
