@@ -15,7 +15,7 @@ from ngpt.network import features, inputs, padding, poisson
 from ngpt.network.heads import Head, head_of
 from ngpt.network.poisson import Poisson
 from ngpt.network.transfer import signed_exp, signed_log
-from ngpt.network.unet import DenseUNet, PlainUNet
+from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 
 NETWORKS = ("dense", "plain")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
@@ -53,6 +53,8 @@ class ModelConfig:
                   network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
     ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
+    ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
+                  "average", "maximum" or "bilinear", see ``ngpt.network.unet``
     """
 
     network: str
@@ -68,10 +70,13 @@ class ModelConfig:
     sweeps: int = 0
     optional: tuple[str, ...] = ()
     emission: bool = False
+    pooling: str = "convolution"
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise NgptError(f"network '{self.network}': choose one of: {', '.join(NETWORKS)}")
+        if self.pooling not in POOLING:
+            raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")
         if self.base and not self.start:
             object.__setattr__(self, "start", ("base",))
         for name in ("channels", "units", "inputs", "start", "optional"):
@@ -185,11 +190,16 @@ class Reconstructor(nn.Module):
         super().__init__()
         self.config = config
         channels, head = features.channels(config.inputs), config.head
-        last: dict[str, Any] = {"outputs": head.outputs, "zero": head.neutral, "normalise": head.normalise}
+        options: dict[str, Any] = {
+            "outputs": head.outputs,
+            "zero": head.neutral,
+            "normalise": head.normalise,
+            "pooling": config.pooling,
+        }
         self.network = (
-            DenseUNet(channels, config.channels, config.units, **last)
+            DenseUNet(channels, config.channels, config.units, **options)
             if config.network == "dense"
-            else PlainUNet(channels, config.channels, **last)
+            else PlainUNet(channels, config.channels, **options)
         )
 
     @property
