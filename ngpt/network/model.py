@@ -15,7 +15,7 @@ from ngpt.network import features, inputs, kpcn, padding, poisson
 from ngpt.network.heads import Head, head_of
 from ngpt.network.poisson import Poisson
 from ngpt.network.transfer import signed_exp, signed_log
-from ngpt.network.unet import DenseUNet, PlainUNet
+from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 
 NETWORKS = ("dense", "plain", "kpcn")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
@@ -54,6 +54,8 @@ class ModelConfig:
                   network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
     ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
     ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
+    ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
+                  "average", "maximum" or "bilinear", see ``ngpt.network.unet``
     """
 
     network: str
@@ -69,10 +71,13 @@ class ModelConfig:
     sweeps: int = 0
     optional: tuple[str, ...] = ()
     emission: bool = False
+    pooling: str = "convolution"
 
     def __post_init__(self) -> None:
         if self.network not in NETWORKS:
             raise NgptError(f"network '{self.network}': choose one of: {', '.join(NETWORKS)}")
+        if self.pooling not in POOLING:
+            raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")
         if self.base and not self.start:
             object.__setattr__(self, "start", ("base",))
         for name in ("channels", "units", "inputs", "start", "optional"):
@@ -206,9 +211,9 @@ class Reconstructor(nn.Module):
         last: dict[str, Any] = {"outputs": head.outputs, "zero": head.neutral, "normalise": head.normalise}
         self.network: Any
         if config.network == "dense":
-            self.network = DenseUNet(channels, config.channels, config.units, **last)
+            self.network = DenseUNet(channels, config.channels, config.units, **last, pooling=config.pooling)
         elif config.network == "plain":
-            self.network = PlainUNet(channels, config.channels, **last)
+            self.network = PlainUNet(channels, config.channels, **last, pooling=config.pooling)
         else:
             self.network = kpcn.KPCN(config.inputs, config.channels[0], config.units[0], **last)
 

@@ -18,9 +18,11 @@ import math
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import conv2d, conv_transpose2d, leaky_relu
+from torch.nn.functional import avg_pool2d, conv2d, conv_transpose2d, interpolate, leaky_relu, max_pool2d
 
 SLOPE = 0.01
+# How sizes are halved and doubled; all but the first are the alternatives that the paper tries [section 4.4.5].
+POOLING = ("convolution", "average", "maximum", "bilinear")
 
 
 class Convolution(nn.Module):
@@ -63,6 +65,39 @@ class Convolution(nn.Module):
         return leaky_relu(x, SLOPE) if self.activation else x
 
 
+class Resampling(nn.Module):
+    """A 1x1 convolution, and half or twice the size by a rule that learns nothing [Kettunen et al. 2019, figure 12].
+
+    ``pooling``  "average": means of 2x2, and each pixel repeated; "maximum": the largest of 2x2, and each repeated;
+                 "bilinear": bilinear at the centres of pixels, which is the mean of 2x2 on the way down
+    """
+
+    def __init__(self, inputs: int, outputs: int, pooling: str, up: bool):
+        super().__init__()
+        self.pooling, self.up = pooling, up
+        self.convolution = Convolution(inputs, outputs, "1x1")
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = self.convolution(x)
+        if self.up:
+            return interpolate(x, scale_factor=2.0, mode="bilinear" if self.pooling == "bilinear" else "nearest")
+        return max_pool2d(x, 2) if self.pooling == "maximum" else avg_pool2d(x, 2)
+
+
+def halved(inputs: int, outputs: int, pooling: str) -> nn.Module:
+    """From one level to the next coarser one; ``pooling`` is one of ``POOLING``."""
+    if pooling == "convolution":
+        return Convolution(inputs, outputs, "pool")
+    return Resampling(inputs, outputs, pooling, up=False)
+
+
+def doubled(inputs: int, outputs: int, pooling: str) -> nn.Module:
+    """The way back of ``halved``."""
+    if pooling == "convolution":
+        return Convolution(inputs, outputs, "unpool")
+    return Resampling(inputs, outputs, pooling, up=True)
+
+
 class LastConvolution(nn.Module):
     """The 1x1 convolution to ``outputs`` channels: float32, whatever autocast does, and not activated.
 
@@ -102,20 +137,22 @@ class Unit(nn.Module):
         return self.grow(self.squeeze(torch.cat(tensors, 1)))
 
 
-def radius(convolutions: list[int]) -> int:
+def radius(convolutions: list[int], pooling: str) -> int:
     """How far, in pixels, a pixel's influence reaches, with so many 3x3 convolutions at each level.
 
-    One reaches as far as its level's pixels are wide; a coarsest pixel spreads what any pixel in it holds to all of it.
+    One reaches as far as its level's pixels are wide; a coarsest pixel spreads what any pixel in it holds to all of it,
+    and bilinear interpolation, at each level, to the pixel beside it.
     """
-    return sum(n << level for level, n in enumerate(convolutions)) + (1 << len(convolutions) - 1) - 1
+    spread = (1 << len(convolutions) - 1) - 1
+    return sum(n << level for level, n in enumerate(convolutions)) + spread * (2 if pooling == "bilinear" else 1)
 
 
 class DenseUNet(nn.Module):
     """(N, inputs, H, W) to (N, outputs, H, W); H and W divisible by ``alignment``.
 
     ``growth`` and ``units`` have one number for each level: the channels each unit adds, and how many units there are
-    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``radius``
-    that of the receptive field.
+    on the way down and again on the way up. ``zero`` and ``normalise`` are those of ``LastConvolution``, ``pooling``
+    is one of ``POOLING``, ``radius`` that of the receptive field.
     """
 
     def __init__(
@@ -126,11 +163,12 @@ class DenseUNet(nn.Module):
         outputs: int = 3,
         zero: bool = False,
         normalise: bool = False,
+        pooling: str = "convolution",
     ):
         super().__init__()
         levels = len(growth)
         self.alignment = 2 ** (levels - 1)
-        self.radius = radius([2 * n for n in units])
+        self.radius = radius([2 * n for n in units], pooling)
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
         self.pool, self.unpool = nn.ModuleList(), nn.ModuleList()
         channels, dense = inputs, []
@@ -139,11 +177,11 @@ class DenseUNet(nn.Module):
             dense.append(channels + n * g)
             if level + 1 < levels:
                 channels = 2 * growth[level + 1]
-                self.pool.append(Convolution(dense[level], channels, "pool"))
+                self.pool.append(halved(dense[level], channels, pooling))
         for level in reversed(range(levels)):
             g, n = growth[level], units[level]
             if level + 1 < levels:
-                self.unpool.insert(0, Convolution(dense[level + 1], 2 * g, "unpool"))
+                self.unpool.insert(0, doubled(dense[level + 1], 2 * g, pooling))
                 dense[level] += 2 * g
             self.up.insert(0, nn.ModuleList(Unit(dense[level] + i * g, g) for i in range(n)))
             dense[level] += n * g
@@ -173,19 +211,25 @@ class PlainUNet(nn.Module):
     """
 
     def __init__(
-        self, inputs: int, widths: tuple[int, ...], outputs: int = 3, zero: bool = False, normalise: bool = False
+        self,
+        inputs: int,
+        widths: tuple[int, ...],
+        outputs: int = 3,
+        zero: bool = False,
+        normalise: bool = False,
+        pooling: str = "convolution",
     ):
         super().__init__()
         self.alignment = 2 ** (len(widths) - 1)
-        self.radius = radius([4] * (len(widths) - 1) + [2])
+        self.radius = radius([4] * (len(widths) - 1) + [2], pooling)
         self.down, self.up = nn.ModuleList(), nn.ModuleList()
         self.pool, self.unpool = nn.ModuleList(), nn.ModuleList()
         channels = inputs
         for level, width in enumerate(widths):
             self.down.append(nn.Sequential(Convolution(channels, width, "3x3"), Convolution(width, width, "3x3")))
             if level + 1 < len(widths):
-                self.pool.append(Convolution(width, width, "pool"))
-                self.unpool.append(Convolution(widths[level + 1], width, "unpool"))
+                self.pool.append(halved(width, width, pooling))
+                self.unpool.append(doubled(widths[level + 1], width, pooling))
                 self.up.append(nn.Sequential(Convolution(2 * width, width, "3x3"), Convolution(width, width, "3x3")))
             channels = width
         self.head = LastConvolution(widths[0], outputs, zero, normalise)

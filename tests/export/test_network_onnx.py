@@ -18,7 +18,7 @@ from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
 from ngpt.errors import NgptError
-from ngpt.export.network import network_model, overlap, statistics_model
+from ngpt.export.network import network_body, network_model, overlap, statistics_model
 from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import reconstruct
 from ngpt.network import inputs
@@ -401,3 +401,14 @@ def test_a_base_without_a_graph_is_refused(tmp_path, capsys):
     save_weights(tmp_path / "w.safetensors", Reconstructor(config), {})
     assert main(["--weights", str(tmp_path / "w.safetensors"), "-o", str(tmp_path / "m.onnx")]) == 2
     assert "'l2'" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("pooling", ["average", "maximum", "bilinear"])
+def test_any_pooling_is_exported(pooling):
+    torch.manual_seed(4)
+    model = Reconstructor(ModelConfig("dense", (3, 4, 4), (1, 1, 1), ("primal",), pooling=pooling)).eval()
+    x = torch.rand(1, 3, 3 * model.alignment, 8 * model.alignment)
+    with torch.no_grad():
+        expected = model.network(x).numpy()
+    session = onnxruntime.InferenceSession(network_body(model).SerializeToString())
+    assert np.allclose(session.run(None, {"channels": x.numpy()})[0], expected, rtol=1e-4, atol=1e-5)

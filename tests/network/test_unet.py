@@ -10,7 +10,7 @@ from ngpt.network import features, padding  # noqa: E402
 from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
 from ngpt.network.run_torch import reconstruct  # noqa: E402
 from ngpt.network.transfer import signed_log  # noqa: E402
-from ngpt.network.unet import Convolution, DenseUNet, PlainUNet  # noqa: E402
+from ngpt.network.unet import POOLING, Convolution, DenseUNet, PlainUNet, Resampling  # noqa: E402
 from ngpt.training.cost import per_pixel  # noqa: E402
 
 NGPT = ("primal", "dx", "dy", "albedo", "normal", "depth")
@@ -59,10 +59,16 @@ def test_weights_have_norm_root_two_whatever_their_scale(kind):
     assert torch.allclose(norms, torch.full((7,), 2**0.5), rtol=1e-5)
 
 
+# The largest of 2x2 has a slope at one of them only, so that what it sees is not seen in one go.
+@pytest.mark.parametrize("pooling", [pooling for pooling in POOLING if pooling != "maximum"])
 @pytest.mark.parametrize("network", ["dense", "plain"])
-def test_the_receptive_field_is_as_stated_and_no_smaller_than_needed(network):
+def test_the_receptive_field_is_as_stated_and_no_smaller_than_needed(network, pooling):
     torch.manual_seed(1)
-    net = DenseUNet(3, (4, 4, 4), (1, 2, 1)) if network == "dense" else PlainUNet(3, (4, 4, 4))
+    net = (
+        DenseUNet(3, (4, 4, 4), (1, 2, 1), pooling=pooling)
+        if network == "dense"
+        else PlainUNet(3, (4, 4, 4), pooling=pooling)
+    )
     size = 8 * net.alignment * 4
     x = torch.rand(1, 3, size, size, requires_grad=True)
     reach = 0
@@ -73,6 +79,44 @@ def test_the_receptive_field_is_as_stated_and_no_smaller_than_needed(network):
         seen = torch.nonzero(gradient[0].abs().sum(0))
         reach = max(reach, int((seen - center).abs().max()))
     assert reach == net.radius
+
+
+def test_ways_to_halve_and_double():
+    x = torch.rand(1, 2, 4, 6, generator=torch.Generator().manual_seed(3))
+    small = {name: Resampling(2, 3, name, up=False) for name in POOLING[1:]}
+    large = {name: Resampling(2, 3, name, up=True) for name in POOLING[1:]}
+    for changes in (*small.values(), *large.values()):
+        changes.load_state_dict(small["average"].state_dict())
+    flat = small["average"].convolution(x)
+    blocks = flat.reshape(1, 3, 2, 2, 3, 2).movedim(4, 3).flatten(4)
+    assert torch.allclose(small["average"](x), blocks.mean(4))
+    assert torch.allclose(small["bilinear"](x), blocks.mean(4))
+    assert torch.equal(small["maximum"](x), blocks.amax(4))
+    for name in ("average", "maximum"):
+        assert torch.equal(large[name](x), flat.repeat_interleave(2, 2).repeat_interleave(2, 3))
+    # Between the centres of coarse pixels a ramp stays a ramp.
+    between = large["bilinear"](x)[..., 1:-1, 1:-1]
+    a, b, c, d = flat[..., :-1, :-1], flat[..., :-1, 1:], flat[..., 1:, :-1], flat[..., 1:, 1:]
+    assert torch.allclose(between[..., ::2, ::2], (9 * a + 3 * b + 3 * c + d) / 16, atol=1e-6)
+    assert torch.allclose(between[..., 1::2, 1::2], (a + 3 * b + 3 * c + 9 * d) / 16, atol=1e-6)
+
+
+@pytest.mark.parametrize("pooling", POOLING)
+def test_models_of_any_pooling_know_their_cost(pooling):
+    model = Reconstructor(ModelConfig(**PAPER, inputs=NGPT, pooling=pooling))
+    macs, _ = per_pixel(model)
+    if pooling == "convolution":
+        assert parameters(model) == 4_358_534
+    else:
+        # Of the four taps of each pool and unpool one is left.
+        spared = 3 * (112_800 + 256_000 + 204_800 + 256_000 + 409_600 + 307_200) // 4
+        assert parameters(model) == pytest.approx(4_358_534 - spared, rel=1e-3)
+    assert macs > 0
+
+
+def test_a_pooling_that_is_none():
+    with pytest.raises(NgptError, match="pooling 'lanczos': choose one of: convolution, average, maximum, bilinear"):
+        ModelConfig(**PAPER, inputs=NGPT, pooling="lanczos")
 
 
 @pytest.mark.parametrize("network", ["dense", "plain"])

@@ -1,0 +1,130 @@
+"""What each part of the paper's network and loss is worth, at the scale of a CPU: the ablations of NGPT's section 4.4.
+
+    python -m bench.ablations --data SET ... --apart SCENE ... --out DIR
+
+Trains configs/ablations.toml and its variants on the same crops, for as many steps, from the same seed, and measures
+them on all inputs of the scenes whose names begin with one of --apart: geometric means of trimmed relMSE (free of the
+noise of references in halves) and FLIP, apart for few samples and many. Runs that are there are continued or read: the
+command may be stopped. --only takes some of the variants.
+"""
+
+import argparse
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from bench.common import metadata, save
+from bench.scaling import train
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import scores
+from ngpt.network.model import Reconstructor, parameters
+from ngpt.network.run_torch import layers_of
+from ngpt.network.weights import load_weights
+from ngpt.repair import repair
+from ngpt.system import configs
+from ngpt.training.cost import per_pixel
+from ngpt.training.examples import judges_of, open_crops, split
+from ngpt.training.settings import read_settings
+
+# What is changed of the configuration; the plain network has as many parameters.
+VARIANTS: dict[str, list[str]] = {
+    "dense": [],
+    "no gradients": ['model.inputs=["primal", "albedo", "normal", "depth"]'],
+    "no features": ['model.inputs=["primal", "dx", "dy"]'],
+    "l1 alone": ['loss.kind="l1"', "loss.l1=1.0", "loss.gradient=0.0"],
+    "l1 and differences": ['loss.kind="l1"', "loss.l1=1.0", "loss.gradient=1.0"],
+    "plain": ['model.network="plain"', "model.channels=[13, 26, 39, 53]", "model.units=[]"],
+    "average pooling": ['model.pooling="average"'],
+    "maximum pooling": ['model.pooling="maximum"'],
+    "bilinear": ['model.pooling="bilinear"'],
+}
+METRICS = ("relMSE trimmed", "FLIP")
+FEW = 16  # samples; fewer are apart from as many or more
+
+
+@torch.no_grad()
+def judged(model: Reconstructor, crops: Sequence[Any]) -> list[dict[str, float]]:
+    """Of each input of each crop: its samples per pixel, and the metrics of the network's image and of the primal."""
+    found = []
+    for crop in crops:
+        halves = judges_of(crop, model.config)
+        for k in range(crop.inputs):
+            stack = repair(crop.stack(k), model.config.reads_gradients)
+            layers = {name: layer[None] for name, layer in layers_of(stack, model.config).items()}
+            image = model(layers)[0].permute(1, 2, 0).numpy()
+            given = layers["primal"][0].permute(1, 2, 0).numpy()
+            row = {f"{name} primal": value for name, value in scores(METRICS, given, *halves).items()}
+            found.append({"spp": crop.spp[k], **scores(METRICS, image, *halves), **row})
+    return found
+
+
+def mean(rows: Sequence[dict[str, float]], name: str, few: bool) -> float:
+    """The geometric mean over inputs of few samples, or of many; NaN of none."""
+    # The noise of two halves may outweigh what is left of an error.
+    values = [max(row[name], 1e-9) for row in rows if (row["spp"] < FEW) == few]
+    return math.exp(math.fsum(map(math.log, values)) / len(values)) if values else math.nan
+
+
+def table(result: dict[str, Any]) -> str:
+    """Markdown: a row for each variant, and one for the input."""
+    heads = [f"{name}, {which}" for name in METRICS for which in (f"below {FEW} spp", f"from {FEW} spp")]
+    lines = ["| variant | parameters | multiplications per pixel | " + " | ".join(heads) + " |"]
+    lines += ["|---|--:|--:|" + "--:|" * len(heads)]
+
+    def cells(rows: Sequence[dict[str, float]], end: str = "") -> str:
+        return " | ".join(f"{mean(rows, name + end, few):.4f}" for name in METRICS for few in (True, False))
+
+    for name, found in result["variants"].items():
+        cost = f"{found['parameters'] / 1e3:.0f} k | {found['multiplications'] / 1e3:.0f} k"
+        lines.append(f"| {name} | {cost} | {cells(found['inputs'])} |")
+    first = next(iter(result["variants"].values()))
+    return "\n".join([*lines, f"| the input | | | {cells(first['inputs'], ' primal')} |"])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", required=True, nargs="+", metavar="SET", help="training sets")
+    parser.add_argument("--apart", required=True, nargs="+", metavar="SCENE", help="beginnings of scenes' names")
+    parser.add_argument("--out", required=True, type=Path, help="folder of the runs")
+    parser.add_argument("--only", nargs="+", choices=VARIANTS, default=list(VARIANTS), metavar="NAME", help="variants")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting of all")
+    parser.add_argument("-o", "--output", default="bench/results/ablations.json", metavar="JSON")
+    args = parser.parse_args()
+
+    shared = [f"data.folders={_toml(args.data)}", f"data.validation={_toml(args.apart)}", *args.set]
+    crops, held_out = split([crop for folder in args.data for crop in open_crops(folder)], tuple(args.apart))
+    if not crops or not held_out:
+        raise NgptError(f"{len(crops)} crops to train on, {len(held_out)} kept apart: change --apart")
+    config, variants = configs.find_config("ablations", configs.TRAINING), {}
+    for name in args.only:
+        settings = read_settings(config, [*shared, *VARIANTS[name]])
+        out = args.out / name.replace(" ", "-")
+        train(settings, crops, held_out, out)
+        model, _ = load_weights(out / "weights.safetensors")
+        variants[name] = {
+            "parameters": parameters(model),
+            "multiplications": per_pixel(model)[0],
+            "steps": settings.run.steps,
+            "inputs": judged(model, held_out),
+        }
+        print(f"{name}: measured", flush=True)
+    result = {
+        "metadata": metadata("torch"),
+        "crops": len(crops),
+        "crops apart": len(held_out),
+        "scenes apart": sorted({crop.scene for crop in held_out}),
+        "variants": variants,
+    }
+    save(args.output, result)
+    print(table(result))
+
+
+def _toml(names: Sequence[str]) -> str:
+    return "[" + ", ".join(f'"{name}"' for name in names) + "]"
+
+
+if __name__ == "__main__":
+    main()
