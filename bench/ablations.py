@@ -33,9 +33,7 @@ from ngpt.training.settings import read_settings
 VARIANTS: dict[str, list[str]] = {
     "dense": [],
     "no gradients": ['model.inputs=["primal", "albedo", "normal", "depth"]'],
-    "no features": ['model.inputs=["primal", "dx", "dy"]'],
     "l1 alone": ['loss.kind="l1"', "loss.l1=1.0", "loss.gradient=0.0"],
-    "l1 and differences": ['loss.kind="l1"', "loss.l1=1.0", "loss.gradient=1.0"],
     "plain": ['model.network="plain"', "model.channels=[13, 26, 39, 53]", "model.units=[]"],
     "average pooling": ['model.pooling="average"'],
     "maximum pooling": ['model.pooling="maximum"'],

@@ -23,7 +23,8 @@ from data_gen.samplers.photons.camera import Level, Path
 from data_gen.samplers.photons.copies import copy, is_near, light, photon_of
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.pairs import Pairs, Points, pieces
-from data_gen.samplers.photons.ppm import Passes, begin
+from data_gen.samplers.photons.ppm import begin
+from data_gen.samplers.photons.render import Passes
 
 # Levels are joined until they have so many paths for each camera sample.
 LEVELS = 3

@@ -34,8 +34,8 @@ from data_gen.samplers.photons.differences import PAIR_BYTES, Near, difference
 from data_gen.samplers.photons.gbre import GBRE, PATHS_BYTES, Beside, Both, beside_of
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.pairs import Pairs
-from data_gen.samplers.photons.ppm import Passes
 from data_gen.samplers.photons.radius import shrunk
+from data_gen.samplers.photons.render import Passes
 
 # Parts of beams, for each light path, and pairs of a ray and a beam, for each camera sample, in memory together
 PARTS = 16

@@ -50,8 +50,8 @@ from data_gen.samplers.photons.differences import (
 )
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.pairs import Pairs, Rays
-from data_gen.samplers.photons.ppm import Passes
 from data_gen.samplers.photons.radius import shrunk
+from data_gen.samplers.photons.render import Passes
 from ngpt.errors import NgptError
 
 # Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums

@@ -47,7 +47,7 @@ from data_gen.samplers.photons.planes import (
     planes_of,
     scattered_of,
 )
-from data_gen.samplers.photons.ppm import Passes
+from data_gen.samplers.photons.render import Passes
 from data_gen.samplers.photons.trace import VERTICES_PER_PATH
 
 

@@ -32,8 +32,9 @@ from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.camera import Level, levels
 from data_gen.samplers.photons.camera import Path as CameraPath
 from data_gen.samplers.photons.differences import PAIR_BYTES, PAIRS, Near, add_to, differences, emitted, gradient_pass
-from data_gen.samplers.photons.ppm import PPM, Passes
+from data_gen.samplers.photons.ppm import PPM
 from data_gen.samplers.photons.radius import shrunk
+from data_gen.samplers.photons.render import Passes
 
 # Of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 3072

@@ -49,8 +49,8 @@ from data_gen.samplers.photons.differences import (
 from data_gen.samplers.photons.fog import Fog
 from data_gen.samplers.photons.gbre import PATHS_BYTES, AlongPieces, Both, with_media
 from data_gen.samplers.photons.pairs import Points
-from data_gen.samplers.photons.ppm import Passes
 from data_gen.samplers.photons.radius import shrunk
+from data_gen.samplers.photons.render import Passes
 from data_gen.samplers.photons.vpm import VPM
 
 

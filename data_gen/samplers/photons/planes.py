@@ -38,7 +38,7 @@ from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.beams import BEAMS
 from data_gen.samplers.photons.bre import Both, seen_along
 from data_gen.samplers.photons.fog import Fog
-from data_gen.samplers.photons.ppm import Passes
+from data_gen.samplers.photons.render import Passes
 from data_gen.samplers.photons.trace import VERTICES_PER_PATH
 from ngpt.errors import NgptError
 

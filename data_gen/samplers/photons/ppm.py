@@ -18,7 +18,7 @@ emission that the camera path meets on its way counts as it is. So each path of 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -40,9 +40,9 @@ from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.photons.copies import faces, light, photon_of
 from data_gen.samplers.photons.fog import Fog
-from data_gen.samplers.photons.frozen import Frozen
 from data_gen.samplers.photons.grid import Grid
 from data_gen.samplers.photons.radius import pixel_width, shrunk
+from data_gen.samplers.photons.render import Passes
 from data_gen.samplers.photons.trace import MAP_BYTES, trace
 from ngpt.errors import NgptError
 
@@ -84,34 +84,6 @@ class Gathering:
         return self.K * self.grid.gather(si.p, self.radius2, active, one, zero)
 
 
-@dataclass
-class Passes:
-    """The passes of a render, and the memory that one takes."""
-
-    integrator: PPM
-    scene: mi.Scene
-    lights: LightEnds
-    materials: Materials
-    width: float  # of a pixel
-    frozen: Frozen = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
-
-    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        self.integrator.sample_pass(self, camera, film)
-
-    @property
-    def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light paths may leave in a map."""
-        return self.integrator.camera_bytes + self.integrator.photons * self.integrator.map_bytes
-
-    def instead(self, lane_bytes: int) -> str:
-        """What else than a smaller image would fit into so many bytes for each camera sample."""
-        fits = (lane_bytes - self.integrator.camera_bytes) // self.integrator.map_bytes
-        return f", or no more than --option photons={fits}" if fits > 0 else ""
-
-
 class PPM(GradientIntegrator):
     """Progressive photon mapping on surfaces; no gradients.
 
@@ -147,6 +119,16 @@ class PPM(GradientIntegrator):
             raise NgptError(f"{self.name}: a radius of {self.radius:g} pixels; use one above 0")
         if not 1 <= self.photons <= 1 << 16:
             raise NgptError(f"{self.name}: {self.photons} photons for each pixel are out of range; use 1 .. {1 << 16}")
+
+    @property
+    def lane_bytes(self) -> int:
+        """Of a camera sample, with all that its light paths may leave in a map."""
+        return self.camera_bytes + self.photons * self.map_bytes
+
+    def instead(self, lane_bytes: int) -> str:
+        """What else than a smaller image would fit into so many bytes for each camera sample."""
+        fits = (lane_bytes - self.camera_bytes) // self.map_bytes
+        return f", or no more than --option photons={fits}" if fits > 0 else ""
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)

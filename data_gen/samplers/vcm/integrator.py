@@ -24,7 +24,6 @@ Space Extension for Robust Light Transport Simulation"]
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from functools import partial
 from types import SimpleNamespace
 
@@ -42,45 +41,14 @@ from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.frozen import Frozen
 from data_gen.samplers.photons.ppm import refuse
 from data_gen.samplers.photons.radius import pixel_width, shrunk
+from data_gen.samplers.photons.render import Passes
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
 from ngpt.errors import NgptError
 
 # Of a camera sample, its features and its light path, beside the map: what was seen, and some more
 SAMPLE_BYTES = 1536
-
-
-@dataclass
-class Passes:
-    """The passes of a render, and the memory that one takes."""
-
-    integrator: VCM
-    scene: mi.Scene
-    lights: LightEnds
-    materials: Materials
-    width: float  # of a pixel
-    frozen: Frozen = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
-
-    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
-        self.integrator.sample_pass(self, camera, film)
-
-    @property
-    def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light path may leave in the map."""
-        # Dr.Jit gives each array the next power of two of bytes.
-        places = 1 << (self.integrator.vertices - 1).bit_length() if self.integrator.vertices else 0
-        return self.integrator.sample_bytes + places * VERTEX_BYTES
-
-    def instead(self, lane_bytes: int) -> str:
-        """What else than a smaller image would fit into so many bytes for each camera sample."""
-        places = (lane_bytes - self.integrator.sample_bytes) // VERTEX_BYTES
-        fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
-        return f", or no more than --option joined_depth={fits}" if fits else ""
 
 
 class VCM(BDPT):
@@ -124,6 +92,19 @@ class VCM(BDPT):
     def vertices(self) -> int:
         """The most that are kept of a light path."""
         return max(self.longest - 1, 0)
+
+    @property
+    def lane_bytes(self) -> int:
+        """Of a camera sample, with all that its light path may leave in the map."""
+        # Dr.Jit gives each array the next power of two of bytes.
+        places = 1 << (self.vertices - 1).bit_length() if self.vertices else 0
+        return self.sample_bytes + places * VERTEX_BYTES
+
+    def instead(self, lane_bytes: int) -> str:
+        """What else than a smaller image would fit into so many bytes for each camera sample."""
+        places = (lane_bytes - self.sample_bytes) // VERTEX_BYTES
+        fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
+        return f", or no more than --option joined_depth={fits}" if fits else ""
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)
