@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--scenes", nargs="+", default=["glossy", "environment", "lens"])
     parser.add_argument("--size", type=int, nargs=2, default=(128, 72), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
-    parser.add_argument("--reference-spp", type=int, default=2048)
+    parser.add_argument("--reference-spp", type=int, default=1024)
     parser.add_argument("--table", action="store_true")
     args = parser.parse_args()
     if not args.table:

@@ -96,6 +96,14 @@ def test_the_tables_of_bidirectional_samplers_are_those_of_their_file():
     assert f"{MARKS[0]}\n\n{table(result)}\n\n{MARKS[1]}" in text
 
 
+def test_the_table_of_kpcn_is_that_of_its_file():
+    """`python -m bench.kpcn --table` prints it."""
+    from bench.kpcn import table
+
+    result = json.loads((ROOT / "bench" / "results" / "kpcn.json").read_text())
+    assert table(result) in (ROOT / "docs" / "kpcn.md").read_text()
+
+
 def test_the_numbers_of_the_readme_are_in_the_results():
     readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/RESULTS.md"))
     hero = json.loads((ROOT / "bench" / "results" / "hero.json").read_text())["results"]
