@@ -14,7 +14,7 @@ from ngpt.errors import NgptError
 from ngpt.export.builder import IR_VERSION, OPSET
 from ngpt.export.graphs.exposure import STATISTICS
 from ngpt.export.graphs.model import layers, optional, reconstruction, statistics
-from ngpt.network import features, kpcn
+from ngpt.network import features
 from ngpt.network.model import Reconstructor
 from ngpt.network.unet import Convolution
 from ngpt.network.weights import load_weights
@@ -90,8 +90,11 @@ def bytes_per_pixel(model: Reconstructor) -> int:
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
     model, header = load_weights(weights)
-    if model.config.network == "kpcn":
-        raise NgptError(f"{weights}: {kpcn.NO_GRAPH}")
+    if split := [name for name in model.config.inputs if name.removesuffix("_se") in features.PARTS]:
+        raise NgptError(
+            f"{weights}: the network reads {', '.join(split)}, for which there is no ONNX graph; run its weights in "
+            "PyTorch: ngpt denoise --weights FILE.safetensors"
+        )
     if model.config.base not in ("", "wcv"):
         raise NgptError(
             f"{weights}: the network starts from '{model.config.base}', for which there is no graph; train with 'wcv'"

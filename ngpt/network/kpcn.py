@@ -110,7 +110,4 @@ class SplitKernels(Head):
         return signed_log(light + signed_exp(averaged(of_specular, signed_log(specular), self.size)))
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
-        raise NgptError(NO_GRAPH)
-
-
-NO_GRAPH = "a network 'kpcn' has no ONNX graph; run its weights in PyTorch: ngpt denoise --weights FILE.safetensors"
+        raise NgptError("kernels of split light have no ONNX graph")

@@ -224,6 +224,7 @@ def test_there_is_no_graph(tmp_path):
     pytest.importorskip("onnxscript")
     from ngpt.export.network import network_model
 
-    save_weights(tmp_path / "w.safetensors", Reconstructor(small()), {})
-    with pytest.raises(NgptError, match="a network 'kpcn' has no ONNX graph; run its weights in PyTorch"):
-        network_model(tmp_path / "w.safetensors", "mine")
+    for i, config in enumerate([small(), ModelConfig("dense", (4,), (1,), ("primal", "diffuse_se"))]):
+        save_weights(tmp_path / f"{i}.safetensors", Reconstructor(config), {})
+        with pytest.raises(NgptError, match="diffuse_se, for which there is no ONNX graph; run it"):
+            network_model(tmp_path / f"{i}.safetensors", "mine")
