@@ -226,5 +226,5 @@ def test_there_is_no_graph(tmp_path):
 
     for i, config in enumerate([small(), ModelConfig("dense", (4,), (1,), ("primal", "diffuse_se"))]):
         save_weights(tmp_path / f"{i}.safetensors", Reconstructor(config), {})
-        with pytest.raises(NgptError, match="diffuse_se, for which there is no ONNX graph; run it"):
+        with pytest.raises(NgptError, match="for which there is no ONNX graph; run its weights in PyTorch"):
             network_model(tmp_path / f"{i}.safetensors", "mine")
