@@ -28,7 +28,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bench.common import metadata, save
+from bench.common import metadata, save, write_page
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import EPSILON, relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
@@ -186,13 +186,6 @@ def table(result: dict) -> str:
 
 def shown(name: str, row: dict) -> str:
     return f"{name} (apart)" if row["apart"] else name
-
-
-def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
-    """Puts the tables between the marks of the page."""
-    before, _, rest = page.read_text().partition(marks[0])
-    _, _, after = rest.partition(marks[1])
-    page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
 
 
 if __name__ == "__main__":

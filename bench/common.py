@@ -39,3 +39,10 @@ def save(path: str | Path, result: dict) -> None:
     """Writes or replaces a JSON file, and makes its folder."""
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     write_json(Path(path), result)
+
+
+def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
+    """Puts the tables between the marks of the page."""
+    before, _, rest = page.read_text().partition(marks[0])
+    _, _, after = rest.partition(marks[1])
+    page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")

@@ -30,8 +30,7 @@ import numpy as np
 
 import ngpt
 from bench import panels
-from bench.bidirectional import write_page
-from bench.common import metadata, save
+from bench.common import metadata, save, write_page
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read_image

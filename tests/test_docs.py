@@ -87,6 +87,15 @@ def test_the_first_tables_of_the_results_are_those_of_the_cells():
         assert table in text
 
 
+def test_the_tables_of_the_main_evaluation_are_those_of_its_file():
+    """`python -m bench.pages` writes them."""
+    from bench.pages import RESULT, blocks, marks
+
+    for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
+        start, end = marks(name)
+        assert f"{start}\n\n{text}\n\n{end}" in (ROOT / page).read_text(), (page, name)
+
+
 def test_the_tables_of_bidirectional_samplers_are_those_of_their_file():
     """`python -m bench.bidirectional --docs` writes them."""
     from bench.bidirectional import MARKS, table

@@ -1,0 +1,240 @@
+"""Writes the tables of the main evaluation into the pages that quote it.
+
+    python eval.py --config configs/eval-main.toml --out out/eval ... --advice ngpt/measure/advice.json
+    python -m bench.pages out/eval
+
+keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
+docs/RESULTS.md, docs/evaluation.md, docs/methods.md and the model cards. Without a folder it writes them anew from
+that file, all but the list of every cell.
+"""
+
+import argparse
+import json
+from pathlib import Path
+
+import numpy as np
+
+from bench.common import save, write_page
+from bench.groups import GROUPS, heading
+from bench.groups import tables as groups
+from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+
+ROOT = Path(__file__).parents[1]
+RESULT = ROOT / "bench" / "results" / "main.json"
+EVERYONE = tuple(scene for scenes in GROUPS.values() for scene in scenes)
+# Among which gradients are judged by scenes that no network was trained on
+KNOWN = {
+    "all but classroom": tuple(scene for scene in EVERYONE if scene != "classroom"),
+    "rooms, watched": GROUPS["rooms"] + GROUPS["watched"],
+    "other views": GROUPS["other views"],
+}
+LISTED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "oidn")
+# Ratios over OIDN from which a loss is listed by name
+LOSS = 1.1
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path, nargs="?", help="of the evaluation; default: the tables of before")
+    args = parser.parse_args()
+    if args.folder:
+        save(RESULT, kept(json.loads((args.folder / "results.json").read_text())))
+        write_page(ROOT / "docs" / "RESULTS.md", every_cell(args.folder / "results.md"), marks("every cell"))
+    for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
+        write_page(ROOT / page, text, marks(name))
+
+
+def marks(name: str) -> tuple[str, str]:
+    return f"<!-- python -m bench.pages: {name} -->", f"<!-- {name} ends -->"
+
+
+def kept(results: dict) -> dict:
+    """Of an evaluation what the tables need: medians over seeds, and what gradients are worth."""
+    results["settings"]["groups"] = KNOWN
+    worth = worth_of_gradients(results)
+    table = worth_tables(results | {"worth": worth})
+    cells = [
+        {
+            "scene": row["scene"],
+            "spp": row["spp"],
+            "method": row["method"],
+            "error": row["metrics"][results["primary"]]["median"],
+            "FLIP": row["metrics"]["FLIP"]["median"],
+            "seconds": row["seconds"]["reconstruct"],
+        }
+        for row in results["summary"]
+        if row["scene"] and row["metrics"]
+    ]
+    facts = {name: results[name] for name in ("command", "date", "metadata")}
+    return {"benchmark": "main", **facts, "cells": cells, "worth": list(table.values())}
+
+
+def every_cell(page: Path) -> str:
+    """All of results.md but its title."""
+    return page.read_text().partition("\n\n")[2].rstrip()
+
+
+def blocks(result: dict) -> dict[tuple[str, str], str]:
+    """(page, name of its marks) -> Markdown."""
+    table = Cells(result["cells"])
+    card = "docs/ngpt-{}.md".format
+    made = {
+        ("docs/RESULTS.md", "groups"): by_group(table),
+        ("docs/RESULTS.md", "eye"): eye(table),
+        ("docs/RESULTS.md", "worth"): worth_by_group(result["worth"][0]),
+        ("docs/RESULTS.md", "worth by scene"): worth_by_scene(result["worth"][1]),
+        ("README.md", "errors"): errors_of_readme(table),
+        ("README.md", "cells"): cells_of_readme(table),
+        ("README.md", "worth"): worth_by_group(result["worth"][0], ("all", "rooms, watched")),
+        ("docs/methods.md", "errors"): errors_by_method(table),
+        ("docs/evaluation.md", "over primal"): over_primal(table),
+        (card("combine"), "over primal"): over_primal(table),
+        (card("combine"), "losses"): losses(table, "ngpt-combine"),
+        (card("primal"), "losses"): losses(table, "ngpt-primal"),
+    }
+    for name in ("fast", "combine", "primal"):
+        made[card(name), "results"] = over_oidn(table, f"ngpt-{name}")
+    return made
+
+
+class Cells:
+    """Medians of the evaluation, and means and counts over scenes."""
+
+    def __init__(self, rows: list[dict]):
+        self.rows = {(row["scene"], row["spp"], row["method"]): row for row in rows}
+        self.counts = sorted({spp for _, spp, _ in self.rows})
+
+    def values(self, key: str) -> dict[tuple[str, int, str], float]:
+        return {cell: row[key] for cell, row in self.rows.items()}
+
+    def mean(self, scenes: tuple[str, ...], spp: int, method: str, key: str = "error") -> float:
+        return float(np.exp(np.mean([np.log(self.rows[scene, spp, method][key]) for scene in scenes])))
+
+    def over(self, scenes: tuple[str, ...], spp: int, method: str, rival: str, key: str = "error") -> float:
+        return self.mean(scenes, spp, method, key) / self.mean(scenes, spp, rival, key)
+
+    def below(self, scenes: tuple[str, ...], method: str, rival: str, key: str = "error", spp: int = 0) -> str:
+        """In how many cells, by default at all numbers of samples, one has less than the other: "4 of 12"."""
+        counts = [spp] if spp else self.counts
+        pairs = [(self.rows[s, n, method][key], self.rows[s, n, rival][key]) for s in scenes for n in counts]
+        return f"{sum(a < b for a, b in pairs)} of {len(pairs)}"
+
+
+def by_group(table: Cells) -> str:
+    means, ratios, counts = groups(table.values("error")).split("\n\n")
+    between = "The same means, over those of another method:", "In how many cells one has less error than the other:"
+    return "\n\n".join((means, between[0], ratios, between[1], counts))
+
+
+def over_oidn(table: Cells, method: str) -> str:
+    """Of a model card: errors and FLIP over OIDN's for each group of scenes."""
+    spp = ", ".join(map(str, table.counts))
+    over = "error over OIDN's at", "FLIP over OIDN's at"
+    lines = heading("scenes", "less error than OIDN", f"{over[0]} {spp} spp", "less FLIP", f"{over[1]} {spp} spp")
+    for name, scenes in {**GROUPS, "all": EVERYONE}.items():
+        ratios = [
+            ", ".join(f"{table.over(scenes, n, method, 'oidn', key):.2f}" for n in table.counts)
+            for key in ("error", "FLIP")
+        ]
+        won = [table.below(scenes, method, "oidn", key) for key in ("error", "FLIP")]
+        shown = f"{name}: {', '.join(scenes)}" if name != "all" else f"all {len(scenes)}"
+        lines.append(f"| {shown} | {won[0]} | {ratios[0]} | {won[1]} | {ratios[1]} |")
+    return "\n".join(lines)
+
+
+def eye(table: Cells) -> str:
+    """By FLIP: in how many scenes a network has less than OIDN, and the mean ratio."""
+    lines = heading("FLIP, all scenes", *(f"{n} spp" for n in table.counts), "all cells")
+    for method in ("ngpt-combine", "ngpt-primal", "ngpt-fast"):
+        won = [table.below(EVERYONE, method, "oidn", "FLIP", n) for n in (*table.counts, 0)]
+        ratios = [f", {table.over(EVERYONE, n, method, 'oidn', 'FLIP'):.2f}" for n in table.counts]
+        cells = [f"{count}{ratio}" for count, ratio in zip(won, [*ratios, ""], strict=True)]
+        lines.append(f"| `{method}` less than `oidn`, and mean over its | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def over_primal(table: Cells) -> str:
+    lines = heading("error of `ngpt-combine` over that of `ngpt-primal`", *(f"{n} spp" for n in table.counts))
+    for name, scenes in {**GROUPS, "all": EVERYONE}.items():
+        ratios = [f"{table.over(scenes, n, 'ngpt-combine', 'ngpt-primal'):.2f}" for n in table.counts]
+        lines.append(f"| {name} ({len(scenes)}) | {' | '.join(ratios)} |")
+    return "\n".join(lines)
+
+
+def losses(table: Cells, method: str) -> str:
+    """The scenes in which it has more than ``LOSS`` times OIDN's error somewhere, the worst first."""
+    lines = heading("scene", *(f"{n} spp" for n in table.counts))
+    found = {scene: [table.over((scene,), n, method, "oidn") for n in table.counts] for scene in EVERYONE}
+    for scene, ratios in sorted(found.items(), key=lambda item: -max(item[1])):
+        if max(ratios) > LOSS:
+            lines.append(f"| {scene} | {' | '.join(f'{ratio:.2f}' for ratio in ratios)} |")
+    return "\n".join(lines)
+
+
+def errors_by_method(table: Cells) -> str:
+    lines = heading("method", "relMSE at 4 spp", *(str(n) for n in table.counts[1:]), "seconds")
+    for method in LISTED:
+        means = [f"{table.mean(EVERYONE, n, method):.4f}" for n in table.counts]
+        seconds = table.mean(EVERYONE, table.counts[0], method, "seconds")
+        lines.append(f"| `{method}` | {' | '.join(means)} | {seconds:.2f} |")
+    return "\n".join(lines)
+
+
+def errors_of_readme(table: Cells) -> str:
+    methods = {"oidn": "OIDN", "ngpt-combine": "`ngpt-combine`", "ngpt-fast": "`ngpt-fast`"}
+    heads = [f"{'classroom, blind: ' if name == 'OIDN' else ''}{name}" for name in methods.values()]
+    heads += [f"{'all 14 scenes: ' if name == 'OIDN' else ''}{name}" for name in methods.values()]
+    lines = heading("spp of gradients", *heads)
+    for n in table.counts:
+        cells = []
+        for scenes in (GROUPS["blind"], EVERYONE):
+            means = [table.mean(scenes, n, method) for method in methods]
+            cells += [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
+        lines.append(f"| {n} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def cells_of_readme(table: Cells) -> str:
+    told = {
+        "ngpt-combine": "uses OIDN and gradients",
+        "ngpt-primal": "uses OIDN, no gradients",
+        "ngpt-fast": "uses gradients, no OIDN",
+    }
+    lines = heading("network", "less error than OIDN: classroom", "three other rooms", "all scenes", "less FLIP")
+    for method, what in told.items():
+        won = [table.below(scenes, method, "oidn") for scenes in (GROUPS["blind"], GROUPS["rooms"], EVERYONE)]
+        won.append(table.below(EVERYONE, method, "oidn", "FLIP"))
+        lines.append(f"| `{method}` ({what}) | {' | '.join(won)} |")
+    return "\n".join(lines)
+
+
+def worth_by_group(rows: list[list[str]], only: tuple[str, ...] = ()) -> str:
+    """W/C of the best pipelines, a line for each group; ``rows`` are those of ``worth_tables``."""
+    place = {name: i for i, name in enumerate(rows[0])}
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in rows[1:]:
+        found.setdefault(row[place["scenes"]], {})[row[place["spp"]]] = row
+    counts = list(next(iter(found.values())))
+    lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
+    for group, by_spp in found.items():
+        if not only or group.rpartition(" (")[0] in only:
+            cells = [by_spp[counts[0]][place["C"]], *(by_spp[n][place["W/C"]] for n in counts)]
+            lines.append(f"| {group} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def worth_by_scene(rows: list[list[str]]) -> str:
+    place = {name: i for i, name in enumerate(rows[0])}
+    found: dict[str, dict[str, list[str]]] = {}
+    for row in rows[1:]:
+        found.setdefault(row[place["scene"]], {})[row[place["spp"]]] = row
+    counts = list(next(iter(found.values())))
+    lines = heading("scene", "C", *(f"W / C at {n} spp" for n in counts))
+    for scene, by_spp in found.items():
+        cells = [by_spp[counts[0]][place["C"]], *(by_spp[n][place["W/C"]] if n in by_spp else "" for n in counts)]
+        lines.append(f"| {scene} | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    main()
