@@ -48,3 +48,8 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)
+    import drjit as dr
+
+    # Where there is one core, Dr.Jit has one thread, and some scene files then load for ever (Mitsuba 3.9.1).
+    if dr.thread_count() < 2:
+        dr.set_thread_count(2)
