@@ -14,6 +14,7 @@ from ngpt.errors import NgptError
 from ngpt.export.builder import IR_VERSION, OPSET
 from ngpt.export.graphs.exposure import STATISTICS
 from ngpt.export.graphs.model import layers, optional, reconstruction, statistics
+from ngpt.export.reach import reach
 from ngpt.network import features
 from ngpt.network.model import Reconstructor
 from ngpt.network.unet import Convolution
@@ -45,6 +46,7 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
+    seen = reach(model)
     return {
         "version": __version__,
         "method": name,
@@ -53,8 +55,8 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
         "gradient": "forward: dx[y, x] = I[y, x + 1] - I[y, x], last column 0; dy alike",
         "normal": "camera space, +x right, +y up, +z toward the viewer",
         "alignment": str(model.alignment),
-        "overlap": str(overlap(model)),
-        "overlap with base": str(overlap(model, given_base=True)),
+        "overlap": str(seen + _base_reach(model)),
+        "overlap with base": str(seen),
         "bytes per pixel": str(bytes_per_pixel(model)),
         "statistics": ", ".join(STATISTICS),
         "precision": precision,
@@ -64,15 +66,9 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     }
 
 
-def overlap(model: Reconstructor, given_base: bool = False) -> int:
-    """Pixels that a tile must see on each side beyond those it is for, a multiple of the alignment.
-
-    What the network sees, and before it what the control variates and the smoothing of their weights do.
-    """
-    reach = model.radius
-    if model.config.base and not given_base:
-        reach += SWEEPS + 2
-    return -(-reach // model.alignment) * model.alignment
+def _base_reach(model: Reconstructor) -> int:
+    """What the control variates, and the smoothing of their weights before them, see; a multiple of the alignment."""
+    return -(-(SWEEPS + 2) // model.alignment) * model.alignment if model.config.base else 0
 
 
 def bytes_per_pixel(model: Reconstructor) -> int:

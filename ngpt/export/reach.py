@@ -1,0 +1,87 @@
+"""How far around a pixel a network has to see, which is what its tiles overlap by.
+
+How far it can see is ``Reconstructor.radius``. Networks with kernels or sweeps at several resolutions can see twice as
+far as makes any difference: what lies at the end of that comes through every convolution, every coarse pixel and every
+sweep, each time with a small weight. Tiles that overlap by all of it take four times the memory. So it is measured, on
+noise that is worse than that of images.
+"""
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ngpt.network import features, padding
+from ngpt.network.model import Reconstructor
+
+# What lies farther away changes an image by less than this of its value: ten times less than tiles may.
+TOLERANCE = 1e-6
+# How many examples are tried, and the side of the middle of each that is compared.
+EXAMPLES, MIDDLE = 3, 64
+# Pixels more than examples need, since images differ; what is so near is not measured.
+BESIDE, NEAR = 24, 48
+
+
+def reach(model: Reconstructor) -> int:
+    """Pixels, a multiple of the alignment: ``radius`` rounded up, or less where more makes no difference.
+
+    Less are those that leave every pixel of all examples within ``TOLERANCE``, and ``BESIDE`` more.
+    """
+    step = model.alignment
+    whole = -(-model.radius // step)
+    if whole * step <= NEAR:
+        return whole * step
+    least = max(_least(model, whole, seed) for seed in range(EXAMPLES))
+    return min(least + -(-BESIDE // step), whole) * step
+
+
+@torch.inference_mode()
+def _least(model: Reconstructor, whole: int, seed: int) -> int:
+    """So many times the alignment is what one example needs."""
+    step = model.alignment
+    middle = -(-MIDDLE // step) * step
+    scaled, _ = features.normalised(_example(model, middle + 2 * whole * step, seed))
+
+    def predicted(around: int) -> Tensor:
+        away = (whole - around) * step
+        window = slice(away, away + middle + 2 * around * step)
+        part = {name: layer[..., window, window] for name, layer in scaled.items()}
+        side = window.stop - window.start
+        pads = padding.pads(side, side, step)
+        prediction = padding.crop(model.predict(padding.pad(features.completed(part, model.config.inputs), pads)), pads)
+        return prediction[..., around * step :, around * step :][..., :middle, :middle]
+
+    expected = predicted(whole)
+    low, high = 0, whole
+    while low < high:
+        tried = (low + high) // 2
+        if torch.abs(predicted(tried) - expected).max() <= TOLERANCE * (1 + expected.abs().max()):
+            high = tried
+        else:
+            low = tried + 1
+    return high
+
+
+def _example(model: Reconstructor, side: int, seed: int) -> dict[str, Tensor]:
+    """Layers (1, C, side, side): rectangles of all brightnesses under noise of which a hundredth is a hundredfold."""
+    rng = np.random.default_rng(seed)
+    image = np.ones((3, side, side))
+    for _ in range(side):
+        (y, x), (height, width) = rng.integers(side, size=2), rng.integers(4, 48, size=2)
+        image[:, y : y + height, x : x + width] = np.exp(rng.normal(0, 2)) * rng.uniform(0.2, 1, (3, 1, 1))
+
+    def noise() -> np.ndarray:
+        return rng.gamma(0.3, 1 / 0.3, image.shape) * np.where(rng.random((1, side, side)) < 0.01, 100, 1)
+
+    layers: dict[str, np.ndarray] = {}
+    for name in model.config.layers:
+        if name in ("dx", "dy"):
+            axis = 2 if name == "dx" else 1
+            end = image.take([-1], axis)
+            layers[name] = np.diff(image, axis=axis, append=end) + rng.normal(0, 0.3, image.shape) * image * noise()
+        elif name.endswith("_se"):
+            layers[name] = image * noise()
+        elif name in features.RADIANCE:
+            layers[name] = image * noise() if name == "primal" else image * rng.gamma(4, 0.25, image.shape)
+        else:
+            layers[name] = rng.random((features.CHANNELS[name], side, side))
+    return {name: torch.from_numpy(layer[None].astype(np.float32)) for name, layer in layers.items()}
