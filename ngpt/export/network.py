@@ -77,11 +77,13 @@ def bytes_per_pixel(model: Reconstructor) -> int:
     The last convolution reads the longest list of tensors there is; it exists as the list, as one tensor, and about
     once more in units that are at work. The channels exist raw, cleaned, scaled, encoded, padded, and as one tensor.
     When these are gone, the head has the prediction, cropped, as weights, and once more. ONNX Runtime's arena, without
-    which a run takes twice as long, gets half as much again and more.
+    which a run takes twice as long, gets half as much again and more: most where sizes are halved and doubled without
+    weights, since more tensors of as many lengths are at work then.
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)
-    return 7 * max(body, 4 * model.config.head.outputs)
+    each = 7 if model.config.pooling == "convolution" else 8
+    return each * max(body, 4 * model.config.head.outputs)
 
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:

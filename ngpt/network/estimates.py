@@ -16,9 +16,9 @@ def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
     counts as noise of the gradients there, which is on the safe side.
 
     Over eight scenes at 4 and 64 spp, `ngpt-combine` has 1.06 and 1.09 times the error that true variances leave it,
-    where ``image`` is OIDN's, and less than OIDN in each of the 16 cells. `ngpt-fast` has 1.42 and 1.24 times, where it
-    is that of `l1`: 0.52 and 0.88 times the error of `l1`. Variances from the curl of the gradients were worse: much of
-    their noise is the gradient of the pixels' noise, which has no curl.
+    where ``image`` is OIDN's, and less than OIDN in each of the 16 cells. `ngpt-fast` has 1.25 and 1.21 times, where
+    it is that of `l1` (eight scenes, not all the same): 0.42 and 0.82 times the error of `l1`. Variances from the curl
+    of the gradients were worse: much of their noise is the gradient of the pixels' noise, which has no curl.
     """
     noise = data.noise
     if noise is None:

@@ -61,7 +61,7 @@ def python():
 @pytest.fixture(scope="module")
 def wide(tmp_path_factory, python):
     """A folder with layers so wide that tiles do not see all of them, and their image."""
-    layers = repeated(23, 348)
+    layers = repeated(23, 440)
     return write_vector(tmp_path_factory.mktemp("wide") / "layers", layers), python(layers)
 
 
@@ -91,7 +91,7 @@ def test_a_host_agrees_with_the_vector(host, tmp_path):
 def test_tiles_of_a_host_agree_with_the_whole(host, wide, tmp_path):
     folder, expected = wide
     # MiB in C++; in Node pixels, no multiple of the alignment: the host must make one of it.
-    result = host(MODEL, folder, tmp_path / "image.pfm", 19)
+    result = host(MODEL, folder, tmp_path / "image.pfm", 26)
     assert result.returncode == 0, result.stderr
     agree(read_pfm(tmp_path / "image.pfm"), expected)
 

@@ -55,7 +55,7 @@ def test_tiles_do_not_show(network, image, tiles, batch):
 
 
 @pytest.mark.parametrize("size", [(1, 1), (7, 900), (1080, 1920), (333, 1001), (4320, 8192)])
-@pytest.mark.parametrize("memory", [120, 300, 2048])
+@pytest.mark.parametrize("memory", [220, 300, 2048])
 def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
     tiles, (rows, columns) = network.plan(*size, memory)
     count = np.zeros(size, np.uint8)
@@ -91,7 +91,7 @@ def test_memory_that_does_not_hold_a_tile_is_refused_with_what_would(network, im
     assert str(least(network)) in str(caught.value) and network.plan(333, 497, least(network))[0]
 
 
-@pytest.mark.parametrize("bound", [pytest.param(150, marks=pytest.mark.slow), 400])
+@pytest.mark.parametrize("bound", [pytest.param(220, marks=pytest.mark.slow), 400])
 def test_memory_stays_within_the_bound(bound):
     """In a process of its own, by the largest size it ever had."""
     code = f"""
