@@ -52,7 +52,8 @@ def test_it_gives_the_pixels_of_denoise(fast, colour, memory):
     layers = example(100, 400)
     for network, method in ((fast, "ngpt-fast"), (colour, "ngpt-colour")):
         expected = reconstruct(stack_of(layers), method).image
-        agree(result(network, those(network, layers), memory), expected)
+        # Kernels of ngpt-colour weigh a bright pixel in the logarithm, which enlarges roundings of its exposure.
+        agree(result(network, those(network, layers), memory), expected, 5e-5 if network is colour else 1e-5)
 
 
 def test_a_rendered_stack(renderer, fast, colour):
@@ -63,7 +64,7 @@ def test_a_rendered_stack(renderer, fast, colour):
     assert stack["direct"].any()
     layers = {name: stack[name] for name in fast.names if name in stack}
     agree(result(fast, layers), reconstruct(stack, "ngpt-fast").image)
-    agree(result(colour, those(colour, layers)), reconstruct(stack, "ngpt-colour").image)
+    agree(result(colour, those(colour, layers)), reconstruct(stack, "ngpt-colour").image, 5e-5)
 
 
 def test_a_network_that_corrects_another_denoiser(library):
@@ -93,7 +94,7 @@ def test_a_network_that_corrects_another_denoiser(library):
     network.close()
 
 
-@pytest.mark.parametrize(("name", "height", "width", "memory"), [("fast", 23, 700, 25), ("colour", 40, 470, 20)])
+@pytest.mark.parametrize(("name", "height", "width", "memory"), [("fast", 23, 700, 30), ("colour", 40, 470, 20)])
 def test_tiles_agree_with_the_whole(request, name, height, width, memory):
     network = request.getfixturevalue(name)
     layers, fractions = those(network, example(height, width)), []
@@ -105,10 +106,10 @@ def test_tiles_agree_with_the_whole(request, name, height, width, memory):
 def test_the_tiles_are_those_of_python(colour):
     from ngpt.network.run_onnx import Network as InPython
 
-    layers = those(colour, example(200, 300))
+    layers = those(colour, example(200, 500))
     fractions = []
-    result(colour, layers, 40, progress=lambda fraction: fractions.append(fraction) or 0)
-    tiles, _ = InPython(COLOUR).plan(200, 300, 40)
+    result(colour, layers, 90, progress=lambda fraction: fractions.append(fraction) or 0)
+    tiles, _ = InPython(COLOUR).plan(200, 500, 90)
     assert len(set(fractions)) == len(tiles) + 1 > 3
 
 
@@ -213,5 +214,5 @@ def test_halves(colour):
 
 def test_the_output_may_lie_where_a_layer_is(fast):
     layers = those(fast, example(23, 700))
-    expected = result(fast, layers, 25)
-    np.testing.assert_array_equal(result(fast, layers, 25, image=layers["primal"]), expected)
+    expected = result(fast, layers, 30)
+    np.testing.assert_array_equal(result(fast, layers, 30, image=layers["primal"]), expected)

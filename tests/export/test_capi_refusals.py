@@ -174,7 +174,7 @@ def test_tiles_need_the_statistics(library, tmp_path):
     shutil.copy(FAST, alone)
     network = Network(library, alone)
     job = Job(network, those(network, example(23, 700)))
-    refused(job.run(25), BAD_NETWORK, job, "ngpt-fast.statistics.onnx: cannot be read.* tiles .*need it")
+    refused(job.run(30), BAD_NETWORK, job, "ngpt-fast.statistics.onnx: cannot be read.* tiles .*need it")
     assert job.run() == OK
     job.free()
     network.close()
@@ -182,8 +182,8 @@ def test_tiles_need_the_statistics(library, tmp_path):
     shutil.copy(COLOUR, tmp_path / "other.onnx")
     shutil.copy(other, tmp_path / "other.statistics.onnx")
     network = Network(library, tmp_path / "other.onnx")
-    job = Job(network, those(network, example(200, 300)))
-    refused(job.run(40), BAD_NETWORK, job, "belongs to another network, it reads dx")
+    job = Job(network, those(network, example(200, 500)))
+    refused(job.run(90), BAD_NETWORK, job, "belongs to another network, it reads dx")
     job.free()
     network.close()
 
@@ -208,9 +208,9 @@ def test_cancelled_after_so_many_tiles(fast, after):
         fractions.append(fraction)
         return len(set(fractions)) > after
 
-    refused(job.run(25, progress), CANCELLED, job, "^cancelled$")
+    refused(job.run(30, progress), CANCELLED, job, "^cancelled$")
     assert fractions == sorted(fractions) and len(set(fractions)) == after + 1
-    assert job.run(25) == OK and (job.image != -7).any()
+    assert job.run(30) == OK and (job.image != -7).any()
     job.free()
 
 

@@ -120,7 +120,7 @@ def test_cpp_and_node(demo, host, kind, method, tile, capsys, request, tmp_path)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("memory", [0, 60])
+@pytest.mark.parametrize("memory", [0, 70])
 @pytest.mark.parametrize("method", ["ngpt-combine", "ngpt-primal"])
 def test_cpp_with_oidn(demo, host, method, memory, capsys, request, tmp_path):
     stack, raw = demo

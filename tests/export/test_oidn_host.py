@@ -38,7 +38,7 @@ def stack():
     return wide, GradientStack.from_arrays(**{name: layer[0].transpose(1, 2, 0) for name, layer in wide.items()})
 
 
-@pytest.mark.parametrize("memory", [0, 25])
+@pytest.mark.parametrize("memory", [0, 40])
 @pytest.mark.parametrize("method", ["ngpt-combine", "ngpt-primal"])
 def test_a_host_with_oidn_gives_the_pixels_of_denoise(host, stack, method, memory, tmp_path):
     layers, held = stack
