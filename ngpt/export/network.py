@@ -82,8 +82,8 @@ def bytes_per_pixel(model: Reconstructor) -> int:
     """
     listed = next(model.network.head.parameters()).shape[1]
     body = 3 * listed + 6 * features.channels(model.config.inputs)
-    each = 7 if model.config.pooling == "convolution" else 8
-    return each * max(body, 4 * model.config.head.outputs)
+    each = 7 if model.config.pooling == "convolution" else 8.5
+    return int(each * max(body, 4 * model.config.head.outputs))
 
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:

@@ -47,7 +47,7 @@ def test_the_vector(fast):
     agree(result(fast, those(fast, layers)), layers["image"])
 
 
-@pytest.mark.parametrize("memory", [0, 110])
+@pytest.mark.parametrize("memory", [0, 115])
 def test_it_gives_the_pixels_of_denoise(fast, colour, memory):
     layers = example(100, 400)
     for network, method in ((fast, "ngpt-fast"), (colour, "ngpt-colour")):

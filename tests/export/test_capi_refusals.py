@@ -124,7 +124,7 @@ def test_what_is_missing(library, fast):
 
 def test_too_little_memory(fast):
     job = Job(fast, those(fast, example(400, 400)))
-    refused(job.run(1), OUT_OF_MEMORY, job, "smallest tile takes 3.. MiB, and 1 MiB")
+    refused(job.run(1), OUT_OF_MEMORY, job, "smallest tile takes 4.. MiB, and 1 MiB")
     job.free()
 
 
