@@ -24,6 +24,7 @@ namespace mitsuba_oidn {
 enum OIDNDeviceType { OIDN_DEVICE_TYPE_CPU = 1 };
 enum OIDNFormat { OIDN_FORMAT_FLOAT3 = 3 };
 enum OIDNError { OIDN_ERROR_NONE = 0 };
+enum OIDNQuality { OIDN_QUALITY_BALANCED = 5 };
 typedef struct OIDNDeviceImpl *OIDNDevice;
 typedef struct OIDNFilterImpl *OIDNFilter;
 OIDNDevice oidnNewDevice(OIDNDeviceType type);
@@ -34,6 +35,7 @@ OIDNFilter oidnNewFilter(OIDNDevice device, const char *type);
 void oidnSetSharedFilterImage(OIDNFilter filter, const char *name, void *data, OIDNFormat format, size_t width,
                               size_t height, size_t byteOffset, size_t pixelByteStride, size_t rowByteStride);
 void oidnSetFilterBool(OIDNFilter filter, const char *name, bool value);
+void oidnSetFilterInt(OIDNFilter filter, const char *name, int value);
 void oidnCommitFilter(OIDNFilter filter);
 void oidnExecuteFilter(OIDNFilter filter);
 void oidnReleaseFilter(OIDNFilter filter);

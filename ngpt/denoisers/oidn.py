@@ -35,27 +35,34 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
 
     if quality not in QUALITIES:
         raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(QUALITIES)}")
-    level = getattr(mitsuba_oidn.Quality, QUALITIES[quality])
     features = {}
     if auxiliary == "prefiltered":
-        features = prefiltered(data.features)
+        features = prefiltered(data.features, "high")
     elif auxiliary != "none":
         features = _in_range(data.features)
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
-    options = {"hdr": True, "clean_aux": clean, "quality": level}
+    options = {"hdr": True, "clean_aux": clean, "quality": _level(quality)}
     # A copy: the result is a view of a buffer that OIDN owns.
     return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
 
 
-def prefiltered(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them; takes longer than the image itself.
+def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
+    """Albedo and normal (H, W, 3) denoised by OIDN's own models for them.
 
-    Whether they are noisy is not asked: no cheap answer was right (docs/lab/LOG.md). Who knows says "clean".
+    With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
+    denoised with their help are as good (docs/lab/LOG.md). Whether features are noisy is not asked: no cheap answer was
+    right. Who knows says "clean".
     """
     require_oidn()
-    return {name: _prefiltered(name, layer) for name, layer in _in_range(features).items()}
+    return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
+
+
+def _level(quality: str) -> Any:
+    import mitsuba_oidn
+
+    return getattr(mitsuba_oidn.Quality, QUALITIES[quality])
 
 
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -65,17 +72,18 @@ def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     return layers | {"albedo": np.clip(layers["albedo"], 0, 1)}
 
 
-def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:
+def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
     """A feature denoised by OIDN's own model for it."""
     if not layer.any():
         return layer
     result = np.zeros_like(layer)
     device, held = _filters()
-    key = (name, layer.shape)
+    key = (name, layer.shape, quality)
     if key not in held:
         if len(held) > 8:
             held.clear()
         held[key] = device.new_filter("RT")
+        held[key].quality = _level(quality)
     held[key].set_image(name, layer)
     held[key].set_image("output", result)
     held[key].execute()
@@ -84,7 +92,7 @@ def _prefiltered(name: str, layer: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _filters() -> tuple[Any, dict]:
-    """The device, and its filters by feature and size: to make one takes longer than to run it."""
+    """The device, and its filters by feature, size and quality: to make one takes longer than to run it."""
     import mitsuba_oidn
 
     # On the CPU arrays are used where they lie; results would have to be copied from elsewhere.

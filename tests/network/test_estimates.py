@@ -88,7 +88,7 @@ def test_training_never_reads_estimates():
 def test_features_are_filtered_once_for_a_frame(absent, monkeypatch):
     calls = []
     real = inputs.prefiltered
-    monkeypatch.setattr(inputs, "prefiltered", lambda features: calls.append(1) or real(features))
+    monkeypatch.setattr(inputs, "prefiltered", lambda *given: calls.append(1) or real(*given))
     for name in ("ngpt-combine", "ngpt-primal") if not absent else ("ngpt-combine",):
         calls.clear()
         ngpt.denoise(without(full_stack(24, 28), *absent), name)
