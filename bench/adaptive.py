@@ -37,11 +37,11 @@ from scipy.ndimage import gaussian_filter
 
 from bench.common import metadata, save, summary
 from bench.pipelines import Kept
+from ngpt.api.uncertainty import SPREAD
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import EPSILON, relative_squared_error, relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
-from ngpt.uncertainty import SPREAD
 
 # method -> the sampler of its stacks
 SAMPLER = {

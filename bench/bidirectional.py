@@ -35,7 +35,7 @@ from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
 RESULT = Path("bench/results/bidirectional.json")
-PAGE = Path("docs/bidirectional.md")
+PAGE = Path("docs/samplers/bidirectional.md")
 MARKS = "<!-- python -m bench.bidirectional -->", "<!-- ends here -->"
 # sampler -> options of its renders, and what its stacks are given to; "primal" is the image as it is
 PIPELINES: dict[str, tuple[dict, tuple[str, ...]]] = {
@@ -95,7 +95,7 @@ def measure_all(args: argparse.Namespace) -> None:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """Sampler -> seconds per sample, samples and time; column -> error; and the reference."""
-    from data_gen.costs import measure
+    from data_gen.choosing.costs import measure
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene, set_film_size

@@ -16,7 +16,7 @@ from PIL import Image
 import ngpt
 from bench.sequences import SPEEDS, sideways
 from ngpt.report.display import auto_exposure, to_srgb8
-from ngpt.temporal import Temporal
+from ngpt.sequence.history import Temporal
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""Errors of what denoises any image, with features and of colour alone: the tables of docs/ngpt-colour.md.
+"""Errors of what denoises any image, with features and of colour alone: the tables of docs/methods/ngpt-colour.md.
 
     python -m bench.colour --cache /tmp/stacks
 

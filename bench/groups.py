@@ -1,4 +1,4 @@
-"""The first tables of docs/RESULTS.md: errors at equal time, by what the networks knew of the scenes.
+"""The first tables of docs/lab/RESULTS.md: errors at equal time, by what the networks knew of the scenes.
 
     python -m bench.groups
 
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-# What the shipped networks knew of each scene. docs/training.md and the model cards say how.
+# What the shipped networks knew of each scene. docs/train/training.md and the model cards say how.
 GROUPS = {
     "blind": ("classroom",),
     "rooms": ("living-room", "dining-room", "bedroom"),

@@ -1,4 +1,4 @@
-"""KPCN beside denoisers that need no split light, on the same stacks: the table of docs/kpcn.md.
+"""KPCN beside denoisers that need no split light, on the same stacks: the table of docs/methods/kpcn.md.
 
     python -m bench.kpcn --cache DIR --networks kpcn-small=runs/kpcn-small/weights.safetensors --scenes glossy SCENE.xml
 

@@ -1,5 +1,5 @@
-"""What `auto` takes of the layers of a stack, and the error it leaves: the tables of docs/RESULTS.md ("By the layers of
-a stack") and docs/from-your-renderer.md ("What auto takes").
+"""What `auto` takes of the layers of a stack, and the error it leaves: the tables of docs/lab/RESULTS.md ("By the
+layers of a stack") and docs/use/from-your-renderer.md ("What auto takes").
 
     python -m bench.layers --cache /tmp/stacks --scenes diffuse glossy environment lens SCENE.xml ...
 

@@ -1,4 +1,4 @@
-"""What gradients cost and gain in scenes with media: the first table of docs/media.md.
+"""What gradients cost and gain in scenes with media: the first table of docs/samplers/media.md.
 
     python -m bench.media --scenes haze smoke cloud SCENE.xml ... [-o bench/results/media.json]
 

@@ -1,4 +1,5 @@
-"""Error of every reconstruction method by scene and samples per pixel: the table and pictures of docs/classical.md.
+"""Error of every reconstruction method by scene and samples per pixel: the table and pictures of
+docs/methods/classical.md.
 
     python -m bench.methods --scenes diffuse glossy environment lens SCENE.xml ... --cache /tmp/stacks
 

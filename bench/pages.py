@@ -4,8 +4,8 @@
     python -m bench.pages out/eval
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
-docs/RESULTS.md, docs/evaluation.md, docs/methods.md and the model cards. Without a folder it writes them anew from
-that file, all but the list of every cell.
+docs/lab/RESULTS.md, docs/use/evaluation.md, docs/methods/methods.md and the model cards. Without a folder it writes
+them anew from that file, all but the list of every cell.
 """
 
 import argparse
@@ -39,7 +39,7 @@ def main() -> None:
     args = parser.parse_args()
     if args.folder:
         save(RESULT, kept(json.loads((args.folder / "results.json").read_text())))
-        write_page(ROOT / "docs" / "RESULTS.md", every_cell(args.folder / "results.md"), marks("every cell"))
+        write_page(ROOT / "docs" / "lab" / "RESULTS.md", every_cell(args.folder / "results.md"), marks("every cell"))
     for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
         write_page(ROOT / page, text, marks(name))
 
@@ -77,17 +77,17 @@ def every_cell(page: Path) -> str:
 def blocks(result: dict) -> dict[tuple[str, str], str]:
     """(page, name of its marks) -> Markdown."""
     table = Cells(result["cells"])
-    card = "docs/ngpt-{}.md".format
+    card = "docs/methods/ngpt-{}.md".format
     made = {
-        ("docs/RESULTS.md", "groups"): by_group(table),
-        ("docs/RESULTS.md", "eye"): eye(table),
-        ("docs/RESULTS.md", "worth"): worth_by_group(result["worth"][0]),
-        ("docs/RESULTS.md", "worth by scene"): worth_by_scene(result["worth"][1]),
+        ("docs/lab/RESULTS.md", "groups"): by_group(table),
+        ("docs/lab/RESULTS.md", "eye"): eye(table),
+        ("docs/lab/RESULTS.md", "worth"): worth_by_group(result["worth"][0]),
+        ("docs/lab/RESULTS.md", "worth by scene"): worth_by_scene(result["worth"][1]),
         ("README.md", "errors"): errors_of_readme(table),
         ("README.md", "cells"): cells_of_readme(table),
         ("README.md", "worth"): worth_by_group(result["worth"][0], ("all", "rooms, watched")),
-        ("docs/methods.md", "errors"): errors_by_method(table),
-        ("docs/evaluation.md", "over primal"): over_primal(table),
+        ("docs/methods/methods.md", "errors"): errors_by_method(table),
+        ("docs/use/evaluation.md", "over primal"): over_primal(table),
         (card("combine"), "over primal"): over_primal(table),
         (card("combine"), "losses"): losses(table, "ngpt-combine"),
         (card("primal"), "losses"): losses(table, "ngpt-primal"),

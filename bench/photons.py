@@ -79,7 +79,7 @@ SHOWN = (
 TITLES = {"primal": "path", "l1": "l1", "wcv": "wcv", "oidn": "OIDN"}
 SETUP = ("size", "seconds", "seeds", "radius", "photons")
 REFERENCE = {"radius": 1.0, "photons": 16}
-PAGE = Path("docs/photons.md")
+PAGE = Path("docs/samplers/photons.md")
 MARKS = "<!-- python -m bench.photons -->", "<!-- ends here -->"
 TILE = 192
 

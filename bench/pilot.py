@@ -7,7 +7,7 @@ Time is processor time of all threads together, so that other work on the machin
 
     trial     seconds of each sampler's trial in the pilot, kernels recorded and compiled
     pilot     seconds to the error that the scene's own sampler has in the end, over the least, as `--sampler auto`
-              estimates them (data_gen/pilot.py)
+              estimates them (data_gen/choosing/pilot.py)
     relMSE    of renders of as many samples as --seconds buy, reconstructed as the pilot does, trimmed, the geometric
               mean over --seeds; kernels are recorded before
     loss      that of the sampler that the pilot chooses, over the least
@@ -58,11 +58,11 @@ def main() -> None:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """The choices, their losses, and errors and times by sampler."""
-    from data_gen.pilot import best_of, seen, simple, times_to_the_end
+    from data_gen.choosing.pilot import best_of, seen, simple, times_to_the_end
+    from data_gen.choosing.trials import candidates, try_out
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
-    from data_gen.trials import candidates, try_out
 
     small = load_scene(path, tuple(args.pilot_size))
     usual = candidates(small, biased=True)

@@ -10,10 +10,10 @@ halves of a reference) are those of each method on a few samples, on one part an
 shared out. Seconds of the methods are measured in the same turns. Stacks are kept in --cache, so that a benchmark that
 was broken off goes on, and rules can be judged anew without a render.
 
-The pilot (data_gen/pipelines.py) is not told any of it. Times are those of 16, 64 and 256 samples of the first sampler
-and of the slowest method, so that every pipeline fits into each of them. Of the samples that a pipeline has time for,
-the error is on the straight line of logarithms between the measured ones. Regret is the error of what the pilot chose
-over the least of all.
+The pilot (data_gen/choosing/pipelines.py) is not told any of it. Times are those of 16, 64 and 256 samples of the first
+sampler and of the slowest method, so that every pipeline fits into each of them. Of the samples that a pipeline has
+time for, the error is on the straight line of logarithms between the measured ones. Regret is the error of what the
+pilot chose over the least of all.
 
 Nothing may be chosen by scenes ``--apart``.
 """
@@ -93,12 +93,13 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
-    from data_gen import passes, pipelines
+    from data_gen import passes
     from data_gen.adaptive import LEAST, Adaptive
+    from data_gen.choosing import pipelines
+    from data_gen.choosing.trials import candidates, noise_of
     from data_gen.render import render_stack
     from data_gen.samplers import SAMPLERS
     from data_gen.scenes.load import load_scene
-    from data_gen.trials import candidates, noise_of
 
     scene = load_scene(path, tuple(args.size))
     kept = Kept(args.cache / "{}-{}x{}".format(scene_name(path), *args.size))
@@ -194,7 +195,7 @@ def rounded(value):
 
 def _trial(kept: Kept, scene, name: str, limit: float):
     """The pilot's stacks of a sampler, rendered or kept; None where it cannot render the scene, or not in the time."""
-    from data_gen.trials import Trial, try_out
+    from data_gen.choosing.trials import Trial, try_out
 
     made = []
 
@@ -228,8 +229,8 @@ def true_error(errors: dict[str, float], spp: float) -> float:
 def cells(entry: dict) -> list[dict]:
     """For each time of ``LADDER`` samples of the first sampler: name -> error, the pilot's choice, and the error by the
     sampler that `--sampler auto` chooses over that by the best, both by a simple method."""
-    from data_gen.pilot import best_of, simple
-    from data_gen.pipelines import Pipeline, choose
+    from data_gen.choosing.pilot import best_of, simple
+    from data_gen.choosing.pipelines import Pipeline, choose
 
     pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])

@@ -27,7 +27,7 @@ import numpy as np
 import ngpt
 from bench.common import metadata, save
 from bench.sequences import MOVES, SPEEDS, measured, mover, sideways
-from ngpt.temporal import Temporal
+from ngpt.sequence.history import Temporal
 
 RIVALS = {
     "restir": {"sampler": "restir"},

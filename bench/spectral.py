@@ -1,10 +1,11 @@
-"""Spectra with and without steps between wavelengths, at equal time: docs/spectral.md.
+"""Spectra with and without steps between wavelengths, at equal time: docs/samplers/spectral.md.
 
     python -m bench.spectral [--samples 2 8 32] [--picture docs/images/prism.png]
 
-The scene is a prism and a ball of flint glass before stripes (data_gen/spectral/scene.py). Time is processor time,
-kernels compiled: the render without steps has as many samples as take the time of the one with them. Errors are relMSE,
-trimmed, of the RGB image, and of the light of single bins, against two halves of --reference-samples.
+The scene is a prism and a ball of flint glass before stripes (data_gen/samplers/studies/spectral/scene.py). Time is
+processor time, kernels compiled: the render without steps has as many samples as take the time of the one with them.
+Errors are relMSE, trimmed, of the RGB image, and of the light of single bins, against two halves of
+--reference-samples.
 """
 
 import argparse
@@ -39,11 +40,11 @@ def main() -> None:
 
     import mitsuba as mi
 
+    from data_gen.samplers.studies.spectral.glass import register
+    from data_gen.samplers.studies.spectral.render import Spectra, render_spectra
+    from data_gen.samplers.studies.spectral.scene import prism
+    from data_gen.samplers.studies.spectral.solve import reconstructed, to_rgb
     from data_gen.scenes.load import set_film_size
-    from data_gen.spectral.glass import register
-    from data_gen.spectral.render import Spectra, render_spectra
-    from data_gen.spectral.scene import prism
-    from data_gen.spectral.solve import reconstructed, to_rgb
 
     register()
     scene = mi.load_dict(prism())

@@ -16,11 +16,11 @@ from pathlib import Path
 import numpy as np
 
 from bench.common import metadata, save
+from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, write
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
-from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
 
 INTERVALS = {"68": (1.0, 0.683), "95": (1.96, 0.95)}
 

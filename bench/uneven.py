@@ -4,7 +4,7 @@
     python -m bench.uneven --cache out/adaptive EVEN.safetensors UNEVEN.safetensors ...
 
 For each file of weights, and each scene in the cache: trimmed relMSE of its image of even samples and of adaptive ones,
-and their ratio; geometric means over scenes. docs/adaptive.md says how the files were trained.
+and their ratio; geometric means over scenes. docs/use/adaptive.md says how the files were trained.
 """
 
 import argparse

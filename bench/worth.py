@@ -1,6 +1,6 @@
 """W, C and W/C of each scene, sampler and method with gradients, of what ``python -m bench.pipelines`` has measured.
 
-    python -m bench.worth [--file bench/results/pipelines.json]          # prints the tables of docs/worth.md
+    python -m bench.worth [--file bench/results/pipelines.json]          # prints the tables of docs/lab/worth.md
 
 W and C are those of ngpt/evaluation/worth.py: by how many times more samples the best pipeline without gradients needs
 for the same error, and what a sample costs over one of it. Pipelines without gradients are all samplers that have none,

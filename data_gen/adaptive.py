@@ -1,16 +1,16 @@
 """Samples where they pay: after a few samples everywhere, more of them where the result's error is large.
 
 The error is that of the image by the method that will run on the stack, not that of the stack: the standard errors of
-``ngpt.uncertainty``. A render goes on in steps, each of which may double the samples. Before each step the method runs
-twice on what there is. With error q of a pixel, relative to its light, and n samples of it, s = q sqrt(n) is what one
-sample would leave. The mean of s² / n for a given sum of n is least where n is proportional to s: the step brings the
-counts as near to that as it can. All pixels get at least a quarter of their even share, lest light that the first
+``ngpt.api.uncertainty``. A render goes on in steps, each of which may double the samples. Before each step the method
+runs twice on what there is. With error q of a pixel, relative to its light, and n samples of it, s = q sqrt(n) is what
+one sample would leave. The mean of s² / n for a given sum of n is least where n is proportional to s: the step brings
+the counts as near to that as it can. All pixels get at least a quarter of their even share, lest light that the first
 samples missed were never found.
 
 The samples that a choice was made by stay in the means. So a pixel whose first samples were too dark by chance might
 get fewer of those that would show it, and be too dark in the mean. Two things keep that small: errors are means over
 about 9x9 pixels, in which a pixel's own samples are few; and they are relative to the light there, so that noise which
-darkens lowers both. docs/adaptive.md has what was measured.
+darkens lowers both. docs/use/adaptive.md has what was measured.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, SamplePass
 from data_gen.samplers import SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
+from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
-from ngpt.uncertainty import FACTOR, FACTORS, change, noisier
 
 # Least number of samples per pixel in the mean: that of the first step, everywhere, and as many to be shared out
 LEAST = 2 * BLOCK

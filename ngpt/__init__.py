@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING
 from ngpt.version import __version__ as __version__
 
 if TYPE_CHECKING:
-    from ngpt.denoiser import Denoiser, denoise
+    from ngpt.api.arrays import Denoiser, denoise
+    from ngpt.api.uncertainty import reconstruct_with_error
     from ngpt.errors import NgptError
     from ngpt.io.exr import read, read_image, write
     from ngpt.merging import merge
     from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.stack import GradientStack
-    from ngpt.uncertainty import reconstruct_with_error
 
 __all__ = [
     "METHODS",
@@ -42,9 +42,9 @@ __all__ = [
 # Imported when they are asked for. So the commands are at work, and handle what interrupts them, before NumPy and SciPy
 # have been loaded, which comes with this package otherwise.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
-_HOMES |= dict.fromkeys(("Denoiser", "denoise"), "denoiser")
+_HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
-_HOMES["reconstruct_with_error"] = "uncertainty"
+_HOMES["reconstruct_with_error"] = "api.uncertainty"
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 

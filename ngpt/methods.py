@@ -56,7 +56,7 @@ class Result:
     ``weights``    the file of the network that ran, None for methods without one
     ``options``    those that are not the method's defaults, weights left out
     ``estimated``  layers that the stack lacks and the method estimated
-    ``error``      (H, W, 3) float32, the standard error of the image where it was asked for (``ngpt.uncertainty``)
+    ``error``      (H, W, 3) float32, the standard error of the image where it was asked for (``ngpt.api.uncertainty``)
     """
 
     image: np.ndarray
@@ -177,7 +177,7 @@ METHODS |= {
 }
 
 
-# The best first, by the errors that docs/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
+# The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
 # OIDN's mean error it leaves 0.79 to 0.94 times in rooms, but up to 1.16 times elsewhere, and single scenes more.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor", "ngpt-colour")
 
@@ -188,9 +188,9 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
     ``layers``  a stack, or names of its layers
     ``usable``  whether a method can be used, by its name; None asks this machine
 
-    The errors behind ``ORDER`` are in docs/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is better
-    than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are better
-    on diffuse scenes. The identity is left for a machine without ONNX Runtime.
+    The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is
+    better than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are
+    better on diffuse scenes. The identity is left for a machine without ONNX Runtime.
     """
     usable = usable or (lambda name: not METHODS[name].missing())
     for name in ORDER:

@@ -82,7 +82,7 @@ def test_pictures_are_small_and_used():
 def test_the_first_tables_of_the_results_are_those_of_the_cells():
     from bench.groups import CELLS, cells, tables
 
-    text = (ROOT / "docs" / "RESULTS.md").read_text()
+    text = (ROOT / "docs" / "lab" / "RESULTS.md").read_text()
     for table in tables(cells(CELLS)).split("\n\n"):
         assert table in text
 
@@ -101,7 +101,7 @@ def test_the_tables_of_bidirectional_samplers_are_those_of_their_file():
     from bench.bidirectional import MARKS, table
 
     result = json.loads((ROOT / "bench" / "results" / "bidirectional.json").read_text())
-    text = (ROOT / "docs" / "bidirectional.md").read_text()
+    text = (ROOT / "docs" / "samplers" / "bidirectional.md").read_text()
     assert f"{MARKS[0]}\n\n{table(result)}\n\n{MARKS[1]}" in text
 
 
@@ -110,11 +110,11 @@ def test_the_table_of_kpcn_is_that_of_its_file():
     from bench.kpcn import table
 
     result = json.loads((ROOT / "bench" / "results" / "kpcn.json").read_text())
-    assert table(result) in (ROOT / "docs" / "kpcn.md").read_text()
+    assert table(result) in (ROOT / "docs" / "methods" / "kpcn.md").read_text()
 
 
 def test_the_numbers_of_the_readme_are_in_the_results():
-    readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/RESULTS.md"))
+    readme, results = ((ROOT / page).read_text() for page in ("README.md", "docs/lab/RESULTS.md"))
     hero = json.loads((ROOT / "bench" / "results" / "hero.json").read_text())["results"]
     measured = {f"{value:.4f}" for row in hero.values() for value in row.values() if isinstance(value, float)}
     for number in re.findall(r"\b0\.\d{4}\b", readme):
@@ -128,7 +128,7 @@ def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):
     import ngpt
 
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "from-your-renderer.md").read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "use" / "from-your-renderer.md").read_text(), re.S)
     made: dict = {}
     exec(blocks[0], made)
     stack = ngpt.read("stack.exr")
@@ -137,9 +137,9 @@ def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):
 
 
 def test_the_examples_of_python_run(tmp_path, monkeypatch):
-    """Arrays and files; that of Mitsuba is in tests/test_denoiser.py."""
+    """Arrays and files; that of Mitsuba is in tests/api/test_denoiser.py."""
     monkeypatch.chdir(tmp_path)
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "python.md").read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "use" / "python.md").read_text(), re.S)
     made: dict = {}
     exec(blocks[0], made)
     assert made["clean"].shape == made["noisy"].shape
@@ -151,7 +151,7 @@ def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
     import ngpt
     from ngpt.methods import METHODS, Method
 
-    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "add-a-method.md").read_text(), re.S)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "methods" / "add-a-method.md").read_text(), re.S)
     made: dict = {"Method": Method}
     exec(blocks[0] + blocks[1], made)
     monkeypatch.setitem(METHODS, "median", made["METHODS"]["median"])
@@ -170,7 +170,9 @@ def test_the_example_of_a_sampler_runs(renderer, monkeypatch):
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    module, entry = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "add-a-sampler.md").read_text(), re.S)
+    module, entry = re.findall(
+        r"```python\n(.*?)```", (ROOT / "docs" / "samplers" / "add-a-sampler.md").read_text(), re.S
+    )
     monkeypatch.setitem(sys.modules, "data_gen.samplers.replay", made := ModuleType("data_gen.samplers.replay"))
     exec(module, made.__dict__)
     monkeypatch.setattr(samplers, "SAMPLERS", dict(samplers.SAMPLERS))

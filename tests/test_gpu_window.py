@@ -6,13 +6,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.gpu import __main__ as conductor
-from bench.gpu import parcel
-from bench.gpu.recipe import Clock, Recipe, Run, read_recipe, split
-from bench.gpu.report import gather, markdown
-from bench.gpu.work import Work
 from ngpt.errors import NgptError
 from ngpt.system.writing import write_json
+from scripts.gpu import __main__ as conductor
+from scripts.gpu import parcel
+from scripts.gpu.recipe import Clock, Recipe, Run, read_recipe, split
+from scripts.gpu.report import gather, markdown
+from scripts.gpu.work import Work
 
 ROOT = Path(__file__).parents[1]
 RUNS = (Run("a", "tiny", 0.75, ("run.batch=2",)), Run("b", "tiny", 0.25))
@@ -26,7 +26,7 @@ class Program:
         self.now, self.took, self.arguments, self.log = now, took, arguments, log
         self.seconds, self.running, self.given = 0.0, True, None
         self.status = statuses.get(log.stem, 0)
-        if "bench.gpu.checks" in arguments and not self.status:
+        if "scripts.gpu.checks" in arguments and not self.status:
             name, file = arguments[2], Path(arguments[-1])
             write_json(file, {"check": name, "status": "passed", "detail": {}, "seconds": 1.0})
 
@@ -74,7 +74,7 @@ def test_recipes_are_whole():
 
 
 def test_recipes_that_make_no_sense_are_refused(tmp_path):
-    text = (ROOT / "bench" / "gpu" / "window.toml").read_text()
+    text = (ROOT / "scripts" / "gpu" / "window.toml").read_text()
     for old, new, message in (
         ("share = 0.65", "share = 0.75", "add up to 1.1"),
         ("minutes = 9.0", "minutes = 0", "minutes = 0"),

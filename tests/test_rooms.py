@@ -17,20 +17,22 @@ FLOORS = """
 ngpt.errors ngpt.version
 ngpt.system
 ngpt.report.display ngpt.report.png
-ngpt.arrays ngpt.layers ngpt.testing ngpt.warp ngpt.report.notebook
+ngpt.api.tensors ngpt.layers ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack
 ngpt.repair ngpt.io
 ngpt.merging
 ngpt.classical
-ngpt.denoisers
+ngpt.studies ngpt.denoisers ngpt.sequence.wcv_frames
 ngpt.network
 ngpt.methods
-ngpt.evidence
-ngpt.blending
-ngpt.uncertainty ngpt.lightgroups ngpt.temporal ngpt.shots
-ngpt.denoiser
+ngpt.sequence.evidence
+ngpt.sequence.network
+ngpt.api.uncertainty ngpt.api.lightgroups ngpt.sequence.history ngpt.sequence.windows
+ngpt.api.arrays
+ngpt.sequence ngpt.api
 ngpt.report
 ngpt.measure
+ngpt.sequence.flicker
 ngpt.training
 ngpt.export
 data_gen data_gen.llvm data_gen.scenes.grids
@@ -39,19 +41,21 @@ data_gen.film data_gen.paths
 data_gen.passes
 data_gen.uneven
 data_gen.samplers
-data_gen.adaptive data_gen.spectral
+data_gen.adaptive
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames
-data_gen.costs data_gen.trials
-data_gen.pipelines
-data_gen.pilot
+data_gen.choosing.costs data_gen.choosing.trials
+data_gen.choosing.pipelines
+data_gen.choosing.pilot
+data_gen.choosing
 data_gen.dataset
 ngpt.evaluation
 ngpt.cli
 ngpt
 ngpt.__main__ data_gen.__main__ train eval export
-bench scripts
+bench
+scripts
 """
 
 # The only rooms of ngpt that render: commands, and what compares renderers. All others know nothing of Mitsuba.
@@ -60,7 +64,7 @@ RENDERING = ("ngpt.cli", "ngpt.evaluation")
 
 def modules(root: Path) -> dict[str, Path]:
     """Name -> file of all code but the tests'."""
-    folders = [root / name for name in ("ngpt", "data_gen", "export", "bench")]
+    folders = [root / name for name in ("ngpt", "data_gen", "export", "bench", "scripts")]
     files = [file for folder in folders for file in folder.rglob("*.py") if "node_modules" not in file.parts]
     files += [root / "train.py", root / "eval.py"]
     names = {".".join(file.relative_to(root).with_suffix("").parts).removesuffix(".__init__"): file for file in files}

@@ -1,7 +1,7 @@
 """Renderer x layers x OIDN: what `auto` takes of files with each renderer's names, and the error that it leaves.
 
 Two built-in scenes, 16 samples per pixel, 96x64 pixels; errors are geometric means of the trimmed relMSE over both. The
-same at 192x108 pixels over four scenes is in docs/from-your-renderer.md, by `python -m bench.layers`.
+same at 192x108 pixels over four scenes is in docs/use/from-your-renderer.md, by `python -m bench.layers`.
 """
 
 import re
@@ -14,7 +14,7 @@ from ngpt.denoisers import oidn
 from ngpt.measure.gains import NEED_OIDN
 from ngpt.methods import METHODS, choose
 
-PAGE = Path(__file__).parents[1] / "docs" / "from-your-renderer.md"
+PAGE = Path(__file__).parents[1] / "docs" / "use" / "from-your-renderer.md"
 
 
 @pytest.fixture(scope="module")

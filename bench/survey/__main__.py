@@ -1,4 +1,4 @@
-"""Error of every row of section 5 of the survey, by scene and samples per pixel: docs/reconstructions.md.
+"""Error of every row of section 5 of the survey, by scene and samples per pixel: docs/methods/reconstructions.md.
 
     python -m bench.survey --scenes diffuse SCENE.xml ... --cache out/survey [--references FOLDER]
 

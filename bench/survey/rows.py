@@ -6,15 +6,15 @@ from unittest.mock import patch
 
 import numpy as np
 
-from bench.survey.collaborative import collaborative
-from bench.survey.norms import irls, wl1
-from bench.survey.patches import patches
-from bench.survey.resampling import resampled
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import nfor
 from ngpt.methods import METHODS, Method, reconstruct
 from ngpt.repair import Repaired
 from ngpt.stack import GradientStack
+from ngpt.studies.bcd import collaborative
+from ngpt.studies.norms import irls, wl1
+from ngpt.studies.patches import patches
+from ngpt.studies.resampling import resampled
 
 _GRADIENTS = ("primal", "dx", "dy")
 _VARIANCES = (*_GRADIENTS, "primal_var", "dx_var", "dy_var")

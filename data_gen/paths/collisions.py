@@ -15,7 +15,7 @@ optical depth m of the majorant, which is the same number of units whatever grid
 
 Homogeneous media have a clock of their own: their one exponential number of a segment, and no list.
 
-[Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/media.md]
+[Miller et al. 2019, "A null-scattering path integral formulation of light transport"; docs/samplers/media.md]
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ homogeneous media it goes. The density of a vertex in a medium is T_c σ_c, and 
 copy that reconnects to the vertex has T_c' for T_c, and the same σ_c. One that replays the number has r = 1. For media
 whose density varies see ``data_gen.paths.collisions``.
 
-[Hua et al. 2019, section 7.1; docs/media.md]
+[Hua et al. 2019, section 7.1; docs/samplers/media.md]
 """
 
 from __future__ import annotations

@@ -32,7 +32,7 @@ class Materials:
     Materials with no parameter for their roughness (``diffuse``, ``measured``) count as rough.
 
     Shapes that are ``passed`` have no vertices, and do not count. With ``media`` in the scene rough glass is not
-    connectable, however rough: light that leaves a medium by it is found by few paths, see docs/media.md.
+    connectable, however rough: light that leaves a medium by it is found by few paths, see docs/samplers/media.md.
 
     ``unconnectable`` lists the materials, as "shape.material (class)", at which a vertex is not connectable or an event
     may be other than smooth; ``all_connectable`` is True where there are none.

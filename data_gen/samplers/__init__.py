@@ -42,7 +42,8 @@ class Sampler:
     ``options``     the options that ``make`` takes: name -> what it does
     ``gradients``   whether it renders dx and dy
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
-    ``tried``       whether the pilot of "auto" tries it too, where it can render the scene (``data_gen.pilot``)
+    ``tried``       whether the pilot of "auto" tries it too, where it can render the scene
+                    (``data_gen.choosing.pilot``)
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
     ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
@@ -276,26 +277,26 @@ def _notes_on_gmlt(facts: Facts) -> list[str]:
     f"data_gen.samplers.{name}"
     for name in (
         "gpt.integrator",
-        "gpt_basic",
-        "gpt_simple",
-        "gpt_tiles",
+        "teaching.gpt_basic",
+        "teaching.gpt_simple",
+        "studies.gpt_tiles",
         "bdpt.integrator",
         "gbdpt.integrator",
-        "gmlt.integrator",
-        "photons.ppm",
-        "photons.gpm",
-        "photons.vpm",
-        "photons.gvpm",
-        "photons.bre",
-        "photons.gbre",
-        "photons.beams",
-        "photons.gbeams",
-        "photons.planes",
-        "photons.gplanes",
+        "studies.gmlt.integrator",
+        "photons.surfaces.ppm",
+        "photons.surfaces.gpm",
+        "photons.media.vpm",
+        "photons.media.gvpm",
+        "photons.media.bre",
+        "photons.media.gbre",
+        "photons.media.beams",
+        "photons.media.gbeams",
+        "photons.media.planes",
+        "photons.media.gplanes",
         "vcm.integrator",
         "vcm.gvcm",
         "primal",
-        "split",
+        "studies.split",
     )
 )
 

@@ -6,7 +6,7 @@
  *     ngpt_set_output(job, "image", image, NGPT_FLOAT, 3, 0, 0, 0);
  *     if (ngpt_run(job, width, height, 0, NULL, NULL) != NGPT_OK) puts(ngpt_message(job));
  *
- * What the layers mean, their signs and units: export/CONTRACT.md. A worked example: docs/c-library.md.
+ * What the layers mean, their signs and units: export/CONTRACT.md. A worked example: docs/embed/c-library.md.
  *
  * Threads: any number may use one network at once. A job belongs to one thread at a time.
  * Handles: NULL is allowed for all of them; what a function then returns says that it could do nothing.

@@ -17,8 +17,8 @@ from ngpt.methods import METHODS
 from ngpt.system.console import Console
 
 if TYPE_CHECKING:
-    from data_gen.pilot import Choice
-    from data_gen.pipelines import Pipeline
+    from data_gen.choosing.pilot import Choice
+    from data_gen.choosing.pipelines import Pipeline
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -66,7 +66,7 @@ def by_pilot(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.pipelines import LONG, explore
+    from data_gen.choosing.pipelines import LONG, explore
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
@@ -130,7 +130,7 @@ def by_table(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.pipelines import LONG
+    from data_gen.choosing.pipelines import LONG
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
@@ -172,10 +172,10 @@ def by_table(args: argparse.Namespace, console: Console) -> int:
 def choose_sampler(scene, kinds: set[str], seconds: float) -> Choice:
     """The sampler of the scene for so many ``seconds``, compared with others by a pilot; of those alone that render
     the ``kinds`` of stacks that methods read."""
-    from data_gen.pilot import Choice, best_of, seen
+    from data_gen.choosing.pilot import Choice, best_of, seen
+    from data_gen.choosing.trials import candidates, try_all
     from data_gen.samplers import SAMPLERS, choose
     from data_gen.scenes.facts import scene_facts
-    from data_gen.trials import candidates, try_all
 
     default, reason = choose(scene_facts(scene))
     names = [
@@ -194,7 +194,7 @@ def measured(scene, choice: Choice, args: argparse.Namespace):
     A sampler without gradients renders the other kinds in place of ``primal``; there is nothing to win by gradients
     then, since a pilot has compared its images with theirs.
     """
-    from data_gen.costs import measure
+    from data_gen.choosing.costs import measure
     from data_gen.samplers import SAMPLERS
     from ngpt.evaluation.renders import DEFAULTS
 

@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ngpt import lightgroups
-from ngpt.blending import Network
+from ngpt.api import lightgroups
+from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
     RESULT_SUFFIX,
     add_files,
@@ -33,12 +33,12 @@ from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, reconstruct
 from ngpt.network.identity import Identity, identify
 from ngpt.network.run_onnx import MEMORY
+from ngpt.sequence.history import Temporal
+from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
-from ngpt.temporal import Temporal
-from ngpt.uncertainty import reconstruct_with_error
 from ngpt.version import __version__
 
 # The options of methods that are numbers; they may be "auto" as well.

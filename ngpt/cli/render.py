@@ -126,9 +126,9 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     use_variant(args.variant or DEFAULT_VARIANT)
     from data_gen.adaptive import Adaptive
+    from data_gen.choosing.pilot import choose_by_pilot
+    from data_gen.choosing.pipelines import plan
     from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.pilot import choose_by_pilot
-    from data_gen.pipelines import plan
     from data_gen.render import check_options, render_stack
     from data_gen.scenes.load import load_scene
 

@@ -9,11 +9,11 @@ import numpy as np
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image
-from ngpt.measure.flicker import change_maps, flicker, flicker_maps
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.page import oversize, write_report
+from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.version import __version__

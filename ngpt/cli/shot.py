@@ -8,7 +8,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import compare
-from ngpt.shots import reconstruct_shot
+from ngpt.sequence.windows import reconstruct_shot
 from ngpt.stack import GradientStack
 
 

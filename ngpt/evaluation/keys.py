@@ -14,7 +14,7 @@ _PRESENTATION = ("cli", "evaluation", "export", "report", "system")
 # What the built-in scenes are made of.
 _BUILT_IN = ("scenes/builtin.py", "scenes/grids.py")
 # Of data_gen: files that render nothing. A scene has a key of its own; a procedural one is a scene file by then.
-_NOT_RENDERING = ("__main__.py", "costs.py", "inspect.py", "dataset", *_BUILT_IN, "scenes/procedural")
+_NOT_RENDERING = ("__main__.py", "choosing", "inspect.py", "dataset", *_BUILT_IN, "scenes/procedural")
 
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
 

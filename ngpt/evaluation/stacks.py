@@ -101,7 +101,7 @@ class SceneStacks:
         if new:
             self.say(f"{self.name}: measuring what samples cost")
             scene = self.load()
-            from data_gen.costs import measure
+            from data_gen.choosing.costs import measure
 
             timed = {clock.name: clock} | new
             seconds, _ = measure(scene, {name: r.options for name, r in timed.items()}, spp, repeats)
@@ -138,7 +138,7 @@ class SceneStacks:
             if self.given:
                 raise NgptError(f"{path}: no such stack")
             scene = self.load()
-            from data_gen.costs import timed
+            from data_gen.choosing.costs import timed
 
             self._warm_up(render)
             stack, seconds = timed(scene, render.options, spp, seed)
@@ -170,7 +170,7 @@ class SceneStacks:
     def _warm_up(self, render: Render) -> GradientStack:
         """Has the kernels compiled, and returns the stack of one sample."""
         scene = self.load()
-        from data_gen.costs import warm_up
+        from data_gen.choosing.costs import warm_up
 
         if render.name not in self._warm:
             self._warm[render.name] = warm_up(scene, render.options)

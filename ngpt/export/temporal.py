@@ -1,14 +1,14 @@
-"""The network that blends frames as ONNX: ``inputs`` as of ``ngpt.blending``, (1, C, H, W) of aligned sizes."""
+"""The network that blends frames as ONNX: ``inputs`` as of ``ngpt.sequence.network``, (1, C, H, W) of aligned sizes."""
 
 import json
 from pathlib import Path
 
 import onnx
 
-from ngpt.blending import INPUTS
 from ngpt.errors import NgptError
 from ngpt.export.network import convolutions
 from ngpt.network.weights import fill, read_tensors
+from ngpt.sequence.network import INPUTS
 from ngpt.training.temporal import WIDTHS, network
 from ngpt.version import __version__
 

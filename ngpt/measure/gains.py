@@ -1,6 +1,6 @@
 """What one more layer would buy: errors of what ``auto`` takes, by the layers of a stack and whether OIDN is installed.
 
-The errors are measured (layers.json, by ``python -m bench.layers``; docs/RESULTS.md has them as a table): geometric
+The errors are measured (layers.json, by ``python -m bench.layers``; docs/lab/RESULTS.md has them as a table): geometric
 means of the trimmed relMSE over the four built-in scenes, of stacks of the same samples with fewer or more layers.
 """
 

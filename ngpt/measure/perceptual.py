@@ -75,7 +75,8 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
 
 
 def elpips(image: np.ndarray, reference: np.ndarray, backbone: str = "", weights: str = "") -> float:
-    """E-LPIPS by SqueezeNet, 0 for equal images; ``backbone`` and ``weights`` are files that docs/losses.md explains.
+    """E-LPIPS by SqueezeNet, 0 for equal images; ``backbone`` and ``weights`` are files that docs/train/losses.md
+    explains.
 
     d(x, r) averaged over random transforms [Kettunen et al. 2019, "E-LPIPS"], of sRGB(x / (1 + mean_c x)); the draws
     are the same for all images. Raises NgptError for files that are missing or not what they should be.

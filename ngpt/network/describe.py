@@ -14,7 +14,7 @@ from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
 SUFFIXES = (".onnx", ".safetensors")
-# What the metadata of the network that blends frames have (``ngpt.blending``).
+# What the metadata of the network that blends frames have (``ngpt.sequence.network``).
 FRAMES = "ngpt.temporal inputs"
 
 # What of a training's settings is worth a line, by table.

@@ -26,7 +26,7 @@ class LossSettings:
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
                      weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
-    ``backbone``, ``weights``  files of E-LPIPS (docs/losses.md); "" looks for the backbone in PyTorch's cache
+    ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
     kind: str = "structural"

@@ -1,4 +1,4 @@
-"""The tables of docs/training.md: ``python -m ngpt.training.parameters`` prints them.
+"""The tables of docs/train/training.md: ``python -m ngpt.training.parameters`` prints them.
 
 What a parameter means stands once, in the docstring of its dataclass: ``name``  meaning. What a configuration is for,
 in the first sentence of its file.

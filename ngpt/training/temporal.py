@@ -1,4 +1,4 @@
-"""Training of the network that blends frames (``ngpt.blending``), on shots of training sets.
+"""Training of the network that blends frames (``ngpt.sequence.network``), on shots of training sets.
 
     python -m ngpt.training.temporal DATA... --out temporal.safetensors
 
@@ -29,16 +29,16 @@ import torch
 from safetensors.numpy import load_file, save_file
 from torch import Tensor
 
-from ngpt.blending import BANDS, INPUTS, LARGEST, MOST, Corrections
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.unet import PlainUNet
 from ngpt.network.weights import fill, read_tensors, write_tensors
+from ngpt.sequence.history import Temporal
+from ngpt.sequence.network import BANDS, INPUTS, LARGEST, MOST, Corrections
+from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
-from ngpt.temporal import Temporal
 from ngpt.training.dataset import Dataset
 from ngpt.version import __version__
-from ngpt.warp import warped
 
 WIDTHS = (16, 24, 32)
 FLICKER = 1.0

@@ -5,17 +5,17 @@ import pytest
 from full_stack import full_stack
 from solvers import energy, l1_by_irls, noisy_stack, operator, right_hand_side, solve_sparse
 
-from bench.survey import patches as patches_module
-from bench.survey.collaborative import collaborative
 from bench.survey.graph import Edges, least_squares
-from bench.survey.norms import irls
-from bench.survey.patches import Windows, design, patches
-from bench.survey.resampling import resampled
 from bench.survey.rows import RESAMPLED, ROWS, image_of
 from ngpt.classical.gradients import forward_differences
 from ngpt.classical.leastsquares import Equations
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
+from ngpt.studies import patches as patches_module
+from ngpt.studies.bcd import collaborative
+from ngpt.studies.norms import irls
+from ngpt.studies.patches import Windows, design, patches
+from ngpt.studies.resampling import resampled
 
 every_row = pytest.mark.parametrize("name", ROWS)
 

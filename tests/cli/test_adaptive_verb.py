@@ -43,7 +43,7 @@ def test_refusals(renderer, tmp_path, capsys, options, message):
 
 def test_a_pilot_chooses_for_a_method(renderer, tmp_path, capsys, monkeypatch):
     """What it chose is rendered, in the time that is left, and written down."""
-    from data_gen import pipelines
+    from data_gen.choosing import pipelines
 
     asked = []
 

@@ -12,8 +12,8 @@ from ngpt.cli import main
 @pytest.fixture
 def seen(renderer, monkeypatch):
     """A scene in which samples of two samplers leave known errors."""
-    from data_gen import pipelines
-    from data_gen.pipelines import Pipeline
+    from data_gen.choosing import pipelines
+    from data_gen.choosing.pipelines import Pipeline
 
     usual = {m: pipelines.usual_fall("gpt", m) for m in ("wcv", "primal", "l1")}
     found = [
@@ -68,7 +68,7 @@ def test_the_commands_of_a_pilot_run_as_printed(seen, tmp_path, capsys, monkeypa
 
 def test_a_pilot_advises(renderer, capsys, monkeypatch):
     """Whatever it may be: a row for each method of each sampler that was tried."""
-    from data_gen import pipelines
+    from data_gen.choosing import pipelines
 
     monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "l1"))

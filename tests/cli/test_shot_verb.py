@@ -8,8 +8,8 @@ import pytest
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_image
-from ngpt.measure.flicker import flicker
-from ngpt.shots import HOP, LENGTH, reconstruct_shot
+from ngpt.sequence.flicker import flicker
+from ngpt.sequence.windows import HOP, LENGTH, reconstruct_shot
 from ngpt.stack import GradientStack
 
 COUNT, SIZE = LENGTH + 4, (16, 20, 3)

@@ -8,8 +8,8 @@ import pytest
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_exr, read_image
+from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
-from ngpt.temporal import Temporal
 
 
 @pytest.fixture

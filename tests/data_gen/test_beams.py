@@ -57,7 +57,7 @@ def test_lines_are_nearest(renderer):
     """Against the least distance of many pairs of points."""
     import drjit as dr
 
-    from data_gen.samplers.photons.beams import nearest
+    from data_gen.samplers.photons.media.beams import nearest
 
     mi, rng = renderer, np.random.default_rng(0)
     o, p = rng.normal(size=(2, 3, 200)) * 0.3
@@ -80,7 +80,7 @@ def test_lines_are_nearest(renderer):
 def test_beams_are_cut_the_same_in_windows(renderer, monkeypatch):
     """All parts at once, or few at a time: the same light."""
     from data_gen.render import render_stack
-    from data_gen.samplers.photons import beams
+    from data_gen.samplers.photons.media import beams
 
     scene = load(renderer, media_scenes.haze, (8, 8))
     whole = render_stack(scene, 2, 0, "beams", photons=4)["primal"]

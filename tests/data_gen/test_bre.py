@@ -96,8 +96,8 @@ def test_the_grid_finds_what_is_beside_a_ray(renderer, radius):
     """Each point once, whatever its cell, on and beyond the box too; rays without end are cut at the box."""
     import drjit as dr
 
-    from data_gen.samplers.photons.bre import BALL
-    from data_gen.samplers.photons.grid import Grid
+    from data_gen.samplers.photons.map.grid import Grid
+    from data_gen.samplers.photons.media.bre import BALL
 
     mi, rng = renderer, np.random.default_rng(0)
     points = (rng.random((3000, 3)) * [2, 1, 0.2] - [1, 0, 0]).astype(np.float32)

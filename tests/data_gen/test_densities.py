@@ -89,7 +89,7 @@ def test_unbiased_where_surfaces_are_seen_from_behind(renderer, sampler):
 @pytest.mark.parametrize("sampler", ["gpt", "gpt-simple"])
 def test_a_mutant_that_takes_samples_at_their_word_fails_the_z_test(renderer, monkeypatch, sampler):
     from data_gen.paths import media
-    from data_gen.samplers import gpt_simple
+    from data_gen.samplers.teaching import gpt_simple
 
     for module in (media, gpt_simple):
         monkeypatch.setattr(module, "consistent", lambda bsdf, si, sample, *_: sample)

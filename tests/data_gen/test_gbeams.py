@@ -16,8 +16,8 @@ from unbiased import far_shifts, load, render_ours
 @pytest.mark.parametrize("far", [False, True])
 def test_beams_turn_to_and_fro(rays, far):  # noqa: F811
     """Past the other ray at the same distance along it, on the other side; J by finite differences."""
-    from data_gen.samplers.photons.beams import nearest
-    from data_gen.samplers.photons.shift import past
+    from data_gen.samplers.photons.gradients.shift import past
+    from data_gen.samplers.photons.media.beams import nearest
 
     g, dr = rays, rays.dr
     a = g.b - g.Vector(0.3, 2.0, 0.2)
@@ -72,7 +72,7 @@ def test_differences_by_beams_are_those_of_the_image(renderer, name, pixels):
 @pytest.mark.slow
 def test_a_wrong_jacobian_of_beams_is_found(renderer, monkeypatch):
     """One without the lengths."""
-    from data_gen.samplers.photons import shift
+    from data_gen.samplers.photons.gradients import shift
 
     monkeypatch.setattr(shift, "jacobian_in_medium", lambda length2, length2_1: 0 * length2_1 + 1)
     stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 32, 4, "gbeams", radius=0.5, photons=2)

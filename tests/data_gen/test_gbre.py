@@ -41,7 +41,7 @@ def rays(renderer):
 
 def beside(g, b, o, d, u, e):
     """The copy, beside the ray (u, e), of a photon beside (o, d)."""
-    from data_gen.samplers.photons.shift import moved
+    from data_gen.samplers.photons.gradients.shift import moved
 
     t = g.dr.dot(b - o, d)
     return moved(b, o + d * t, d, u + e * t, e)
@@ -65,7 +65,7 @@ def test_between_rays_from_one_point_what_is_beside_one_alone_goes_to_the_other(
 
 def test_jacobians_in_media_by_finite_differences(rays):
     """Of volumes, which are kept; and of directions and distances from the predecessor."""
-    from data_gen.samplers.photons.shift import jacobian_in_medium
+    from data_gen.samplers.photons.gradients.shift import jacobian_in_medium
 
     g, dr = rays, rays.dr
     axes = [g.Vector(1, 0, 0), g.Vector(0, 1, 0), g.Vector(0, 0, 1)]
@@ -104,7 +104,7 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     """Camera rays come by, a hundredth of their length apart."""
     import drjit as dr
 
-    from data_gen.samplers.photons.gbre import Beside
+    from data_gen.samplers.photons.media.gbre import Beside
 
     mi = renderer
 
@@ -136,10 +136,10 @@ def assert_copies_are_light_paths(mi, name, receivers):
     from data_gen.paths.vertex import Materials
     from data_gen.samplers.bdpt.lights import LightEnds, LightRay
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.copies import Photon, photon_of, start_of
-    from data_gen.samplers.photons.fog import Fog
-    from data_gen.samplers.photons.gbre import copy_beside
-    from data_gen.samplers.photons.trace import trace, vertex_in_media_of
+    from data_gen.samplers.photons.gradients.copies import Photon, photon_of, start_of
+    from data_gen.samplers.photons.map.fog import Fog
+    from data_gen.samplers.photons.map.trace import trace, vertex_in_media_of
+    from data_gen.samplers.photons.media.gbre import copy_beside
 
     scene = load(mi, getattr(media_scenes, name), (8, 8))
     lights, n = LightEnds(scene), 1 << 14
@@ -221,7 +221,7 @@ def test_differences_in_media_are_those_of_the_image(renderer, name, pixels):
 
 @pytest.mark.slow
 def test_a_wrong_jacobian_in_media_is_found(renderer, monkeypatch):
-    from data_gen.samplers.photons import shift
+    from data_gen.samplers.photons.gradients import shift
 
     monkeypatch.setattr(shift, "jacobian_in_medium", lambda length2, length2_1: 0 * length2_1 + 1)
     stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 32, 4, "gbre", radius=0.7, photons=4)

@@ -15,13 +15,13 @@ SIZE = (16, 12)
 @pytest.fixture
 def chains(renderer):
     """The module, in the renderer's variant."""
-    from data_gen.samplers.gmlt import chains
+    from data_gen.samplers.studies.gmlt import chains
 
     return chains
 
 
 def test_small_steps_go_either_way_and_around(renderer):
-    from data_gen.samplers.gmlt.mutation import LARGEST, SMALLEST, small_step
+    from data_gen.samplers.studies.gmlt.mutation import LARGEST, SMALLEST, small_step
 
     mi, rng = renderer, np.random.default_rng(0)
     x = rng.random(100_000, np.float32)
@@ -43,7 +43,7 @@ def test_small_steps_go_either_way_and_around(renderer):
 
 def test_acceptance_balances_every_pair_of_states(renderer):
     """f(x) a(x -> y) = f(y) a(y -> x); from and to what has no value as well."""
-    from data_gen.samplers.gmlt.mutation import acceptance
+    from data_gen.samplers.studies.gmlt.mutation import acceptance
 
     f = np.array([1e-20, 1e-3, 0.5, 0.5, 2, 7, 1e6], np.float32)
     x, y = (renderer.Float(a.ravel()) for a in np.meshgrid(f, f))
@@ -99,7 +99,7 @@ def test_numbers_that_do_not_change_make_the_same_path(renderer, monkeypatch, ch
     import drjit as dr
 
     from data_gen.render import render_stack
-    from data_gen.samplers.gmlt import mutation
+    from data_gen.samplers.studies.gmlt import mutation
 
     counts = dr.zeros(renderer.UInt32, 2)
     acceptance = chains.acceptance
@@ -122,7 +122,7 @@ def test_numbers_that_do_not_change_make_the_same_path(renderer, monkeypatch, ch
 def test_chains_accept_enough(renderer, monkeypatch):
     """A floor: chains that never move would pass every test of the mean."""
     from data_gen.render import render_stack
-    from data_gen.samplers.gmlt import integrator
+    from data_gen.samplers.studies.gmlt import integrator
 
     rates, run = [], integrator.run
 

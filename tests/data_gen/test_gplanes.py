@@ -14,7 +14,7 @@ from unbiased import far_shifts, load, render_ours
 
 def turning(g):
     """(a, d, e, where the first ray meets the plane) of planes that go well with pairs of rays, in double precision."""
-    from data_gen.samplers.photons.planes import crossing
+    from data_gen.samplers.photons.media.planes import crossing
 
     dr = g.dr
     a = g.b - g.Vector(0.5, 1.5, 0.2)
@@ -25,8 +25,8 @@ def turning(g):
 
 def test_planes_turn_to_and_fro(rays):  # noqa: F811
     """To where the other ray is as far along it, with the same angle between both edges; J J' = 1."""
-    from data_gen.samplers.photons.planes import crossing
-    from data_gen.samplers.photons.shift import about, jacobian_of_planes
+    from data_gen.samplers.photons.gradients.shift import about, jacobian_of_planes
+    from data_gen.samplers.photons.media.planes import crossing
 
     g, dr = rays, rays.dr
     a, d, e, at = turning(g)
@@ -49,8 +49,8 @@ def test_planes_turn_to_and_fro(rays):  # noqa: F811
 
 def test_jacobians_of_planes_by_finite_differences(rays):  # noqa: F811
     """Of the solid angles of the second edge: another one meets the ray at another distance along it."""
-    from data_gen.samplers.photons.planes import crossing
-    from data_gen.samplers.photons.shift import about, jacobian_of_planes
+    from data_gen.samplers.photons.gradients.shift import about, jacobian_of_planes
+    from data_gen.samplers.photons.media.planes import crossing
 
     g, dr = rays, rays.dr
     a, d, e, at = turning(g)
@@ -75,9 +75,9 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
 
     from data_gen.paths.streams import sample_streams
     from data_gen.samplers import find
-    from data_gen.samplers.photons.gbre import Beside
-    from data_gen.samplers.photons.gplanes import copied
-    from data_gen.samplers.photons.planes import crossing, planes_of
+    from data_gen.samplers.photons.media.gbre import Beside
+    from data_gen.samplers.photons.media.gplanes import copied
+    from data_gen.samplers.photons.media.planes import crossing, planes_of
 
     mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
     made = find("gplanes").make(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
@@ -116,9 +116,9 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
 
 def by_planes_alone(self, passes, starts, photons, number, paths):
     """For ``GPLANES.gathered``."""
-    from data_gen.samplers.photons.gbre import Both
-    from data_gen.samplers.photons.gplanes import NearPlanes
-    from data_gen.samplers.photons.planes import planes_of
+    from data_gen.samplers.photons.media.gbre import Both
+    from data_gen.samplers.photons.media.gplanes import NearPlanes
+    from data_gen.samplers.photons.media.planes import planes_of
 
     yield Both(None, NearPlanes(planes_of(passes, photons, paths)))
 
@@ -138,7 +138,7 @@ def test_differences_by_planes_are_those_of_the_image(renderer, name, pixels):
 
 @pytest.mark.slow
 def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
-    from data_gen.samplers.photons import gplanes
+    from data_gen.samplers.photons.media import gplanes
 
     monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
     stacks = passes(load(renderer, media_scenes.colours, (12, 12)), 32, 4, "gplanes", planes=144)
@@ -150,7 +150,8 @@ def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypa
 @pytest.mark.parametrize("wrong", [False, True])
 def test_a_wrong_jacobian_of_planes_is_found(renderer, monkeypatch, wrong):
     """One without the lengths; without the volumes the noise of rays that graze planes hides the bias."""
-    from data_gen.samplers.photons import gplanes, shift
+    from data_gen.samplers.photons.gradients import shift
+    from data_gen.samplers.photons.media import gplanes
 
     if wrong:
         monkeypatch.setattr(shift, "jacobian_of_planes", lambda t, volume, t1, volume1: shift.dr.abs(volume1 / volume))
@@ -189,7 +190,7 @@ def test_planes_shifted_by_nothing_find_no_difference(renderer):
 def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):
     """No z-test asks for that: a sampler that rejects every shift is unbiased. Measured, 48x48: 0.02, 66 and 106."""
     from data_gen.render import render_stack
-    from data_gen.samplers.photons import gplanes
+    from data_gen.samplers.photons.media import gplanes
     from ngpt.io.exr import pass_through
 
     monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)

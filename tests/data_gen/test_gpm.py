@@ -45,7 +45,7 @@ def largest(value) -> float:
 
 def test_places_go_to_and_fro(geometry):
     """The image of a place is as far from y as the place is from x, lies in the plane at y, and goes back."""
-    from data_gen.samplers.photons.shift import moved, on_plane
+    from data_gen.samplers.photons.gradients.shift import moved, on_plane
 
     g, dr = geometry, geometry.dr
     b = on_plane(g.b, g.d, g.x, g.n)
@@ -60,7 +60,7 @@ def test_places_go_to_and_fro(geometry):
 
 def test_places_near_to_one_point_go_where_only_the_other_is_near(geometry):
     """In one plane the image is as far from x as the place is from y."""
-    from data_gen.samplers.photons.shift import moved
+    from data_gen.samplers.photons.gradients.shift import moved
 
     g, dr = geometry, geometry.dr
     flat = g.Vector(0, 0, 1)
@@ -72,7 +72,7 @@ def test_places_near_to_one_point_go_where_only_the_other_is_near(geometry):
 @pytest.mark.parametrize("far", [False, True])
 def test_jacobian_by_finite_differences(geometry, far):
     """Of directions from the predecessor; of light from infinity, of origins on a plane across the light."""
-    from data_gen.samplers.photons.shift import jacobian, moved, on_plane
+    from data_gen.samplers.photons.gradients.shift import jacobian, moved, on_plane
 
     g, dr = geometry, geometry.dr
     a = g.b - g.d * g.Vector(*[g.length] * 3)
@@ -122,8 +122,8 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     from data_gen.paths.vertex import Materials
     from data_gen.samplers.bdpt.lights import LightEnds, LightRay
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.copies import Photon, copy, is_near, photon_of, start_of
-    from data_gen.samplers.photons.trace import vertex_of
+    from data_gen.samplers.photons.gradients.copies import Photon, copy, is_near, photon_of, start_of
+    from data_gen.samplers.photons.map.trace import vertex_of
 
     mi = renderer
     scene = load(mi, SCENES[name], (8, 8))
@@ -246,7 +246,7 @@ def test_differences_are_those_of_the_image(renderer, name, pixels):
 
 def test_a_wrong_jacobian_is_found(renderer, monkeypatch):
     """By the same test: J = 1 has even less noise. Measured with 64 passes: a mean of z² of 13, with J one of 0.95."""
-    from data_gen.samplers.photons import shift
+    from data_gen.samplers.photons.gradients import shift
 
     monkeypatch.setattr(shift, "jacobian", lambda d, n, length2, d1, m, length2_1: 0 * length2_1 + 1)
     stacks = passes(load(renderer, "diffuse", (16, 16)), 32, 4, radius=0.7, photons=2)

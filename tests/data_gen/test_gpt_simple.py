@@ -127,7 +127,7 @@ def test_agrees_with_the_full_integrator(renderer, stacks):
     ids=["no Jacobian", "w is 1/2"],
 )
 def test_mutants_fail_the_z_test(renderer, references, function, mutant, monkeypatch):
-    from data_gen.samplers import gpt_simple
+    from data_gen.samplers.teaching import gpt_simple
 
     monkeypatch.setattr(gpt_simple, function, partial(mutant, renderer))
     stacks = render_ours(load(renderer, courtyard, (32, 32)), "gpt-simple")
@@ -152,7 +152,7 @@ class Pairs:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
-        from data_gen.samplers.gpt_simple import base_step, start, step_apart, step_joined
+        from data_gen.samplers.teaching.gpt_simple import base_step, start, step_apart, step_joined
 
         self.mi, self.scene = mi, scene
         camera = CameraSamples(scene.sensors()[0], 5, 64)
@@ -180,7 +180,7 @@ class Pairs:
         from data_gen.paths.lights import emission, sample_light
         from data_gen.paths.shift import mis_weight
         from data_gen.paths.vertex import evaluate
-        from data_gen.samplers.gpt_simple import Step, reflected
+        from data_gen.samplers.teaching.gpt_simple import Step, reflected
 
         light = sample_light(self.scene, x, other.u_light, x.is_valid())
         f, p = evaluate(x.bsdf(), x, wo)
@@ -244,6 +244,6 @@ def test_refuses_what_it_cannot_render(renderer, scene, reason):
 
 
 def test_takes_what_is_rough_enough(renderer):
-    from data_gen.samplers.gpt_simple import make
+    from data_gen.samplers.teaching.gpt_simple import make
 
     assert callable(make(load(renderer, lambda: polished(0.06), (8, 8))))

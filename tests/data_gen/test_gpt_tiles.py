@@ -21,7 +21,7 @@ class Tile:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
-        from data_gen.samplers import gpt_tiles
+        from data_gen.samplers.studies import gpt_tiles
 
         scene = load(mi, "diffuse", SIZE)
         tiles = gpt_tiles.make(scene, tile=side)
@@ -141,7 +141,7 @@ def test_unbiased_with_mirrors_and_lenses(renderer, scene, pixels):
 @pytest.mark.slow
 def test_a_mutant_without_jacobian_fails_the_z_test(renderer, courtyard, monkeypatch):
     """Over eight pixels, where Jacobians are far from 1."""
-    from data_gen.samplers import gpt_tiles
+    from data_gen.samplers.studies import gpt_tiles
 
     monkeypatch.setattr(gpt_tiles, "reconnection_jacobian", lambda *_: renderer.Float(1))
     scene, references = courtyard

@@ -15,7 +15,7 @@ from unbiased import far_shifts, load, render_ours
 
 def test_photons_in_one_ball_alone_go_to_the_other(rays):  # noqa: F811
     """As near to y as they were to x, and as far from x as they were from y; and back. Mirrors keep volumes."""
-    from data_gen.samplers.photons.shift import image
+    from data_gen.samplers.photons.gradients.shift import image
 
     g, dr = rays, rays.dr
     x, y = g.o, g.u
@@ -33,7 +33,7 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     """Camera paths scatter near by, a hundredth of their length apart."""
     import drjit as dr
 
-    from data_gen.samplers.photons.gvpm import InBall
+    from data_gen.samplers.photons.media.gvpm import InBall
 
     mi = renderer
 
@@ -66,7 +66,7 @@ def test_differences_in_balls_are_those_of_the_image(renderer, name, pixels):
 
 @pytest.mark.slow
 def test_a_wrong_jacobian_in_balls_is_found(renderer, monkeypatch):
-    from data_gen.samplers.photons import shift
+    from data_gen.samplers.photons.gradients import shift
 
     monkeypatch.setattr(shift, "jacobian_in_medium", lambda length2, length2_1: 0 * length2_1 + 1)
     stacks = passes(load(renderer, media_scenes.dense, (12, 12)), 64, 4, "gvpm", radius=1.4, photons=32)

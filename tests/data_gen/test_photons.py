@@ -14,7 +14,7 @@ from ngpt.errors import NgptError
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.004])
 def test_the_grid_finds_what_brute_force_finds(renderer, radius):
     """Each once, on and beyond the box too; with the least radius cells are larger than they need be."""
-    from data_gen.samplers.photons.grid import Grid
+    from data_gen.samplers.photons.map.grid import Grid
 
     mi, rng = renderer, np.random.default_rng(0)
     points = rng.random((3000, 3)).astype(np.float32) * [2, 1, 0.2] - [1, 0, 0]
@@ -39,7 +39,7 @@ def test_the_grid_finds_what_brute_force_finds(renderer, radius):
 
 
 def test_an_empty_grid(renderer):
-    from data_gen.samplers.photons.grid import Grid
+    from data_gen.samplers.photons.map.grid import Grid
 
     mi = renderer
     grid = Grid(mi.Point3f(np.zeros((3, 4))), mi.Bool([False] * 4), 0.1)
@@ -54,7 +54,7 @@ def maps_of(mi, scene, paths=4096, max_depth=6):
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
     from data_gen.samplers.bdpt.lights import LightEnds
-    from data_gen.samplers.photons.trace import trace
+    from data_gen.samplers.photons.map.trace import trace
 
     random = sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0))
     start, maps = trace(scene, LightEnds(scene), random, Materials(scene, 0.05).connectable, max_depth, 4)
@@ -84,7 +84,7 @@ def test_vertices_know_their_parents(renderer):
     known = ~first & (depth > 0) & (depth[parent] > 0)
     assert known.any() and (depth[known] == depth[parent[known]] + 1).all()
     assert (depth == 0).mean() > 0.05  # on glass
-    from data_gen.samplers.photons.trace import vertex_of
+    from data_gen.samplers.photons.map.trace import vertex_of
 
     si = vertex_of(photons, mi.UInt32(np.flatnonzero(np.array(photons.t) > 0)))
     assert np.abs(np.array(si.p).T - p).max() < 1e-4
@@ -94,7 +94,7 @@ def test_vertices_know_their_parents(renderer):
 
 def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
     """Into some, which have the same photons each once, whose parents are with them."""
-    from data_gen.samplers.photons import trace
+    from data_gen.samplers.photons.map import trace
 
     mi = renderer
     scene = load(mi, "diffuse", (8, 8))
@@ -121,8 +121,8 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch)
     from data_gen.film import GradientFilm
     from data_gen.passes import recording
     from data_gen.paths.camera import CameraSamples
+    from data_gen.paths.frozen import Frozen
     from data_gen.samplers import find
-    from data_gen.samplers.photons.frozen import Frozen
 
     scene = load(renderer, "diffuse", (16, 12))
     sensor = scene.sensors()[0]
@@ -152,7 +152,7 @@ def test_what_is_recorded_once_has_the_width_of_each_call(renderer):
     """Constants too, such as the emission of a scene without lamps: Dr.Jit would keep the width of the first."""
     import drjit as dr
 
-    from data_gen.samplers.photons.frozen import Frozen
+    from data_gen.paths.frozen import Frozen
 
     mi = renderer
     frozen, time = Frozen(load(mi, "diffuse", (4, 4))), dr.full(mi.Float, 0.5, 20)
@@ -172,7 +172,7 @@ def test_what_is_recorded_once_has_the_width_of_each_call(renderer):
 
 
 def test_radii_shrink_as_told():
-    from data_gen.samplers.photons.radius import ALPHA, shrunk
+    from data_gen.samplers.photons.map.radius import ALPHA, shrunk
 
     r2 = 1.0
     for i in range(50):

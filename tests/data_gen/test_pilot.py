@@ -14,15 +14,15 @@ def images(rng, noise, n=4, bias=0.0):
 
 def witnesses(rng, **noise):
     """Primals of samplers by name, and their relative variances."""
-    from data_gen.trials import Witnesses
+    from data_gen.choosing.trials import Witnesses
 
     return Witnesses({name: images(rng, n) for name, n in noise.items()}, noise, np.ones(SHAPE))
 
 
 def seen(sampler, error, seconds, step=None, **more):
     """What a pilot says of a sampler and its simple method, at 16 samples."""
-    from data_gen.pilot import simple
-    from data_gen.pipelines import Pipeline, usual_fall
+    from data_gen.choosing.pilot import simple
+    from data_gen.choosing.pipelines import Pipeline, usual_fall
 
     method = simple(sampler)
     step = usual_fall(sampler, method) if step is None else step
@@ -30,7 +30,7 @@ def seen(sampler, error, seconds, step=None, **more):
 
 
 def test_the_least_time_to_the_end_is_chosen(renderer):
-    from data_gen.pilot import best_of, times_to_the_end
+    from data_gen.choosing.pilot import best_of, times_to_the_end
 
     pipelines = [seen("gpt", 0.01, 2.0), seen("bdpt", 0.1, 4.0), seen("primal", 0.2, 1.0)]
     times = times_to_the_end(pipelines, 32.0)
@@ -42,7 +42,7 @@ def test_the_least_time_to_the_end_is_chosen(renderer):
 
 def test_errors_that_fall_slowly_lose_in_long_renders(renderer):
     """With the power that a pilot saw, as in scenes whose light paths from the camera hardly find."""
-    from data_gen.pilot import best_of
+    from data_gen.choosing.pilot import best_of
 
     slow, usual = seen("gpt", 0.07, 1.0, step=-0.55), seen("gpt", 0.07, 1.0)
     rival = seen("gbdpt", 0.01, 8.0)
@@ -66,7 +66,7 @@ def test_an_error_is_no_less_than_what_two_images_differ_by(rng):
 
 def test_no_photons_are_witnesses(rng):
     """However little noise they have: they blur."""
-    from data_gen.trials import Witnesses
+    from data_gen.choosing.trials import Witnesses
 
     primals = {"gpt": images(rng, 0.1), "ppm": images(rng, 1e-6, bias=0.5)}
     judges = Witnesses(primals, {"gpt": 0.1, "ppm": 1e-6}, np.ones(SHAPE))
@@ -76,7 +76,7 @@ def test_no_photons_are_witnesses(rng):
 
 def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
     """Their errors fall slower than noise, and where others hardly find the light nobody is sure of them."""
-    from data_gen.pilot import best_of, times_to_the_end
+    from data_gen.choosing.pilot import best_of, times_to_the_end
 
     pipelines = [seen("gpt", 0.5, 1.0), seen("primal", 1.0, 1.0), seen("ppm", 0.01, 1.0, doubt=0.002)]
     assert best_of(pipelines, 100.0)[0] == "ppm" and best_of(pipelines, 1e7)[0] == "gpt"
@@ -91,7 +91,7 @@ def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
 
 
 def test_a_choice_needs_a_margin():
-    from data_gen.pilot import judge
+    from data_gen.choosing.pilot import judge
 
     assert judge("gpt", {"gpt": 1.0, "bdpt": 0.95})[0] == "gpt"
     assert judge("gpt", {"gpt": 1.0, "bdpt": 0.7})[0] == "bdpt"
@@ -99,7 +99,7 @@ def test_a_choice_needs_a_margin():
 
 
 def test_candidates_are_those_of_the_registry(renderer):
-    from data_gen.trials import candidates
+    from data_gen.choosing.trials import candidates
 
     names = candidates(load(renderer, "diffuse", (48, 32)))
     assert names[0] == "gpt" and {"bdpt", "primal"} <= set(names)
@@ -111,7 +111,7 @@ def test_candidates_are_those_of_the_registry(renderer):
 
 
 def test_short_renders_are_not_measured(renderer, monkeypatch):
-    from data_gen import pilot
+    from data_gen.choosing import pilot
 
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pilot, "try_all", None)
@@ -121,7 +121,7 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
 
 
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen import pilot, trials
+    from data_gen.choosing import pilot, trials
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (48, 32))

@@ -16,7 +16,7 @@ SHAPE = (48, 64)
 
 
 def pipeline(sampler="gpt", method="wcv", error=0.01, fall=-0.8, seconds=0.01, after=0.0, **more):
-    from data_gen.pipelines import Pipeline
+    from data_gen.choosing.pipelines import Pipeline
 
     return Pipeline(sampler, method, 16, error, fall, seconds, after, **more)
 
@@ -45,7 +45,7 @@ def stack(rng, seed, spp=8, variance=0.5, of_gradients=None):
 
 
 def trials(rng):
-    from data_gen.trials import Trial
+    from data_gen.choosing.trials import Trial
 
     return {
         "gpt": Trial([stack(rng, i, of_gradients=0.01) for i in range(4)], 0.02),
@@ -55,8 +55,8 @@ def trials(rng):
 
 def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
     """Of every method, whatever it blurs: no pilot knows the truth."""
-    from data_gen import pipelines
-    from data_gen.pipelines import measure, methods_for
+    from data_gen.choosing import pipelines
+    from data_gen.choosing.pipelines import measure, methods_for
 
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "ngpt-fast"))
     monkeypatch.setattr(pipelines, "WITHOUT", ("primal", "oidn"))
@@ -75,7 +75,7 @@ def test_what_is_measured_is_the_true_error(renderer, rng, monkeypatch):
 
 def test_the_best_depends_on_the_time(renderer):
     """A denoiser that hardly improves wins at first, gradients in the end."""
-    from data_gen.pipelines import choose
+    from data_gen.choosing.pipelines import choose
 
     flat = pipeline("primal", "oidn", error=0.005, fall=-0.4, seconds=0.005)
     steep = pipeline("gpt", "wcv", error=0.01, fall=-0.9)
@@ -85,7 +85,7 @@ def test_the_best_depends_on_the_time(renderer):
 
 
 def test_time_of_the_method_counts(renderer):
-    from data_gen.pipelines import choose
+    from data_gen.choosing.pipelines import choose
 
     quick, slow = pipeline(error=0.011), pipeline(method="ngpt-combine", after=0.5)
     assert slow.samples(1.0) == pytest.approx(50) and quick.samples(1.0) == pytest.approx(100)
@@ -94,7 +94,7 @@ def test_time_of_the_method_counts(renderer):
 
 
 def test_samples_are_shared_out_where_that_pays(renderer):
-    from data_gen.pipelines import choose
+    from data_gen.choosing.pipelines import choose
 
     even, shared = pipeline(), pipeline(adaptive=0.6, choosing=0.01)
     assert shared.shared and not even.shared and shared.samples(2.0) < even.samples(2.0)
@@ -119,7 +119,7 @@ def ticking(tick):
 
 
 def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen import pipelines
+    from data_gen.choosing import pipelines
 
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
@@ -136,7 +136,7 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
 
 def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     """The first two always; and the less time there is, the smaller the images."""
-    from data_gen import pipelines, trials
+    from data_gen.choosing import pipelines, trials
 
     scene = load(renderer, "diffuse", (48, 32))
     monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
@@ -159,7 +159,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
 
 
 def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
-    from data_gen.trials import try_out
+    from data_gen.choosing.trials import try_out
 
     scene = load(renderer, "diffuse", (16, 12))
     # One look at the clock before a render of a sample, one after it: four renders of 8 and two of 16 take 64 times
@@ -169,7 +169,7 @@ def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):
-    from data_gen.pipelines import methods_for
+    from data_gen.choosing.pipelines import methods_for
 
     assert methods_for("primal", "wcv") == [] and methods_for("gpt", "wcv") == ["wcv"]
     assert methods_for("primal", "primal") == ["primal"]

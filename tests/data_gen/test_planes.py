@@ -20,7 +20,7 @@ from ngpt.testing import z_test
 
 def test_lines_meet_planes(renderer):
     """By the coordinates that the place has on the plane and on the line; the volume by numpy."""
-    from data_gen.samplers.photons.planes import crossing
+    from data_gen.samplers.photons.media.planes import crossing
 
     mi, rng = renderer, np.random.default_rng(0)
     a, o, d, e, w = rng.normal(size=(5, 3, 200))
@@ -60,7 +60,7 @@ def black_room(max_depth=6):
 
 def light_of_planes(renderer, monkeypatch, spp=4, batches=8, **options):
     """(light by planes alone, that of all paths but those of two edges), images of the same shape."""
-    from data_gen.samplers.photons.beams import BEAMS
+    from data_gen.samplers.photons.media.beams import BEAMS
 
     monkeypatch.setattr(BEAMS, "of_map", lambda *_: iter(()))
     ours = render_ours(load(renderer, black_room, (16, 16)), "planes", batches=batches, spp=spp, photons=2, **options)
@@ -90,7 +90,7 @@ def test_wrong_planes_are_found(renderer, monkeypatch, wrong):
     import drjit as dr
 
     from data_gen.paths import segments
-    from data_gen.samplers.photons import planes
+    from data_gen.samplers.photons.media import planes
 
     if wrong == "shadow":
         whole = segments.cross
@@ -120,7 +120,7 @@ def test_wrong_planes_are_found(renderer, monkeypatch, wrong):
 def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, monkeypatch):
     """A plane and the way to the camera are three edges."""
     from data_gen.render import render_stack
-    from data_gen.samplers.photons.beams import BEAMS
+    from data_gen.samplers.photons.media.beams import BEAMS
 
     monkeypatch.setattr(BEAMS, "of_map", lambda *_: iter(()))
     scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]

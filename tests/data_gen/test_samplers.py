@@ -20,7 +20,7 @@ class Toy:
 
     def __init__(self, scene, shy=False):
         from data_gen.samplers.common import radiance
-        from data_gen.samplers.gpt_basic import make
+        from data_gen.samplers.teaching.gpt_basic import make
 
         make(scene)  # refuses what it cannot render
         self.scene, self.estimate = scene, radiance(scene, scene.integrator())
@@ -132,7 +132,7 @@ def test_unbiased(renderer, name, pixels):
 
 @pytest.mark.parametrize("name", long_slow(NAMES))
 def test_unbiased_where_there_are_holes_and_no_environment(renderer, name):
-    """Where Mitsuba's ``path`` loses light (docs/rendering.md), and no sampler of ours may."""
+    """Where Mitsuba's ``path`` loses light (docs/use/rendering.md), and no sampler of ours may."""
     if SAMPLERS[name].biased:
         pytest.skip("biased, and says so")
     scene, references = load(renderer, leaf, (32, 32)), references_of(renderer, leaf, (32, 32))
@@ -293,7 +293,7 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
 
 
 def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
-    from data_gen import costs
+    from data_gen.choosing import costs
     from ngpt.evaluation.config import Config
     from ngpt.evaluation.run import evaluate
     from ngpt.system.console import Console

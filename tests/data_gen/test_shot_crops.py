@@ -5,7 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ngpt.warp import warped
+from ngpt.sequence.warp import warped
 
 pytest.importorskip("mitsuba")
 

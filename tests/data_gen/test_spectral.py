@@ -15,7 +15,7 @@ def spectral(renderer):
     from data_gen.backend import use_variant
 
     use_variant("llvm_ad_spectral")
-    from data_gen.spectral.glass import register
+    from data_gen.samplers.studies.spectral.glass import register
 
     register()
     yield renderer
@@ -32,7 +32,7 @@ def loaded(mi, description):
 
 def test_indices_are_those_of_catalogues():
     """At the lines of Fraunhofer F, d, C; from which Abbe's number, the dispersion."""
-    from data_gen.spectral.glass import index
+    from data_gen.samplers.studies.spectral.glass import index
 
     lines = np.array([486.13, 587.56, 656.27])
     for material, n, abbe in (("n-bk7", 1.5168, 64.17), ("n-sf11", 1.7847, 25.68)):
@@ -46,7 +46,7 @@ def test_at_one_wavelength_it_is_a_dielectric(spectral):
     import drjit as dr
 
     mi, rng = spectral, np.random.default_rng(0)
-    from data_gen.spectral.glass import index
+    from data_gen.samplers.studies.spectral.glass import index
 
     ours = mi.load_dict({"type": "dispersive", "material": "n-sf11"})
     theirs = mi.load_dict({"type": "dielectric", "int_ior": float(index("n-sf11", 500.0)), "ext_ior": 1.0})
@@ -72,8 +72,8 @@ def si_at(mi, si, wavelength):
 
 def test_steps_are_the_differences_of_bins(spectral):
     """Their mean against that of independent renders, and their variance against that over seeds."""
-    from data_gen.spectral.render import render_spectra
-    from data_gen.spectral.scene import prism
+    from data_gen.samplers.studies.spectral.render import render_spectra
+    from data_gen.samplers.studies.spectral.scene import prism
 
     scene = loaded(spectral, prism())
     found = [render_spectra(scene, 6, 8, seed) for seed in range(12)]
@@ -92,8 +92,8 @@ def test_steps_are_the_differences_of_bins(spectral):
 
 
 def test_the_solve_is_that_of_the_normal_equations(rng, renderer):
-    from data_gen.spectral.render import Spectra
-    from data_gen.spectral.solve import reconstructed
+    from data_gen.samplers.studies.spectral.render import Spectra
+    from data_gen.samplers.studies.spectral.solve import reconstructed
 
     light, step = rng.random((1, 1, 7)), rng.random((1, 1, 7))
     spectra = Spectra(light, np.full((1, 1, 7), 0.5), step, np.full((1, 1, 7), 0.125))
@@ -111,9 +111,9 @@ def test_the_solve_is_that_of_the_normal_equations(rng, renderer):
 
 def test_colours_are_those_of_mitsuba(spectral):
     """White is white, and a render by bins has the colours of one by Mitsuba."""
-    from data_gen.spectral.render import render_spectra
-    from data_gen.spectral.scene import prism
-    from data_gen.spectral.solve import to_rgb
+    from data_gen.samplers.studies.spectral.render import render_spectra
+    from data_gen.samplers.studies.spectral.scene import prism
+    from data_gen.samplers.studies.spectral.solve import to_rgb
 
     description = prism()
     for name in ("prism", "ball"):
@@ -126,8 +126,8 @@ def test_colours_are_those_of_mitsuba(spectral):
 
 def test_refusals(renderer, spectral):
     from data_gen.backend import use_variant
-    from data_gen.spectral.render import render_spectra
-    from data_gen.spectral.scene import prism
+    from data_gen.samplers.studies.spectral.render import render_spectra
+    from data_gen.samplers.studies.spectral.scene import prism
 
     scene = loaded(spectral, prism())
     with pytest.raises(NgptError, match="1 bins and 4 samples: at least 2 of each"):

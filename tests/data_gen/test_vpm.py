@@ -118,7 +118,7 @@ def test_it_converges_in_media(renderer):
 
 
 def test_radii_in_media_shrink_by_volume():
-    from data_gen.samplers.photons.radius import shrunk
+    from data_gen.samplers.photons.map.radius import shrunk
 
     for i in (0, 1, 7, 100):
         assert shrunk(i, 3) ** 3 == pytest.approx(shrunk(i) ** 2, rel=1e-9)
@@ -129,7 +129,7 @@ def test_the_medium_around_a_lamp_is_found(renderer):
     import drjit as dr
 
     from data_gen.samplers.bdpt.lights import LightEnds
-    from data_gen.samplers.photons.fog import Fog
+    from data_gen.samplers.photons.map.fog import Fog
 
     mi = renderer
     scene = load(mi, media_scenes.nested, (8, 8))

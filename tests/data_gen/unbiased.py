@@ -62,7 +62,7 @@ def right_integrator(mi, scene):
     """The scene's own, or ``prb`` where ``path`` is wrong: where there are holes and no environment.
 
     ``path`` is black for paths that go through holes alone and then meet nothing, although emitters lit the material
-    around the holes (docs/rendering.md). ``prb`` is as Mitsuba's authors differentiate it, and has no such rule.
+    around the holes (docs/use/rendering.md). ``prb`` is as Mitsuba's authors differentiate it, and has no such rule.
     """
     from data_gen.scenes.load import path_depths
 

@@ -1,4 +1,4 @@
-"""Fixtures of the C library; it wants a compiler, CMake and ONNX Runtime's headers, see docs/c-library.md."""
+"""Fixtures of the C library; it wants a compiler, CMake and ONNX Runtime's headers, see docs/embed/c-library.md."""
 
 import os
 from pathlib import Path

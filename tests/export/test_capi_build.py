@@ -10,7 +10,7 @@ from capi import COLOUR, FAST, HEADER, SOURCE, Network, command, example, instal
 
 import ngpt
 
-DOCS = SOURCE.parents[1] / "docs" / "c-library.md"
+DOCS = SOURCE.parents[1] / "docs" / "embed" / "c-library.md"
 STRICT = ["-Wall", "-Wextra", "-pedantic", "-Werror"]
 
 PROJECT = """

@@ -1,7 +1,8 @@
 """The hosts in other languages: each is built and run, and must agree with ONNX Runtime in Python.
 
 C++ wants a compiler and ONNX Runtime's headers and library, of the system or in ORT_ROOT; Node and the browser want
-onnxruntime-node and onnxruntime-web in a node_modules that NODE_PATH names, or beside the host. See docs/hosts.md.
+onnxruntime-node and onnxruntime-web in a node_modules that NODE_PATH names, or beside the host. See
+docs/embed/hosts.md.
 """
 
 import base64
@@ -138,7 +139,7 @@ def test_a_host_at_640x360(host, python, tmp_path, capsys, request):
 
 
 def tell(capsys, name, host_times, times, image, expected):
-    """What docs/hosts.md publishes; medians."""
+    """What docs/embed/hosts.md publishes; medians."""
     agree(image, expected)
     worst = np.abs(image - expected).max() / np.abs(expected).max()
     with capsys.disabled():

@@ -1,7 +1,7 @@
 """Every host gives the pixels of ``ngpt denoise`` on the stacks of ``ngpt demo``, unpacked by ``ngpt unpack``.
 
 ``pytest -m slow -s`` prints the worst difference of each, relative to the value (of dark ones to a hundredth of the
-median); docs/hosts.md publishes them. What is not installed is left out, and named.
+median); docs/embed/hosts.md publishes them. What is not installed is left out, and named.
 """
 
 import re

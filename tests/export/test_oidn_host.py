@@ -1,6 +1,6 @@
 """The C++ host that calls Open Image Denoise gives the pixels of ``ngpt denoise`` with the networks that correct it.
 
-Needs mitsuba-oidn, which has OIDN's library in it, a C++ compiler and ONNX Runtime's headers (docs/hosts.md).
+Needs mitsuba-oidn, which has OIDN's library in it, a C++ compiler and ONNX Runtime's headers (docs/embed/hosts.md).
 """
 
 from pathlib import Path

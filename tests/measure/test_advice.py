@@ -180,7 +180,7 @@ def test_the_table_of_an_evaluation(tmp_path):
 
 
 def test_the_table_that_ships():
-    """Judged on its own scenes, each left out: what docs/evaluation.md says of it must hold."""
+    """Judged on its own scenes, each left out: what docs/use/evaluation.md says of it must hold."""
     table = read_table()
     rows = hindsight(table)
     assert statistics.geometric_mean(row["cost"] for row in rows) < 1.3
@@ -188,8 +188,8 @@ def test_the_table_that_ships():
 
 
 def test_the_command(renderer, table, tmp_path, capsys, monkeypatch):
-    from data_gen import costs
-    from data_gen.pilot import Choice
+    from data_gen.choosing import costs
+    from data_gen.choosing.pilot import Choice
 
     def timed(scene, options, spp, seed):
         """As on a machine where samples cost COST: by the law of ``primal`` a faster one has others ahead."""

@@ -15,7 +15,7 @@ from ngpt.measure import gains as module
 from ngpt.measure.gains import NEED_OIDN, cases, gains, read_errors, used
 from ngpt.methods import METHODS, choose
 
-RESULTS = Path(__file__).parents[2] / "docs" / "RESULTS.md"
+RESULTS = Path(__file__).parents[2] / "docs" / "lab" / "RESULTS.md"
 FEATURES, GRADIENTS = ("albedo", "normal", "depth"), ("dx", "dy")
 needs_oidn = pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from ngpt.stack import GradientStack
 
-TUTORIAL = Path(__file__).parents[2] / "docs" / "tutorial.ipynb"
+TUTORIAL = Path(__file__).parents[2] / "docs" / "start" / "tutorial.ipynb"
 
 
 def rows(html):

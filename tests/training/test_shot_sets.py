@@ -70,7 +70,7 @@ def test_frames_are_crops_with_motion_in_their_order(shots):
 
 
 def test_a_history_follows_frames_and_ends_with_the_shot(shots):
-    from ngpt.temporal import Temporal
+    from ngpt.sequence.history import Temporal
 
     temporal, shares = Temporal(), []
     for crop in Dataset(shots[0]):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ngpt.blending import BANDS, INPUTS, Network
+from ngpt.sequence.network import BANDS, INPUTS, Network
 from ngpt.stack import GradientStack
 from ngpt.training import temporal
 from ngpt.training.temporal import Clip, as_corrections, errors, loss, network, play, scores, train

@@ -17,7 +17,7 @@ from ngpt.training.parameters import TABLES, configuration_row, entries, paramet
 from ngpt.training.settings import from_dict, read_settings
 
 CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
-TRAINING = Path("docs/training.md")
+TRAINING = Path("docs/train/training.md")
 
 
 @pytest.fixture
@@ -170,7 +170,7 @@ def test_a_network_trains_on_crops_that_are_being_rendered(renderer, train, tmp_
 
 
 def test_the_smallest_set_trains_the_smallest_network_as_the_page_says(renderer, tmp_path, monkeypatch, capsys):
-    """The first commands of docs/training.md, in a folder of their own."""
+    """The first commands of docs/train/training.md, in a folder of their own."""
     from ngpt.cli import main
 
     commands = re.findall(r"^ {4}ngpt (.*?)(?: {2,}#.*)?$", TRAINING.read_text(), re.M)[:3]

@@ -31,7 +31,7 @@ from data_gen.samplers.gbdpt.base_path import Plan
 from data_gen.samplers.gbdpt.integrator import GBDPT
 from data_gen.samplers.gbdpt.light_again import Marker, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
-from data_gen.samplers.photons.render import Passes
+from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.vcm.differences import ShiftedMerging
 from data_gen.samplers.vcm.integrator import VCM
 from data_gen.samplers.vcm.merging import Photons, Reader

@@ -41,9 +41,9 @@ from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.ppm import refuse
-from data_gen.samplers.photons.radius import pixel_width, shrunk
-from data_gen.samplers.photons.render import Passes
+from data_gen.samplers.photons.map.radius import pixel_width, shrunk
+from data_gen.samplers.photons.passes import Passes
+from data_gen.samplers.photons.surfaces.ppm import refuse
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
 from ngpt.errors import NgptError
 

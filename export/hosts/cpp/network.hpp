@@ -1,4 +1,4 @@
-// libngpt (export/capi, docs/c-library.md) with the manners of C++: what fails is thrown, what is opened is closed.
+// libngpt (export/capi, docs/embed/c-library.md) with the manners of C++: what fails is thrown, what is opened is closed.
 #pragma once
 
 #include <ngpt.h>

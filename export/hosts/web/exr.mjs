@@ -11,7 +11,7 @@ const LAYERS = {
   primal_var: RGB, dx_var: RGB, dy_var: RGB, caustic: RGB, caustic_var: RGB,
 };
 
-/** {width, height, layers: {name: Float32Array, channel by channel}}, named as in docs/gradient-stack.md. */
+/** {width, height, layers: {name: Float32Array, channel by channel}}, named as in docs/use/gradient-stack.md. */
 export async function readStack(buffer) {
   const {width, height, channels} = await readChannels(buffer);
   const layers = {};

@@ -61,10 +61,10 @@ def read_weights(path: str, channels: tuple[int, ...]) -> list[Tensor]:
     if not path:
         raise NgptError(
             "loss.weights is not set: E-LPIPS needs its fitted weights, a safetensors file with vectors lin0 ... "
-            f'lin{len(channels) - 1} (docs/losses.md); loss.kind = "structural" needs none'
+            f'lin{len(channels) - 1} (docs/train/losses.md); loss.kind = "structural" needs none'
         )
     if not Path(path).is_file():
-        raise NgptError(f"{path}: no such file; it should hold the fitted weights of E-LPIPS (docs/losses.md)")
+        raise NgptError(f"{path}: no such file; it should hold the fitted weights of E-LPIPS (docs/train/losses.md)")
     try:
         tensors = load_file(path)
     except (SafetensorError, OSError) as error:

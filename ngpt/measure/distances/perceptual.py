@@ -27,7 +27,7 @@ class PerceptualDistance:
     ``kind``         "structural" (no weights needed), "elpips-squeeze" (NGPT's) or "elpips-vgg"
     ``evaluations``  draws of the random transforms that are averaged
     ``scales``       largest downscaling among the transforms
-    ``backbone``, ``weights``  files of E-LPIPS (docs/losses.md); "" looks for the backbone in PyTorch's cache
+    ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
 
     Raises NgptError for an unknown kind, and for files that are missing or not what they should be.
     """

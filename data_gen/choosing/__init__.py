@@ -1,0 +1,1 @@
+"""Which sampler, how many samples, which method: trials of a scene, and plans made of them."""

@@ -1,0 +1,288 @@
+"""The whole way to an image, a sampler and a method, chosen by the error that it is expected to leave in the end.
+
+Each sampler that could render the scene renders four small stacks. Every method that can use them reconstructs each of
+the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
+the other samplers, whose noise has no mean (``data_gen.choosing.trials``): so what a method blurs or loses counts. From
+the pilot's samples to those that fit into the time errors fall by a power of the samples. Part of that power is what
+the pilot saw from one stack to two, the rest what is usual for methods of its kind.
+
+The image of a biased sampler (photons) is judged as a reconstruction is, and no biased sampler judges others. Where it
+finds most of the light, those that judge it have much noise: twice the standard error is added to what they say.
+
+Samples are even, or shared out (``data_gen.adaptive``) where that is expected to pay for itself: the gain is that of
+the pilot's expected errors, pixel by pixel, were they known.
+
+Not handled: light that no sampler has found in the pilot.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+
+from data_gen.adaptive import LEAST, Adaptive, assess, gain
+from data_gen.choosing.trials import PIXELS, Trial, Witnesses, at_most, candidates, try_all
+from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.samplers import SAMPLERS
+from ngpt.errors import NgptError
+from ngpt.merging import merge
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+
+# Of the time that there is, after which no further sampler is tried, and what each may take
+SHARE, DEAREST = 0.1, 0.2
+# Seconds from which on the pilot's images are as large as they ever are, and the least share of that
+LONG, LEAST_PIXELS = 200.0, 1 / 16
+# The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
+WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
+WITHOUT = ("primal", "oidn", "ngpt-primal")
+# These numbers are those of python -m bench.pipelines on scenes not apart.
+# The powers of the samples by which errors usually fall, of methods that use gradients and of denoisers; the share that
+# the pilot has in such a power, and the steepest and flattest that it may be
+BY_GRADIENTS, BY_DENOISERS = -0.95, -0.55
+SEEN, STEEPEST, FLATTEST = 0.3, -1.2, -0.2
+# The same power of photons' images, by theory; and how much of the standard error of their errors is added to these
+_BY_PHOTONS, _DOUBT = -2 / 3, 2.0
+# The power by which shared out samples with gradients are better than the pilot says, whose need is smoother than it
+# is; and the samples from which on they are thought of
+REALISED, FROM = 2.0, 2 * LEAST
+
+
+@dataclass(frozen=True)
+class Pipeline:
+    """A sampler and a method, as a pilot saw them.
+
+    ``spp``       samples per pixel at which the ``error`` (trimmed relMSE) was measured
+    ``step``      the power of the samples by which it falls, as the pilot saw it
+    ``seconds``   of one sample of the whole image
+    ``after``     those of the method
+    ``adaptive``  error of shared out samples over that of even ones, as the need for them says; 1: samples are even
+    ``choosing``  seconds of the method that shares them out, each time
+    ``doubt``     standard error of the error of a biased sampler, by which it is taken for larger; else 0
+    """
+
+    sampler: str
+    method: str
+    spp: int
+    error: float
+    step: float
+    seconds: float
+    after: float
+    adaptive: float = 1.0
+    choosing: float = 0.0
+    doubt: float = 0.0
+
+    @property
+    def shared(self) -> bool:
+        """Whether samples are shared out."""
+        return self.choosing > 0
+
+    @property
+    def fall(self) -> float:
+        """The power of the samples by which the error falls."""
+        usual = usual_fall(self.sampler, self.method)
+        if self.method == "primal" or SAMPLERS[self.sampler].biased:
+            return usual
+        return min(max(SEEN * self.step + (1 - SEEN) * usual, STEEPEST), FLATTEST)
+
+    @property
+    def doubtful(self) -> bool:
+        """Whether the others find too little of the light to judge it."""
+        return _DOUBT * self.doubt > self.error
+
+    @property
+    def gain(self) -> float:
+        """The error over that of as many even samples."""
+        return self.adaptive ** (REALISED if SAMPLERS[self.sampler].gradients else 1)
+
+    def samples(self, seconds: float) -> float:
+        """How many samples per pixel fit into the time; less than 1 where none do."""
+        spp = (seconds - self.after) / self.seconds
+        return spp - self._choices(spp) / self.seconds
+
+    def takes(self, spp: float) -> float:
+        """The seconds of so many samples and of the method."""
+        return spp * self.seconds + self._choices(spp) + self.after
+
+    def _choices(self, spp: float) -> float:
+        """Seconds in which samples are shared out: each time, their number doubles."""
+        return self.choosing * math.ceil(math.log2(spp / LEAST) + 1) if self.shared and spp > LEAST else 0.0
+
+    @property
+    def least(self) -> int:
+        """Samples below which nothing is expected."""
+        if self.shared:
+            return FROM
+        batch = SAMPLERS[self.sampler].batch
+        # Of one batch there are no variances.
+        return max(1, 2 * batch if self.method == "wcv" else batch)
+
+    def expected(self, spp: float) -> float:
+        """The error after so many samples; infinite where there are too few."""
+        if spp < self.least:
+            return math.inf
+        return self._begins * (spp / self.spp) ** self.fall
+
+    def needed(self, error: float) -> float:
+        """The samples that are expected to leave the error, or the least there are."""
+        return max(self.least, self.spp * (error / self._begins) ** (1 / self.fall))
+
+    @property
+    def _begins(self) -> float:
+        """What the error is taken for at ``spp``."""
+        return (self.error + _DOUBT * self.doubt) * self.gain
+
+
+def usual_fall(sampler: str, method: str) -> float:
+    """The power of the samples by which errors of a method usually fall, on stacks of the sampler."""
+    if SAMPLERS[sampler].biased:
+        return _BY_PHOTONS
+    if method == "primal":
+        return -1.0  # The samples are independent.
+    return BY_GRADIENTS if "dx" in METHODS[method].needs else BY_DENOISERS
+
+
+def measure(
+    trials: dict[str, Trial],
+    clock: Callable[[], float] = time.perf_counter,
+    methods: Callable[[str], list[str]] | None = None,
+    shared: bool = True,
+) -> list[Pipeline]:
+    """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
+
+    Or those of the ``methods`` that are given for a sampler; samples are ``shared`` out too, or only even.
+    """
+    witnesses = Witnesses.of(trials)
+    found = []
+    for name, trial in trials.items():
+        halves = [merge(trial.stacks[:2]), merge(trial.stacks[2:])]
+        need = None
+        for method in (methods or methods_for)(name):
+            single, double, after = [], [], []
+            for half in range(2):
+                single.append([reconstruct(stack, method).image for stack in trial.stacks[2 * half : 2 * half + 2]])
+                start = clock()
+                double.append([reconstruct(halves[half], method).image])
+                after.append(clock() - start)
+            one, two = witnesses.error(name, single), witnesses.error(name, double)
+            spp, doubt = int(halves[0].attributes["ngpt:spp"]), 0.0
+            if SAMPLERS[name].biased:
+                doubt = witnesses.doubt(name, double[0][0])
+            else:
+                # Of both: at twice the samples, the one that was measured there and the one that falls to it.
+                two = math.sqrt(two * one * 2 ** usual_fall(name, method))
+            pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
+            found.append(pipeline)
+            if shared and not SAMPLERS[name].even:
+                if need is None:
+                    need = _need(merge(halves), clock)
+                found.append(replace(pipeline, adaptive=need[0], choosing=need[1]))
+    return found
+
+
+def _need(stack: GradientStack, clock: Callable[[], float]) -> tuple[float, float]:
+    """What sharing samples out is expected to gain, and the seconds of each choice."""
+    method = Adaptive().chosen_by(stack)
+    start = clock()
+    found = assess(stack, method)
+    return gain(found.relative), max(clock() - start, 1e-9)
+
+
+def methods_for(sampler: str, only: str = "auto") -> list[str]:
+    """What may reconstruct the sampler's stacks, of what runs here."""
+    names: tuple[str, ...] = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
+    if only != "auto":
+        lack = METHODS[only].missing() if only in METHODS else f"there is no method '{only}'"
+        if lack:
+            raise NgptError(f"method '{only}' cannot be used: {lack}; name another, or auto")
+        names = (only,) if SAMPLERS[sampler].gradients or "dx" not in METHODS[only].needs else ()
+    return [m for m in names if not METHODS[m].missing()]
+
+
+def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
+    """Those of which at least a sample fits into the time, the one to take first."""
+    fit = [p for p in pipelines if p.samples(seconds) >= 1 and math.isfinite(p.expected(p.samples(seconds)))]
+    return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))
+
+
+def explore(
+    scene: mi.Scene,
+    seconds: float = LONG,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[Pipeline]:
+    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them."""
+    start = clock()
+    names = candidates(scene)
+    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    if not able:
+        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
+    entry = SAMPLERS[able[0]]
+    film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
+    with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
+        trials = try_all(scene, able[:2], clock=clock)
+        trials |= try_all(scene, able[2:], lambda: clock() - start < SHARE * seconds, DEAREST * seconds, clock)
+        if not trials:
+            raise NgptError(f"none of the samplers {', '.join(able)} can render the scene")
+        found = measure(trials, clock, lambda sampler: methods_for(sampler, method))
+    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What to do with the seconds that are left, why, and the seconds that it took to know.
+
+    ``sampler``, ``method``  of the image
+    ``shared``               whether samples are to be shared out
+    ``render``               seconds for the render, those of the method taken off
+    """
+
+    sampler: str
+    method: str
+    shared: bool
+    render: float
+    reason: str
+
+
+def plan(
+    scene: mi.Scene,
+    seconds: float,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Plan:
+    """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
+
+    Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
+    then ``primal``, then all unbiased others that ``--sampler auto`` compares, and begins none after a tenth of the
+    time. The less time, the smaller are its images. What it measures changes from run to run. Raises NgptError for a
+    method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
+    """
+    start = clock()
+    whole = explore(scene, seconds, method, memory, clock)
+    left = seconds - (clock() - start)
+    ranked = choose(whole, left)
+    if not ranked:
+        raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
+    first = ranked[0]
+    return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+
+
+def _turn(first: str) -> Callable[[str], int]:
+    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
+
+
+def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
+    """A line: what is expected of the first, and of the best by each other sampler."""
+    errors: dict[str, tuple[float, Pipeline]] = {}
+    for p in ranked:
+        errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
+    (least, first), *others = errors.values()
+    what = f"expected to leave an error of {math.sqrt(least):.2g} by '{first.method}'"
+    rivals = [f"{math.sqrt(e):.2g} by '{p.sampler}' and '{p.method}'" for e, p in others]
+    return ", ".join([what, *rivals])

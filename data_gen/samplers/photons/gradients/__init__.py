@@ -1,0 +1,1 @@
+"""What photons give to the gradients: their copies for the neighbours' camera paths."""

@@ -1,0 +1,113 @@
+"""Pairs of a point, or a ray, and a photon near it, in the order of the points: one lane each, however many they are.
+
+Shifts are done for pairs, all lanes at work; within the walk through the grid one lane in five would have a photon. The
+list is cut into pieces of a given length, and the sums over the pairs of a point are added up in their order: the same
+pairs give the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.frozen import call
+from data_gen.samplers.photons.map.grid import Grid
+
+
+@dataclass
+class Pairs:
+    """A piece of the list of all pairs: ``point`` and ``place``, that of the photon in the list of the grid."""
+
+    point: mi.UInt32
+    place: mi.UInt32
+    first: mi.UInt32  # of each point, where its pairs begin in this piece
+    end: mi.UInt32
+
+    def sums(self, values: list) -> list:
+        """For each of ``values``, an array of colours, one for each pair: the sum over the pairs of each point."""
+        zeros = [dr.zeros(type(value), dr.width(self.first)) for value in values]
+
+        def add(i, sums):
+            return i + 1, [total + dr.gather(type(v), v, i) for total, v in zip(sums, values, strict=True)]
+
+        state = (mi.UInt32(self.first), zeros)
+        return dr.while_loop(state, lambda i, sums: i < self.end, add, label="sums of pairs")[1]
+
+
+@dataclass
+class Points:
+    """Where photons are gathered near to."""
+
+    p: mi.Point3f
+
+    def each(self, grid: Grid, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
+        return grid.each(self.p, radius2, active, visit, state)
+
+    def __len__(self) -> int:
+        return dr.width(self.p)
+
+
+@dataclass
+class Rays:
+    """Pieces of rays, which photons are gathered along."""
+
+    ray: mi.Ray3f
+    length: mi.Float
+
+    def each(self, grid: Grid, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
+        return grid.along(self.ray, self.length, radius2, active, visit, state)
+
+    def __len__(self) -> int:
+        return dr.width(self.length)
+
+
+def pieces(
+    grid: Grid, points: Points | Rays, radius2: mi.Float, active: mi.Bool, most: int, frozen: Callable = call
+) -> Iterator[Pairs]:
+    """All pairs of ``active`` points and what the ``grid`` has nearer to them, at most so many at a time."""
+    count = frozen(counts, grid, points, radius2, active)
+    first = dr.prefix_sum(count)
+    dr.eval(count, first, active)
+    total = int(dr.sum(count)[0])
+    for low in range(0, total, most):
+        size = min(most, total - low)
+        part = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+        pairs = dr.empty(mi.UInt32, size), dr.empty(mi.UInt32, size)
+        dr.make_opaque(pairs)
+        pairs = frozen(piece, grid, points, radius2, active, first, count, part, pairs)
+        dr.eval(pairs)
+        yield pairs
+
+
+def counts(grid: Grid, points: Points | Rays, radius2, active) -> mi.UInt32:
+    """How many pairs each point has."""
+
+    def one_more(state, i, near):
+        return (state[0] + dr.select(near, mi.UInt32(1), 0),)
+
+    return points.each(grid, radius2, active, one_more, (dr.zeros(mi.UInt32, len(points)),))[0]
+
+
+def piece(
+    grid: Grid, points: Points | Rays, radius2, active, first: mi.UInt32, count: mi.UInt32, part: tuple, pairs: tuple
+) -> Pairs:
+    """The ``part`` (low, size) of the list, in arrays of that size; those of a point begin at ``first``."""
+    (begin, length), (point, place) = part, pairs
+    inside = active & (first < begin + length) & (first + count > begin)
+    lane = dr.arange(mi.UInt32, len(points))
+
+    def write(state, i, near):
+        # Below ``begin`` the difference is larger than any length.
+        at = state[0] - begin
+        known = near & (at < length)
+        dr.scatter(point, lane, at, known)
+        dr.scatter(place, i, at, known)
+        return (dr.select(near, state[0] + 1, state[0]),)
+
+    points.each(grid, radius2, inside, write, (mi.UInt32(first),))
+    last = dr.minimum(first + count, begin + length)
+    start = dr.maximum(first, begin)
+    return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))

@@ -1,0 +1,1 @@
+"""The photon map: light traced from the lamps, kept, and found again."""

@@ -1,0 +1,1 @@
+"""Photons gathered in media: at points, along rays, from beams and planes."""

@@ -1,0 +1,129 @@
+r"""Progressive photon mapping in media and on surfaces: ``ppm``, and photons where light scatters in a medium.
+
+    x           the vertex of a camera path in a medium, at a sampled distance
+    b, d, Φ     a photon within radius r of it, in the same medium; the direction it came along, its scattered power
+    L(x)        Σ f(d) Φ / (4/3 π r³ N),    f: the phase function, N: light paths of the pass
+
+Φ is the power that is scattered at b, and the camera path brings T over the density of x, without σs. In scenes with
+media whose density varies it is Φ / σs(b), and the camera path has σs(x). Paths of both ends go by null collisions.
+
+Each segment of a camera path has one vertex: where it scatters in a medium, or on the surface behind. All light that is
+scattered in a medium comes from photons there. What of it lamps send directly comes from photons, too: a beam of light
+in haze is what the photons of its lamp draw.
+
+[Jensen and Christensen 1998, "Efficient Simulation of Light Transport in Scenes with Participating Media using Photon
+Maps"; Knaus and Zwicker 2011, section 5]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.passes import SamplePass
+from data_gen.paths import media
+from data_gen.paths.vertex import Materials
+from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.radius import pixel_width, shrunk
+from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH
+from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering, Passes, refuse
+from data_gen.scenes.facts import media_of
+
+
+@dataclass(init=False)
+class GatheringInMedia:
+    """The photons of a map in media, gathered within ``radius``; ``paths`` light paths have brought them."""
+
+    photons: Any
+    Φ: mi.Spectrum
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float
+    max_depth: mi.UInt32
+
+    def __init__(self, fog: Fog, photons, radius: float, paths: int, max_depth: int):
+        self.photons, self.Φ = photons, fog.power(photons)
+        dr.eval(self.Φ)
+        scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
+        self.grid = Grid(photons.p, scattered, radius)
+        self.radius2 = dr.opaque(mi.Float, radius**2)
+        self.K = dr.opaque(mi.Float, 1 / (4 / 3 * np.pi * radius**3 * paths))
+        self.max_depth = dr.opaque(mi.UInt32, max_depth)
+
+    def light(self, x: mi.SurfaceInteraction3f, place: media.Place, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        """L(x) at a vertex in a medium, behind ``depth`` edges, of paths that are not too long."""
+        photons, longest = self.photons, self.max_depth - depth
+        phase, seen = place.medium.phase_function(), media.in_medium(x, place)
+
+        def one(i, near):
+            j = dr.gather(mi.UInt32, self.grid.index, i, near)
+            near = near & (dr.gather(mi.MediumPtr, photons.medium, j, near) == place.medium)
+            near &= dr.gather(mi.UInt32, photons.depth, j, near) <= longest
+            d, Φ = dr.gather(mi.Vector3f, photons.d, j, near), dr.gather(mi.Spectrum, self.Φ, j, near)
+            f, _ = phase.eval_pdf(mi.PhaseFunctionContext(), seen, -d, near)
+            return dr.select(near, f * Φ, 0)
+
+        zero = dr.zeros(mi.Spectrum, dr.width(depth))
+        return self.K * self.grid.gather(x.p, self.radius2, active, one, zero)
+
+
+@dataclass
+class Both:
+    """Photons on surfaces, and photons in media."""
+
+    on_surfaces: Gathering
+    in_media: GatheringInMedia
+
+    def light(self, x, place: media.Place, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
+        scatters = active & place.scatters
+        L = self.in_media.light(x, place, depth, scatters)
+        return L + self.on_surfaces.light(x, place, bsdf, depth, active & ~place.scatters)
+
+
+class VPM(PPM):
+    """Progressive photon mapping in media and on surfaces; no gradients.
+
+    Plugin ``vpm``. Parameters are those of ``ppm``; the ``radius`` of the first pass is that of photons in media, too.
+
+    Biased, and consistent: the mean over passes converges to the image of ``volpath``.
+
+    Not handled: light from infinitely far away through a medium without end, and what ``ppm`` does not handle.
+    """
+
+    name = "vpm"
+    grids = True  # whether media may have a density that varies
+    # Two words more for each vertex; and two for each light path
+    map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
+
+    def prepare(self, scene) -> SamplePass:
+        refuse(scene, self.name)
+        lights = LightEnds(scene, self.name)
+        self.fog = Fog(scene, lights, self.name, self.grids) if media_of(scene) else None
+        if self.fog and self.fog.media.grids:
+            # Null collisions of each vertex, twice; and Φ / σs
+            self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * (3 + 3 + 3) * 4
+        passed = media.index_matched if self.fog else lambda shape: False
+        materials = Materials(scene, self.threshold, passed, media=self.fog is not None)
+        return Passes(self, scene, lights, materials, pixel_width(scene))
+
+    def gathering(self, photons, width: float, number: int, paths: int):
+        on_surfaces = super().gathering(photons, width, number, paths)
+        if self.fog is None:
+            return on_surfaces
+        radius = self.radius * width * shrunk(number, 3)
+        return Both(on_surfaces, GatheringInMedia(self.fog, photons, radius, paths, self.max_depth))
+
+
+def make(scene: mi.Scene, **options) -> SamplePass:
+    """The sampler ``vpm``, with the parameters of the scene's own ``volpath`` or ``path``."""
+    return like_path(scene, "vpm", **options).prepare(scene)
+
+
+mi.register_integrator("vpm", lambda props: VPM(props))

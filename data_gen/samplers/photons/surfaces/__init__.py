@@ -1,0 +1,1 @@
+"""Photons gathered on surfaces."""

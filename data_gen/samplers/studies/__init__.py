@@ -1,0 +1,1 @@
+"""Samplers that were measured and lost: kept to be compared with, not to be used."""

@@ -1,0 +1,170 @@
+"""Markov chains of paths, side by side: what they find, splatted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from copy import copy
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.film import SHIFTS, GradientFilm
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.spectrum import to_rgb
+from data_gen.samplers.studies.gmlt.mutation import REMEMBERED, Proposal, acceptance, taken
+
+# The share of mutations that are independent of the state
+LARGE_STEPS = 0.05
+# What the differences count in the value of a path, beside its light
+GRADIENTS = 0.25
+
+
+def value_of(layers: dict[str, mi.Color3f]) -> mi.Float:
+    """f, the value of a path: the luminance of its light, and of its four differences.
+
+    Wherever a path has anything to splat, f is above 0. [Lehtinen et al. 2013, section 4]
+    """
+    f = mi.Float(0)
+    for name, light in layers.items():
+        f += mi.luminance(dr.abs(light)) * (GRADIENTS if name in SHIFTS else 1)
+    return dr.select(dr.isfinite(f), f, 0)
+
+
+class Paths:
+    """The paths of ``gpt`` and what they bring, by layers: light not seen directly, and four differences."""
+
+    def __init__(self, gpt, scene, plan):
+        self.gpt, self.scene, self.plan = gpt, scene, plan
+        # Not within the loop of a chain
+        self.shifts = {name: mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift)) for name, shift in SHIFTS.items()}
+
+    def trace(self, camera: CameraSamples, random) -> tuple[dict[str, mi.Color3f], mi.Color3f, dict[str, mi.Bool]]:
+        """The layers of paths with these ``random`` numbers; light seen directly; which neighbours are on the film."""
+        ray, importance, _ = camera.rays(mi.Vector2f(0))
+        shifted = {name: camera.rays(shift) for name, shift in self.shifts.items()}
+        L, Le, L_caustic, offsets, _ = self.gpt.trace(
+            self.scene, self.plan, random, ray, importance, list(shifted.values()), None
+        )
+        layers = {"primal": to_rgb(L, ray.wavelengths)}
+        if self.plan.caustic:
+            layers["caustic"] = to_rgb(L_caustic, ray.wavelengths)
+        inside = {name: inside for name, (_, _, inside) in shifted.items()}
+        for (name, exists), y in zip(inside.items(), offsets, strict=True):
+            layers[name] = dr.select(exists, to_rgb(y.Δ, ray.wavelengths), 0)
+        return layers, to_rgb(Le, ray.wavelengths), inside
+
+
+@dataclass
+class State:
+    """A chain: its numbers, the path of these, and what that path has to splat yet.
+
+    ``f``         its value
+    ``weight``    how many steps the chain is expected to have been there, since it came
+    ``accepted``  mutations so far
+    """
+
+    vector: dr.Local
+    pixel: mi.UInt32
+    layers: dict
+    f: mi.Float
+    weight: mi.Float
+    accepted: mi.UInt32
+
+
+def run(
+    paths: Paths,
+    camera: CameraSamples,
+    start: mi.UInt32,
+    layers: dict[str, mi.Color3f],
+    f: mi.Float,
+    steps: int,
+    scale: Callable[[mi.Float], mi.Float],
+    film: GradientFilm,
+) -> mi.Float:
+    """Runs chains of so many ``steps``; returns the share of mutations that each has accepted.
+
+    They begin with the paths of the lanes ``start``, of all those of the ``camera``, whose ``layers`` and values ``f``
+    are known. A state of value f counts ``scale(f)`` for each step that a chain is expected to be there: the state it
+    is at and the one proposed are both splatted, whatever is accepted. [Veach and Guibas 1997, "Metropolis Light
+    Transport", section 5.1]
+    """
+    splats = {name: film.splats(name) for name in layers}
+
+    def splat(state: State) -> None:
+        counts = dr.select(state.weight > 0, state.weight * scale(state.f), 0)
+        for name, light in state.layers.items():
+            splats[name].add(state.pixel, list(light * counts), dr.max(dr.abs(light)) * counts > 0)
+
+    def step(i: mi.UInt32, old: State):
+        # Drawn before the numbers of the path, of which there are more for some paths than for others.
+        random = stream(keys, i)
+        large, u = random.next_float32() < LARGE_STEPS, random.next_float32()
+        proposal = Proposal(old.vector, mi.PCG32(random), large, mi.UInt32(0))
+        there, pixel = moved(camera, proposal)
+        layers, _, _ = paths.trace(there, proposal)
+        f = value_of(layers)
+        a = acceptance(old.f, f)
+        accepted = u < a
+        # Of the two states one is left for good: what it has to splat is known.
+        new = State(None, pixel, layers, f, a, old.accepted + 1)
+        stays = State(None, old.pixel, old.layers, old.f, old.weight + 1 - a, old.accepted)
+        splat(dr.select(accepted, stays, new))
+        state = dr.select(accepted, new, stays)
+        state.vector = taken(old.vector, random, large, accepted)
+        return i + 1, state
+
+    # ---------------------- First states -------------------------
+    there = camera.at(start)
+    vector = first_numbers(there)
+    layers = {name: dr.gather(mi.Color3f, light, start) for name, light in layers.items()}
+    pixel, f = dr.gather(mi.UInt32, camera.pixel, start), dr.gather(mi.Float, f, start)
+    chain = dr.arange(mi.UInt32, dr.width(start))
+    # Several chains may have one start.
+    keys = mi.sample_tea_32(there.random.clone().next_key(), chain)
+    dr.eval(layers, pixel, f, keys)
+    # ------------------------- Steps -----------------------------
+    n = dr.opaque(mi.UInt32, steps)
+    state = State(vector, pixel, layers, f, dr.zeros(mi.Float, dr.width(start)), dr.zeros(mi.UInt32, dr.width(start)))
+    _, state = dr.while_loop((mi.UInt32(0), state), lambda i, _: i < n, step, label="chains")
+    splat(state)
+    accepted = state.accepted / mi.Float(n)
+    dr.eval(accepted)
+    return accepted
+
+
+def stream(keys: tuple[mi.UInt32, mi.UInt32], step: mi.UInt32) -> mi.PCG32:
+    """The random numbers of a step of chains."""
+    a, b = mi.sample_tea_32(keys[0], step)
+    random = mi.PCG32()
+    random.seed(mi.UInt64(a) | (mi.UInt64(b) << 32), mi.UInt64(keys[1]))
+    return random
+
+
+def first_numbers(camera: CameraSamples) -> dr.Local:
+    """The numbers that the paths of these camera samples are made of, as ``moved`` and then the path draw them."""
+    sensor, position = camera.sensor, camera.position / mi.Vector2f(camera.size)
+    open_time = sensor.shutter_open_time()
+    time = (camera.time - sensor.shutter_open()) / open_time if open_time > 0 else mi.Float(0)
+    numbers = [position.x, position.y, camera.lens.x, camera.lens.y, time, mi.Float(camera.wavelength)]
+    vector, random = dr.alloc_local(mi.Float, REMEMBERED), camera.random.clone()
+    for i, x in enumerate(numbers):
+        vector.write(x, mi.UInt32(i))
+
+    def draw(i, vector, random):
+        vector.write(random.next_float32(), i)
+        return i + 1, vector, random
+
+    state = (mi.UInt32(len(numbers)), vector, random.random)
+    return dr.while_loop(state, lambda i, *_: i < REMEMBERED, draw, label="numbers")[1]
+
+
+def moved(camera: CameraSamples, random: Proposal) -> tuple[CameraSamples, mi.UInt32]:
+    """Camera samples of other ``random`` numbers, as far as rays go, and their pixels."""
+    there = copy(camera)
+    there.position = random.next_2d() * mi.Vector2f(camera.size)
+    there.lens = random.next_2d()
+    there.time = camera.sensor.shutter_open() + camera.sensor.shutter_open_time() * random.next_1d()
+    there.wavelength = random.next_1d()
+    x, y = (dr.minimum(mi.UInt32(p), n - 1) for p, n in zip(there.position, camera.size, strict=True))
+    return there, x + y * camera.size.x

@@ -1,0 +1,94 @@
+r"""Gradient-domain Metropolis light transport: where a path of ``gpt`` has found light, small changes make others.
+
+A pass is a render of its own. It takes one independent path, a candidate, for each camera sample, as ``gpt`` does, and
+then runs Markov chains over the random numbers of such paths. Chains begin at candidates, chosen by their value, and
+visit paths in proportion to it.
+
+    x        a path with its four offset paths; g(x) what it brings to a layer
+    f(x)     its value: the luminance of its light and of its differences
+    b        mean of f over all paths; b̂: over the candidates of a pass, b0: over some paths of a first look
+    K        mutations for each candidate
+
+    layer =  mean over candidates of g b0 / (b0 + K f)  +  sum over mutations, for each candidate, of g b̂ / (b0 + K f)
+
+Either term is weighted by the balance heuristic. A mutation finds x K f(x) / b times as often as a candidate does: what
+is dim comes from candidates, evenly, and what is bright from chains. No path counts for more than g / (f K) b̂: there
+are no fireflies. b0 is the same in all passes, whatever they find, so that both weights of a path sum to one.
+
+Chains begin at candidates chosen in proportion to f, and count b̂: that is unbiased, however short they are. Passes are
+independent of each other: variances over passes are those of the noise.
+
+[Lehtinen et al. 2013, "Gradient-Domain Metropolis Light Transport"; Kelemen et al. 2002; Veach and Guibas 1997,
+"Metropolis Light Transport", section 5.1; survey, section 6.2]
+"""
+
+from __future__ import annotations
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.film import GradientFilm
+from data_gen.passes import SamplePass
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
+from data_gen.samplers.studies.gmlt.chains import Paths, run, value_of
+
+# Mutations for each candidate, and candidates for each chain
+MUTATIONS, CANDIDATES = 3, 256
+# Paths of the first look, at least, and the seed of their random numbers, far from those that users take
+_LOOK, _LOOK_SEED = 1 << 14, 0x3E7820
+
+
+class GMLT:
+    """The passes of a render; the first one begins with a look at the scene, for b0."""
+
+    def __init__(self, paths: Paths):
+        self.paths = paths
+        self.b0: mi.Float | None = None
+
+    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
+        if self.b0 is None:
+            spp = -(-_LOOK // camera.pixels)
+            _, _, _, f = self.candidates(CameraSamples(camera.sensor, _LOOK_SEED, spp))
+            self.b0 = dr.opaque(mi.Float, np.array(f, np.float64).mean())
+        layers, Le, inside, f = self.candidates(camera)
+        # ------------------------ Chains -----------------------------
+        # Sums of floats in parallel have no fixed order.
+        sums = np.cumsum(np.array(f, np.float64))
+        chains = max(1, len(sums) // CANDIDATES)
+        steps = -(-MUTATIONS * len(sums) // chains)
+        b, K = dr.opaque(mi.Float, sums[-1] / len(sums)), dr.opaque(mi.Float, chains * steps / len(sums))
+        if sums[-1] > 0:
+            start = mi.UInt32(chosen(sums, chains, camera))
+            run(self.paths, camera, start, layers, f, steps, lambda f: b / (self.b0 + K * f), film)
+        # ---------------------- Candidates ---------------------------
+        share = dr.select(f > 0, self.b0 / (self.b0 + K * f), 1)
+        for name, light in layers.items():
+            film.put(name, light * share + (Le if name == "primal" else 0), inside.get(name, True))
+        ray, _, _ = camera.rays()
+        film.put("direct", Le)
+        film.put_all(features(self.paths.scene, camera.sensor, camera.random.clone(), ray))
+
+    def candidates(self, camera: CameraSamples):
+        """Layers, light seen directly, which neighbours are on the film, value: of a path for each camera sample."""
+        layers, Le, inside = self.paths.trace(camera, camera.random.clone())
+        f = value_of(layers)
+        dr.eval(layers, Le, inside, f)
+        return layers, Le, inside, f
+
+
+def chosen(sums: np.ndarray, n: int, camera: CameraSamples) -> np.ndarray:
+    """``n`` lanes in proportion to their values, whose running ``sums`` are given: each as often as it should be, but
+    for one. The random number is one that no path draws."""
+    key = camera.random.at(mi.UInt32(0)).next_key()
+    u = float(mi.sample_tea_float64(key, mi.UInt32(0))[0])
+    return np.minimum(np.searchsorted(sums, (np.arange(n) + u) / n * sums[-1], side="right"), len(sums) - 1)
+
+
+def make(scene: mi.Scene) -> SamplePass:
+    """The sampler ``gmlt``: chains of the paths of ``gpt``."""
+    from data_gen.samplers.gpt.integrator import stand_in
+
+    gpt = stand_in(scene)
+    return GMLT(Paths(gpt, scene, gpt.plan(scene)))

@@ -1,0 +1,1 @@
+"""Twins to read before the integrators that do it fast."""

@@ -1,0 +1,312 @@
+"""Reconstructions of the arrays that a renderer has in its hands: NumPy, PyTorch, Dr.Jit, Mitsuba's bitmaps.
+
+clean = ngpt.denoise(noisy, albedo=albedo, normal=normal)        # the same kind comes back
+denoiser = ngpt.Denoiser(size, albedo=True, normals=True)        # or called as mi.OptixDenoiser is
+clean = denoiser(noisy, albedo, normals, sensor.world_transform().inverse())
+"""
+
+import inspect
+import os
+from collections.abc import Iterable, Mapping
+from typing import Any, TypeVar, overload
+
+import numpy as np
+
+from ngpt.api.tensors import is_bitmap, layer, like, to_numpy
+from ngpt.errors import NgptError
+from ngpt.io.aliases import resolve
+from ngpt.layers import LAYERS
+from ngpt.methods import METHODS, reconstruct
+from ngpt.stack import GradientStack
+
+T = TypeVar("T")
+
+# What goes beside the image; alpha is a channel of it, and no method looks at other frames.
+_BESIDE = tuple(name for name in LAYERS if name not in ("primal", "alpha", "error", "motion", "samples"))
+# Of those, what Mitsuba's denoiser does not know.
+_FURTHER = tuple(name for name in _BESIDE if name not in ("albedo", "normal"))
+# From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
+_TO_CAMERA = np.array([-1, 1, -1], np.float32)
+
+
+def methods_in_words() -> str:
+    """All methods: what they are, what they need beside the image, and their options with defaults."""
+    lines = []
+    for name, method in METHODS.items():
+        beside = [layer for layer in method.needs if layer != "primal"]
+        told = f"needs {', '.join(beside)}" if beside else "needs the image alone"
+        told += f"; uses {', '.join(method.uses)}" if method.uses else ""
+        options = ", ".join(f"{option}={default!r}" for option, default in method.options.items())
+        lines += [f"{name:<14}{method.summary}", f"{'':<14}{told}", f"{'':<14}options: {options or 'none'}"]
+    return "\n".join(f"    {line}" for line in lines)
+
+
+def _with_methods(thing: T) -> T:
+    """The same, with the registry at the end of what ``help`` shows."""
+    thing.__doc__ = f"{inspect.cleandoc(thing.__doc__ or '')}\n\nMethods:\n\n{methods_in_words()}"
+    return thing
+
+
+@_with_methods
+def denoise(
+    image: Any,
+    method: str = "auto",
+    *,
+    albedo: Any = None,
+    normal: Any = None,
+    depth: Any = None,
+    dx: Any = None,
+    dy: Any = None,
+    direct: Any = None,
+    caustic: Any = None,
+    primal_var: Any = None,
+    dx_var: Any = None,
+    dy_var: Any = None,
+    caustic_var: Any = None,
+    **options: Any,
+) -> Any:
+    """The reconstruction of an image or a stack, scene-linear.
+
+    ``image``    (H, W, 3) or (H, W, 4), floats: an array of NumPy, PyTorch (any device), Dr.Jit, or a Mitsuba bitmap.
+                 The same kind comes back, of the same type and shape; alpha comes back as it is. A bitmap of many
+                 channels is read by their names, as files are, and gives its colour and alpha alone. A
+                 ``GradientStack`` gives (H, W, 3) float32.
+    ``method``   "auto", the best for the layers given and the packages installed, or one of those below
+    ``albedo``, ``normal``, ``depth``  features of the same size, in the units of ``GradientStack``: normals in camera
+                 space, +x right, +y up, +z toward the viewer (``Denoiser`` turns those of Mitsuba)
+    ``dx``, ``dy``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var``, ``caustic_var``  further layers of
+                 a gradient stack
+    ``options``  of the method, see below
+
+    Raises NgptError for shapes and types that do not fit, unknown names, layers that the method lacks, and an image
+    without any finite pixel.
+    """
+    given = {"albedo": albedo, "normal": normal, "depth": depth, "dx": dx, "dy": dy, "direct": direct}
+    given |= {"caustic": caustic, "primal_var": primal_var, "dx_var": dx_var, "dy_var": dy_var}
+    given |= {"caustic_var": caustic_var}
+    given = {name: value for name, value in given.items() if value is not None}
+    _check_options("denoise", method, options, _BESIDE)
+    if isinstance(image, str | os.PathLike):
+        raise NgptError(f"denoise: image is the name of a file; pass ngpt.read({os.fspath(image)!r})")
+    if isinstance(image, GradientStack):
+        size = image.height, image.width
+        stack = image.replace(**_layers("denoise", given, size)) if given else image
+        return reconstruct(stack, method, **options).image
+    noisy: Any = image
+    if is_bitmap(image) and _names(image):
+        held = _by_name(image)
+        given, noisy = held | given, held.pop("image")
+        given.pop("image")
+    pixels = layer("denoise", "image", noisy, (3, 4))
+    layers = _layers("denoise", given, pixels.shape[:2])
+    return like(_denoised("denoise", pixels, layers, method, options), image)
+
+
+@_with_methods
+class Denoiser:
+    """Reconstructs images of one size, called as ``mi.OptixDenoiser`` is.
+
+    ``input_size``  (width, height) in pixels
+    ``albedo``, ``normals``  whether they will be given; what is not announced is refused
+    ``temporal``    must be False: no method looks at earlier frames yet
+    ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is
+    ``method``      as of ``ngpt.denoise``: "auto", the default, takes the best method for the layers each call gives
+    ``options``     of the method
+
+    Raises NgptError for an unknown method, option or keyword.
+    """
+
+    def __init__(
+        self,
+        input_size: Any,
+        albedo: bool = False,
+        normals: bool = False,
+        temporal: bool = False,
+        denoise_alpha: bool = False,
+        *,
+        method: str = "auto",
+        **options: Any,
+    ):
+        try:
+            self.width, self.height = (int(n) for n in np.ravel(to_numpy(input_size)))
+        except (TypeError, ValueError, NgptError):
+            raise NgptError(f"Denoiser: input_size is {input_size!r}; it must be (width, height)") from None
+        if temporal:
+            raise NgptError(
+                "Denoiser: temporal denoising is not there yet: leave temporal=False, and denoise frame by frame"
+            )
+        if method not in ("auto", *METHODS):
+            raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(METHODS)}")
+        _check_options("Denoiser", method, options, ())
+        self.announced = {"albedo": albedo, "normals": normals}
+        self.denoise_alpha, self.method, self.options = denoise_alpha, method, options
+
+    @overload
+    def __call__(
+        self,
+        noisy: Any,
+        albedo: Any = None,
+        normals: Any = None,
+        to_sensor: Any = None,
+        flow: Any = None,
+        previous_denoised: Any = None,
+        **layers: Any,
+    ) -> Any: ...
+
+    @overload
+    def __call__(
+        self,
+        noisy: Any,
+        albedo_ch: str = "",
+        normals_ch: str = "",
+        to_sensor: Any = None,
+        flow_ch: str = "",
+        previous_denoised_ch: str = "",
+        noisy_ch: str = "<root>",
+        **layers: Any,
+    ) -> Any: ...
+
+    # In the second form the names of channels stand where arrays do.
+    def __call__(  # type: ignore[misc]
+        self,
+        noisy: Any,
+        albedo: Any = None,
+        normals: Any = None,
+        to_sensor: Any = None,
+        flow: Any = None,
+        previous_denoised: Any = None,
+        noisy_ch: str = "<root>",
+        *,
+        albedo_ch: str = "",
+        normals_ch: str = "",
+        flow_ch: str = "",
+        previous_denoised_ch: str = "",
+        **layers: Any,
+    ) -> Any:
+        """The reconstruction of ``noisy``, of its kind (array, tensor on its device, bitmap), type and shape.
+
+        All (H, W, C), scene-linear. ``noisy`` has 3 channels, or 4: alpha. ``normals`` are in the space of Mitsuba's
+        sensor (+x left, +y up, +z forward), or in the one that ``to_sensor`` leads from: (3, 3) or (4, 4), an array or
+        a transform with a ``matrix``; for normals in world space ``sensor.world_transform().inverse()``. ``layers``
+        are ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var`` and
+        ``caustic_var``, with the meaning of the layers of ``GradientStack``; ``depth`` may be (H, W).
+
+        A bitmap may hold the others as channels: ``denoiser(bitmap, "albedo", "normals", to_sensor)``, or by keyword,
+        ``albedo_ch="albedo", normals_ch="normals"``. ``noisy_ch`` is the layer to denoise, by default the root.
+
+        Raises NgptError for arrays of another size, for albedo or normals that were not announced or are missing though
+        they were, for ``flow`` and ``previous_denoised``, and as ``ngpt.denoise`` does.
+        """
+        if unknown := [name for name in layers if name not in _FURTHER]:
+            raise NgptError(f"Denoiser: no layer is called '{unknown[0]}'; there are: {', '.join(_FURTHER)}")
+        given: dict[str, Any] = {"albedo": _first(albedo, albedo_ch), "normals": _first(normals, normals_ch)}
+        earlier = {"flow": _first(flow, flow_ch), "previous_denoised": _first(previous_denoised, previous_denoised_ch)}
+        for name, value in earlier.items():
+            if value is not None:
+                raise NgptError(f"Denoiser: {name} is given, but temporal denoising is not there yet: leave it out")
+        for name, announced in self.announced.items():
+            if given[name] is not None and not announced:
+                raise NgptError(f"Denoiser: {name} is given, but was not announced: Denoiser(size, {name}=True)")
+            if announced and given[name] is None:
+                raise NgptError(
+                    f"Denoiser: {name} was announced, but is not given: pass {name}=..., or leave it out there"
+                )
+        image = noisy
+        if is_bitmap(noisy):
+            parts = dict(noisy.split()) if _names(noisy) else {"<root>": noisy}
+            image = _part(parts, noisy_ch)
+            given = {name: _part(parts, part) if isinstance(part, str) else part for name, part in given.items()}
+        size = self.height, self.width
+        pixels = layer("Denoiser", "noisy", image, (3, 4), size)
+        beside = {name: value for name, value in (given | layers).items() if value is not None}
+        arrays = _layers("Denoiser", beside, size)
+        if "normals" in arrays:
+            # Normals that are not finite stay so, and are repaired where all layers are.
+            with np.errstate(invalid="ignore", over="ignore"):
+                arrays["normal"] = (arrays.pop("normals") @ _rotation(to_sensor).T).astype(np.float32) * _TO_CAMERA
+        result = _denoised("Denoiser", pixels, arrays, self.method, self.options)
+        if self.denoise_alpha and pixels.shape[2] == 4:
+            result = np.concatenate([result[..., :3], _alpha(pixels[..., 3:], arrays)], axis=-1)
+        return like(result, noisy)
+
+
+def _denoised(
+    where: str, image: np.ndarray, layers: Mapping[str, np.ndarray], method: str, options: Mapping[str, Any]
+) -> np.ndarray:
+    """The image, with its alpha as it was; ``where`` begins the messages."""
+    stack = GradientStack({"primal": image[..., :3], **layers}, path=where)
+    needs = METHODS[method].needs if method in METHODS and not options.get("weights") else ()
+    if lacking := [name for name in needs if name not in stack]:
+        arguments = ", ".join(f"{name}=..." for name in lacking)
+        raise NgptError(f"{where}: method '{method}' needs {', '.join(lacking)}: pass {arguments}")
+    result = reconstruct(stack, method, **options).image
+    return np.concatenate([result, image[..., 3:]], axis=-1) if image.shape[2] > 3 else result
+
+
+def _alpha(alpha: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Coverage (H, W, 1) denoised as a grey image, within its own range."""
+    features = {name: layers[name] for name in ("albedo", "normal") if name in layers}
+    grey = _denoised("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})
+    return np.clip(grey.mean(axis=-1, keepdims=True), alpha.min(), alpha.max())
+
+
+def _layers(where: str, given: Mapping[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
+    return {name: layer(where, name, value, (1,) if name == "depth" else (3,), size) for name, value in given.items()}
+
+
+def _check_options(where: str, method: str, options: Iterable[str], layers: tuple[str, ...]) -> None:
+    """Refuses names that neither the method's options are nor layers, and says which may have been meant."""
+    entries = METHODS.values() if method == "auto" else [METHODS[method]] if method in METHODS else []
+    known = list(dict.fromkeys(option for entry in entries for option in entry.options))
+    for name in options if entries else ():
+        if name not in known:
+            from difflib import get_close_matches  # for those who mistype
+
+            meant = "".join(f"; did you mean '{near}'?" for near in get_close_matches(name, [*known, *layers], 1))
+            beside = f"; layers: {', '.join(layers)}" if layers else ""
+            raise NgptError(
+                f"{where}: method '{method}' has no option '{name}'{meant or ';'} options: {', '.join(known) or 'none'}"
+                f"{beside}"
+            )
+
+
+def _first(value: Any, channel: str) -> Any:
+    """What was given as an array, or as a channel's name; None for neither: so are "" and tensors without elements."""
+    value = channel if value is None else value
+    return None if (isinstance(value, str) and not value) or 0 in getattr(value, "shape", ()) else value
+
+
+def _names(bitmap: Any) -> list[str]:
+    """The names of the channels of a bitmap of many; of a plain image none."""
+    many = bitmap.pixel_format() == type(bitmap.pixel_format()).MultiChannel
+    return [field.name for field in bitmap.struct_()] if many else []
+
+
+def _by_name(bitmap: Any) -> dict[str, np.ndarray]:
+    """The layers of a bitmap of many channels, "image" with alpha among them, known by their names as in files."""
+    names, pixels = _names(bitmap), to_numpy(bitmap, "denoise: image")
+    found = resolve([("", names)], path="denoise: bitmap")
+    layers = {name: pixels[..., [names.index(c) for c in where.channels]] for name, where in found.items()}
+    image = layers.pop("primal"), layers.pop("alpha", pixels[..., :0])
+    return {"image": np.concatenate(image, axis=-1), **layers}
+
+
+def _part(parts: Mapping[str, Any], name: str) -> Any:
+    if name not in parts:
+        raise NgptError(f"Denoiser: the bitmap has no layer '{name}'; it has: {', '.join(parts)}")
+    return parts[name]
+
+
+def _rotation(to_sensor: Any) -> np.ndarray:
+    """What normals are multiplied by, (3, 3): the inverse transpose of a transform, of determinant 1 or -1."""
+    if to_sensor is None:
+        return np.eye(3)
+    matrix = to_numpy(getattr(to_sensor, "matrix", to_sensor), "Denoiser: to_sensor")
+    if matrix.size not in (9, 16) or matrix.dtype.kind not in "fiu":
+        raise NgptError(f"Denoiser: to_sensor is {matrix.shape} of {matrix.dtype}; it must be (3, 3) or (4, 4) numbers")
+    side = 3 if matrix.size == 9 else 4
+    turn = matrix.reshape(side, side)[:3, :3].astype(np.float64)
+    volume = abs(np.linalg.det(turn)) if np.isfinite(turn).all() else np.nan
+    if not 0 < volume < np.inf:
+        raise NgptError(f"Denoiser: to_sensor has determinant {volume:.3g}; it must be a rotation, scaled at most")
+    return np.linalg.inv(turn).T * np.cbrt(volume)

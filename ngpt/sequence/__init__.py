@@ -1,0 +1,1 @@
+"""Shots: frame after frame, with what the frames before it know."""

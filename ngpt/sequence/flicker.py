@@ -1,0 +1,74 @@
+"""Flicker: how much the error of a sequence changes from frame to frame."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import EPSILON, trimmed_mean
+from ngpt.sequence.warp import warped
+
+
+def flicker_maps(
+    images: Sequence[np.ndarray], references: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
+) -> list[np.ndarray]:
+    """(H, W, 3) for each frame but the first: (d - d_r)² / (m + 1e-3), NaN where that is not known.
+
+    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, d_r that of the references
+    r, m the mean of r² in both frames. ``motions`` (H, W, 2) are those of the frames, of which the first is not used;
+    None and NaN: unknown. What changes in the reference too, a moving shadow or a reflection, is no flicker. Raises
+    NgptError for lists of different lengths.
+    """
+    if not len(images) == len(references) == len(motions) or len(images) < 2:
+        raise NgptError(
+            f"flicker of {len(images)} images, {len(references)} references and {len(motions)} motions: it takes two "
+            "frames or more, and as many of each"
+        )
+    errors = [np.asarray(image, np.float64) - reference for image, reference in zip(images, references, strict=True)]
+    return _changes(errors, references, motions)
+
+
+def change_maps(images: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]) -> list[np.ndarray]:
+    """(H, W, 3) for each frame but the first: d² / (m + 1e-3), NaN where d is not known.
+
+    d = x_t(p) - x_{t-1}(p + motion) is the difference in time along motion of the images x, m the mean of x² in both
+    frames: all that changes, flicker and light that moves. A frame without motion (None) is taken for one at rest.
+    """
+    still = np.zeros((*np.shape(images[0])[:2], 2)) if len(images) else None
+    images = [np.asarray(image, np.float64) for image in images]
+    return _changes(images, images, [still if motion is None else motion for motion in motions])
+
+
+def _changes(
+    values: Sequence[np.ndarray], levels: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
+) -> list[np.ndarray]:
+    """Squared differences in time along motion, over the mean of squared ``levels`` in both frames."""
+    maps = []
+    squares = [np.square(level, dtype=np.float64) for level in levels]
+    pairs = zip(values, values[1:], squares, squares[1:], motions[1:], strict=False)
+    for last, value, square_before, square, motion in pairs:
+        if motion is None:
+            maps.append(np.full(value.shape, np.nan))
+            continue
+        before, found = warped(last, motion)
+        # Of both frames: what goes from a lamp to what is dark beside it is not worth thousands of other pixels.
+        level = (square + warped(square_before, motion)[0]) / 2
+        relative = np.square(value - before) / (level + EPSILON)
+        maps.append(np.where(found[..., None], relative, np.nan))
+    return maps
+
+
+def flicker(
+    images: Sequence[np.ndarray], references: Sequence[np.ndarray], motions: Sequence[np.ndarray | None]
+) -> float:
+    """The mean of ``flicker_maps`` over the pixels where it is known, in each frame without the worst 0.1 %.
+
+    0 for a sequence whose error moves with what is seen; twice the mean relMSE where errors of frames have nothing to
+    do with each other. NaN where nothing is known.
+    """
+    values = []
+    for image in flicker_maps(images, references, motions):
+        known = image[np.isfinite(image).all(axis=-1)]
+        if len(known):
+            values.append(trimmed_mean(known, known, 0.001))
+    return float(np.mean(values)) if values else float("nan")

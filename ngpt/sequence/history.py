@@ -1,0 +1,120 @@
+"""Reconstruction over time: each frame's result, blended with the results of the frames before it.
+
+    y = x + b (h - x)        x: this frame's result by any method; h: the last y, seen along the layer ``motion``
+
+How much history counts, b, is made of
+
+    features      no history where albedo, normal and depth of the frame before are not those of this pixel now: what
+                  comes into sight takes nothing from what hid it
+    variances     with r the variance of h over that of x: b = 1 / (1 + r), and y has (1 - b)² + b² r. So the first n
+                  frames of a shot at rest are averaged, up to ``LONGEST`` of them, and fewer of a fast one
+    evidence      h knows nothing of this frame's noisy primal p, of variance σ². In a window with weights w,
+
+                      b* = [Σ w (h - x)(p - x) + k] / Σ w (h - x)²,    k = d Σ w σ²
+
+                  is the b of least squared error of y against the truth, where d is the share of a pixel's noise that
+                  the method leaves in it. What both h and x get wrong, blur above all, cancels. b* has a variance of
+                  its own, and the mean of both b, weighted by their variances, is taken. Where lighting or reflections
+                  change, b* falls, to 0 on fast ones
+
+    change        less history where h - x is many times what it is around: edges that were seen otherwise
+
+b* is the minimum of Stein's unbiased risk over the line from x to h; Rousselle et al. 2013, "Robust denoising using
+feature and color information", choose between filters by that risk. These are rules (``ngpt.sequence.evidence``); a
+network that sees them and more corrects b, at each of several scales of h - x (``ngpt.sequence.network``). Where direct
+emission is known, the rest alone is blended. The method may be any, and knows nothing of time.
+"""
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+from ngpt.repair import repair
+from ngpt.sequence.evidence import agreement, weighed
+from ngpt.sequence.network import Blend, Corrections, shipped
+from ngpt.sequence.warp import warped
+from ngpt.stack import GradientStack
+
+# Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
+LONGEST = 16
+# Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
+FAST = 0.005
+
+
+@dataclass(frozen=True)
+class _History:
+    """What a frame hands on to the next: result without direct emission, its relative variance, features, frame."""
+
+    light: np.ndarray
+    variance: np.ndarray
+    features: dict[str, np.ndarray]
+    frame: object
+
+
+class Temporal:
+    """Blends the frames of a shot, in their order, one after the other.
+
+    ``corrections``  of the rules, by a network (``ngpt.sequence.network``): by default the one that comes with ngpt,
+                     where ONNX Runtime is installed; None for the rules alone
+    """
+
+    def __init__(self, corrections: Corrections | Literal["shipped"] | None = "shipped") -> None:
+        self.corrections = shipped() if corrections == "shipped" else corrections
+        self._history: _History | None = None
+        self.blend: Blend | None = None  # what the last frame was made of; None for a restart
+        self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
+
+    @property
+    def share(self) -> float:
+        """The mean of b in the last frame, from 0 (a restart) to nearly 1."""
+        return float(self.weight.mean())
+
+    def next(self, stack: GradientStack, image: np.ndarray) -> np.ndarray:
+        """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with those before.
+
+        It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is of
+        another size, or says that the frame before it was another one (``ngpt:previousFrame``).
+        """
+        data = repair(stack, gradients=False)
+        now = np.asarray(image, np.float32) - data.direct
+        frame = stack.attributes.get("ngpt:frame")
+        relative = np.ones(now.shape[:2], np.float32)
+        features = data.features
+        self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
+        before = self._history
+        if before is not None and _follows(stack, before):
+            motion = stack["motion"]
+            history, found = warped(before.light, motion, sharp=True)
+            spread = warped(before.variance[..., None], motion)[0][..., 0]
+            then = {name: warped(layer, motion)[0] for name, layer in before.features.items() if name in features}
+            trust = found * agreement(features, then, found)
+            speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
+            spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
+            first = 1 / (1 + spread)
+            evidence = weighed(now, history, data.image, data.noise, trust, first)
+            if self.corrections is None:
+                b = evidence.share
+                now = now + b[..., None] * (history - now)
+            else:
+                self.blend = Blend(now, history, data.image, evidence, trust, first, speed, features)
+                now, b = self.blend.by(self.corrections(self.blend.inputs()))
+            relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
+            self.weight = b
+            # They have noise as well, and are blended as the light is, that they stay those of its pixels.
+            features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
+        self._history = _History(now, relative, features, frame)
+        return (now + data.direct).astype(np.float32)
+
+    def assume(self, variance: float) -> None:
+        """Takes the last result for one of so much of a frame's own variance, as of 1 / ``variance`` frames."""
+        if self._history is not None:
+            self._history = replace(self._history, variance=np.full_like(self._history.variance, variance))
+
+
+def _follows(stack: GradientStack, before: _History) -> bool:
+    """Whether the last frame is the one that the stack's motion leads to."""
+    if "motion" not in stack or stack["motion"].shape[:2] != before.light.shape[:2]:
+        return False
+    previous = stack.attributes.get("ngpt:previousFrame")
+    return previous is None or before.frame is None or previous == before.frame

@@ -1,0 +1,159 @@
+"""History by a network: at each scale of the change from this frame's result to history, how much of it counts.
+
+    y = x + t Σ_s b_s D_s,        b_s = min(MOST sigmoid(logit(b / t MOST) + C tanh(c_s / C)), f)
+
+D_s are the bands of h - x, fine to coarse, which add up to it; b and t are share and trust of the rules, f the b of the
+variances (``ngpt.sequence.evidence``), c_s is what the network says, from ``Blend.inputs``. Where it says nothing, c_s
+= 0, y is that of the rules. It corrects them by no more than C: where their evidence is plain, as after a change of all
+light, it stands. Changes of light are of coarse scales, and moving reflections of fine ones; noise that is left in x is
+of both. So y lies between x and h at each scale, and what comes into sight takes nothing from what hid it, whatever the
+network says. It was trained on frames of moving shots, by histories of its own making (``ngpt.training.temporal``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from importlib.util import find_spec
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+from scipy.ndimage import gaussian_filter
+
+from ngpt.errors import NgptError
+from ngpt.network import run, run_onnx
+from ngpt.network.describe import FRAMES
+from ngpt.network.exposure import statistics
+from ngpt.sequence.evidence import Evidence
+
+# (H, W, len(INPUTS)) float32 -> corrections (H, W, len(SCALES) + 1) float32.
+Corrections = Callable[[np.ndarray], np.ndarray]
+
+# Standard deviations, in pixels, of the windows that part the bands.
+SCALES = (1.5, 5.0)
+BANDS = len(SCALES) + 1
+# The most that history may count, and the least by which the rules' share differs from none and from all of that.
+MOST, LEAST = 0.97, 0.003
+# The most that the network may say, in the logarithm of odds.
+LARGEST = 1.5
+INPUTS = (
+    *("change r", "change g", "change b", "rest r", "rest g", "rest b", "light", "noise", "change over noise"),
+    *(f"band {s} over noise" for s in range(BANDS)),
+    *("share", "first", "trust", "best", "weight", "speed", "albedo", "facing"),
+)
+WEIGHTS = run.WEIGHTS / "temporal.onnx"
+# Pixels of a strip of the image that the network sees at a time, at about 1 KB each.
+STRIP = 1 << 20
+
+
+@dataclass(frozen=True)
+class Blend:
+    """One frame and its history: x ``now``, h ``history`` and the noisy ``primal`` (H, W, 3), and what is known."""
+
+    now: np.ndarray
+    history: np.ndarray
+    primal: np.ndarray
+    evidence: Evidence
+    trust: np.ndarray
+    first: np.ndarray
+    speed: np.ndarray
+    features: Mapping[str, np.ndarray]
+
+    @cached_property
+    def bands(self) -> np.ndarray:
+        """D_s, (BANDS, H, W, 3), finest first: coarse ones are of what is trusted around a pixel."""
+        lows = [(self.history - self.now).astype(np.float32)]
+        trusted = self.trust[..., None] * lows[0]
+        for scale in SCALES:
+            weight = gaussian_filter(self.trust, scale, mode="nearest", truncate=2.5)
+            low = gaussian_filter(trusted, (scale, scale, 0), mode="nearest", truncate=2.5)
+            lows.append(low / np.maximum(weight, 1e-3)[..., None])
+        return np.stack([*(one - other for one, other in pairwise(lows)), lows[-1]])
+
+    @property
+    def prior(self) -> np.ndarray:
+        """logit(b / t MOST), (H, W)."""
+        share = self.evidence.share / np.maximum(self.trust, 1e-6) / MOST
+        share = np.clip(share, LEAST, 1 - LEAST)
+        return np.log(share / (1 - share)).astype(np.float32)
+
+    def by(self, corrections: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """y (H, W, 3) and b, its mean over the bands by what they hold (H, W), of corrections (H, W, BANDS)."""
+        with np.errstate(over="ignore"):
+            shares = MOST / (1 + np.exp(-(self.prior[..., None] + LARGEST * np.tanh(corrections / LARGEST))))
+        shares = (self.trust[..., None] * np.minimum(shares, self.first[..., None])).astype(np.float32)
+        image = self.now + np.einsum("hws,shwc->hwc", shares, self.bands)
+        energy = np.square(self.bands).mean(axis=-1).transpose(1, 2, 0)
+        energy = gaussian_filter(energy, (2, 2, 0), mode="nearest") + 1e-6 * energy.mean() + 1e-30
+        b = (shares * energy).sum(axis=-1) / energy.sum(axis=-1)
+        return image.astype(np.float32), b.astype(np.float32)
+
+    def inputs(self) -> np.ndarray:
+        """What the network sees, (H, W, len(INPUTS)) float32; the same at any exposure."""
+        scale = statistics({"primal": self.primal})[0]
+        deviation = np.sqrt(self.evidence.noise)
+        log_now, log_then = (np.log1p(np.maximum(image / scale, 0)) for image in (self.now, self.history))
+        change = _signed_log(20 * self.trust[..., None] * (log_then - log_now))
+        noise = deviation.mean(axis=-1) / (scale + np.abs(self.now).mean(axis=-1))
+        over = np.sqrt(np.square((self.history - self.now) / deviation).mean(axis=-1)) * self.trust
+        coarse = np.sqrt(np.square(self.bands / deviation).mean(axis=-1)) * self.trust
+        albedo, normal = self.features.get("albedo"), self.features.get("normal")
+        none = np.zeros(self.trust.shape)
+        channels = [
+            *np.moveaxis(change, -1, 0),
+            *np.moveaxis(self.evidence.rest / (4 * deviation), -1, 0),
+            log_now.mean(axis=-1),
+            np.log1p(100 * noise) / 4,
+            np.log1p(4 * over),
+            *np.log1p(4 * coarse),
+            self.evidence.share,
+            self.first,
+            self.trust,
+            np.clip(self.evidence.best, -1, 2),
+            self.evidence.weight,
+            np.log1p(100 * self.speed),
+            none if albedo is None else np.clip(albedo, 0, 1).mean(axis=-1),
+            none if normal is None else normal[..., 2],
+        ]
+        return np.stack(channels, axis=-1).astype(np.float32)
+
+
+def _signed_log(x: np.ndarray) -> np.ndarray:
+    return np.sign(x) * np.log1p(np.abs(x))
+
+
+class Network:
+    """The network of a file (``ngpt.export.temporal``), as ``Corrections``.
+
+    Raises NgptError for a file that is no such network, or one of other inputs.
+    """
+
+    def __init__(self, path: str | Path):
+        self.path = Path(path)
+        if not self.path.is_file():
+            raise NgptError(f"{path}: no such file")
+        self._session = run_onnx.session(str(path), self.path.stat().st_mtime_ns, "cpu", 0)
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if metadata.get(FRAMES) != ", ".join(INPUTS):
+            raise NgptError(f"{path}: is no network that blends frames, or of another version of ngpt; export it anew")
+        self.alignment, self.overlap = (int(metadata[f"ngpt.{name}"]) for name in ("alignment", "overlap"))
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        """In strips of rows; their height does not change the result."""
+        height, width = inputs.shape[:2]
+        padded = np.pad(inputs, [(0, -height % self.alignment), (0, -width % self.alignment), (0, 0)], mode="edge")
+        rows = max(STRIP // padded.shape[1] // self.alignment, 1) * self.alignment
+        result = np.empty((*padded.shape[:2], BANDS), np.float32)
+        for top in range(0, len(padded), rows):
+            first = max(top - self.overlap, 0)
+            part = run_onnx.planes(padded[first : top + rows + self.overlap])
+            (made,) = self._session.run(None, {"inputs": part[None]})
+            result[top : top + rows] = np.moveaxis(made[0, :, top - first : top - first + rows], 0, -1)
+        return result[:height, :width]
+
+
+def shipped() -> Network | None:
+    """The network that comes with ngpt; None without ONNX Runtime."""
+    return Network(WEIGHTS) if find_spec("onnxruntime") is not None and WEIGHTS.is_file() else None

@@ -1,0 +1,201 @@
+"""Control variates over frames: ``wcv`` with a third difference, in time along motion.
+
+In a window of frames each pixel becomes the mean of what its neighbours say it is [``controlvariates``, survey eq. 14
+and 20 - 22], where neighbours are those in its image, what it showed in the frame before, and the pixels that show it
+in the frame after:
+
+    I_t(p)  <-  what W I_{t-1}(p) + dt(p) says, with W the image before at p + motion
+
+W is bilinear on what is to be found, and a Catmull-Rom spline on a first guess G of it, which costs nothing in the
+iteration: W I = B I + (S - B) G. How far both are apart on G says how wrong W may be: ``INTERPOLATION`` ((S - B) G)²,
+the largest of 3x3 pixels, is added to the variance of dt. So other frames count little at edges that move by parts of a
+pixel. A pixel that comes into sight needs no test: dt holds the difference to what hid it.
+
+As in ``controlvariates``, weights are relative: a = f var I / (f var I + var dt), with f the factor by which n
+iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.classical.variances``).
+
+In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/sequences.md.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.ndimage import maximum_filter
+from scipy.sparse import csr_matrix
+
+from ngpt.classical.controlvariates import SWEEPS, decay
+from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
+from ngpt.classical.variances import FLOOR, smoothed
+from ngpt.sequence.warp import bilinear_taps, warped
+
+# Times the squared difference of two interpolations, what is added to the variance of dt. Of 3, 10 and 30 the one of
+# least error on slow shots of the built-in scenes `diffuse` and `glossy`.
+INTERPOLATION = 10
+# Times the variance of dt. It is that of few pairs, most of which saw nothing of what is rare: gloss and caustics above
+# all. Of 1, 4 and 16 the one of least error over slow and fast shots of those scenes and `coffee`, at 2 pairs a pixel.
+DOUBT = 4
+
+
+@dataclass(frozen=True)
+class Link:
+    """What is known of a frame beside the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3), or NaN."""
+
+    motion: np.ndarray
+    dt: np.ndarray
+    dt_var: np.ndarray
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame of a window, arrays (H, W, 3), finite but for variances.
+
+    ``image``      what dx and dy are the differences of
+    ``apart``      light that is no part of it, and of dt: what is to be added to the result
+    ``dx, dy``     its differences
+    ``variances``  of image, dx and dy; NaN where not known
+    ``trusted``    for dx and dy, (H, W) booleans; None if all of them are
+    ``guess``      image and apart, by any method
+    ``link``       to the frame before in the window, None if there is nothing to be known
+    """
+
+    image: np.ndarray
+    apart: np.ndarray
+    dx: np.ndarray
+    dy: np.ndarray
+    variances: tuple[np.ndarray, np.ndarray, np.ndarray]
+    trusted: tuple[np.ndarray, np.ndarray] | None
+    guess: np.ndarray
+    link: Link | None
+
+
+def wcv_frames(frames: Sequence[Frame], sweeps: int = SWEEPS) -> list[np.ndarray]:
+    """Image and light apart of each frame, (H, W, 3) float32: ``wcv`` where frames have no link."""
+    total = [frame.image + frame.apart for frame in frames]
+    dtype = np.float64 if _wide(total) else np.float32
+    total = [image.astype(dtype) for image in total]
+    stills = [_Still(frame, dtype) for frame in frames]
+    level = float(np.mean([still.level for still in stills]))
+    for still in stills:
+        still.divide(level)
+    steps = [
+        None if i == 0 or (link := frame.link) is None else _Step(link, frame.guess, frames[i - 1].guess, level, dtype)
+        for i, frame in enumerate(frames)
+    ]
+    # What dt says of the corrections: those of both frames differ by this.
+    rest = [
+        None if step is None else step.offset - total[i] + step.before(total[i - 1]) for i, step in enumerate(steps)
+    ]
+    corrections = [np.zeros_like(image) for image in total]
+    for factor in decay(sweeps):
+        said = [still.swept(u, factor) for still, u in zip(stills, corrections, strict=True)]
+        for i, step in enumerate(steps):
+            if step is not None:
+                e = corrections[i] - step.before(corrections[i - 1]) - rest[i]
+                step.add(e, factor * stills[i].primal, factor * stills[i - 1].primal, said[i], said[i - 1])
+        corrections = [u + change / weight for u, (change, weight) in zip(corrections, said, strict=True)]
+    return [(image + u).astype(np.float32) for image, u in zip(total, corrections, strict=True)]
+
+
+def _wide(images: Sequence[np.ndarray]) -> bool:
+    """Whether values are so far apart that single precision would not do."""
+    sizes = [np.abs(image) for image in images]
+    typical = float(np.median(np.concatenate([size[size > 0] for size in sizes] + [np.zeros(1)])))
+    return max(float(size.max()) for size in sizes) > FLOAT32_RANGE * typical
+
+
+class _Still:
+    """A frame by itself: ``primal`` is the relative variance (H, W, 1), x and y those of differences."""
+
+    def __init__(self, frame: Frame, dtype: type):
+        p, x, y = frame.variances
+        self.primal, self.x, self.y = smoothed(p), smoothed(x[:, :-1], True), smoothed(y[:-1], True)
+        self.level, self.dtype = robust_mean(self.primal, self.x, self.y), dtype
+        image: np.ndarray = frame.image.astype(dtype)
+        self.dx = frame.dx[:, :-1] - (image[:, 1:] - image[:, :-1])
+        self.dy = frame.dy[:-1] - (image[1:] - image[:-1])
+        self.trusted = frame.trusted
+
+    def divide(self, level: float) -> None:
+        """Variances are relative to those of the whole window from here on."""
+        self.primal, self.x, self.y = (
+            _relative(v, level)[..., None].astype(self.dtype) for v in (self.primal, self.x, self.y)
+        )
+        if self.trusted is not None:
+            self.x[~self.trusted[0][:, :-1]] = np.inf
+            self.y[~self.trusted[1][:-1]] = np.inf
+
+    def swept(self, u: np.ndarray, factor: float) -> tuple[np.ndarray, np.ndarray]:
+        """What the neighbours in the image say beyond u, times weight, and the sum of weights, with u's own of 1."""
+        own = factor * self.primal
+        change, weight = np.zeros_like(u), np.ones_like(own)
+        for here, there, r, v in (
+            (np.s_[:, :-1], np.s_[:, 1:], self.dx, self.x),
+            (np.s_[:-1], np.s_[1:], self.dy, self.y),
+        ):
+            e = u[there] - u[here] - r
+            for side, sign in ((here, 1), (there, -1)):
+                a = own[side] / (own[side] + v)
+                change[side] += sign * a * e
+                weight[side] += a
+        return change, weight
+
+
+class _Step:
+    """From a frame to the one before."""
+
+    def __init__(self, link: Link, guess: np.ndarray, guess_before: np.ndarray, level: float, dtype: type):
+        self.shape = guess.shape
+        height, width = self.shape[:2]
+        pixels = height * width
+        places, weights, found = bilinear_taps(link.motion)
+        spline, _ = warped(guess_before, link.motion, sharp=True)
+        linear, _ = warped(guess_before, link.motion)
+        known = found & np.isfinite(link.dt).all(axis=-1) & np.isfinite(link.dt_var).all(axis=-1)
+        apart: np.ndarray = np.where(known[..., None], spline - linear, 0).astype(dtype)
+        noise = smoothed(np.where(known[..., None], link.dt_var, np.nan), True)
+        wrong = maximum_filter(np.square(apart, dtype=np.float64).sum(axis=-1), 3)
+        variance = np.where(known, _relative(DOUBT * noise + INTERPOLATION * wrong, level), np.inf)
+        self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
+        self.variance: np.ndarray = variance[..., None].astype(dtype)
+        self.known = known[..., None]
+        # B, and what all pixels that look at one say of it: the mean by their variances.
+        rows = np.broadcast_to(np.arange(pixels), places.shape)
+        taps = (weights * known.ravel()).astype(dtype)
+        self.look = csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (pixels, pixels))
+        back = self.look.T.tocsr()
+        precision: np.ndarray = np.where(known, 1 / variance, 0).reshape(-1, 1).astype(dtype)
+        self.precision, total = precision, back @ precision
+        self.cover = np.minimum(back @ self.known.reshape(-1, 1).astype(dtype), 1).reshape(height, width, 1)
+        self.back, self.total = back, np.maximum(total, np.finfo(dtype).tiny)
+        seen = np.maximum(back @ self.known.reshape(-1, 1).astype(dtype), np.finfo(dtype).tiny)
+        self.variance_before = (seen / self.total).reshape(height, width, 1)
+
+    def before(self, image: np.ndarray) -> np.ndarray:
+        """B of an image of the frame before, 0 where it is not known."""
+        return (self.look @ image.reshape(-1, 3)).reshape(self.shape)
+
+    def add(
+        self,
+        e: np.ndarray,
+        own: np.ndarray,
+        own_before: np.ndarray,
+        said: tuple[np.ndarray, np.ndarray],
+        said_before: tuple[np.ndarray, np.ndarray],
+    ) -> None:
+        """Adds what the two frames say of each other, e too much in this one, to the changes and weights of both."""
+        e = np.where(self.known, e, 0)
+        a = own / (own + self.variance)
+        said[0][...] -= a * e
+        said[1][...] += a
+        heard = ((self.back @ (self.precision * e.reshape(-1, 3))) / self.total).reshape(self.shape)
+        a = self.cover * own_before / (own_before + self.variance_before)
+        said_before[0][...] += a * heard
+        said_before[1][...] += a
+
+
+def _relative(variance: np.ndarray, level: float) -> np.ndarray:
+    """Over the mean of all, with the floor of ``smooth_variances``."""
+    return variance / level + FLOOR if level > 0 else np.ones_like(variance)

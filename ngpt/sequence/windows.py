@@ -1,0 +1,128 @@
+"""Reconstruction of a shot from gradients in space and in time: ``wcv`` over windows of frames.
+
+Frames that have ``motion``, ``dt`` and ``dt_var`` hang together with the frame before. A window is ``LENGTH`` of them;
+the next begins ``HOP`` later. A frame's result is the mean over its windows, weighted by how far it is from their ends:
+so results of windows pass over into each other. It knows frames before and after; those beyond its windows play no
+part.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
+
+import numpy as np
+
+from ngpt.classical.bases import CLASSICAL
+from ngpt.denoisers import caustic
+from ngpt.errors import NgptError
+from ngpt.methods import METHODS, Result
+from ngpt.repair import Repaired, repair
+from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
+from ngpt.stack import GradientStack
+
+LENGTH = 10
+HOP = 5
+# The layers by which a frame hangs together with the one before.
+LINK = ("motion", "dt", "dt_var")
+
+
+def reconstruct_shot(
+    stacks: Iterable[GradientStack | None], wanted: Callable[[int], bool] = lambda i: True
+) -> Iterator[tuple[int, GradientStack, Result]]:
+    """(number, stack, result by ``wcv`` over time) of each of ``stacks`` that is ``wanted``, in their order.
+
+    There is a cut before a stack without ``LINK``, of another size, or whose ``ngpt:previousFrame`` is not
+    the stack before, and where a stack is None. At most ``LENGTH`` stacks are in memory. Raises NgptError for stacks
+    that lack a layer of ``wcv``.
+    """
+    run = _Run(wanted)
+    before: GradientStack | None = None
+    for number, stack in enumerate(stacks):
+        if stack is None or before is None or not _follows(stack, before):
+            yield from run.end()
+            run = _Run(wanted)
+        if stack is not None:
+            yield from run.add(_Member(number, stack))
+        before = stack
+    yield from run.end()
+
+
+def _follows(stack: GradientStack, before: GradientStack) -> bool:
+    if any(name not in stack for name in LINK) or stack["primal"].shape != before["primal"].shape:
+        return False
+    frame, previous = before.attributes.get("ngpt:frame"), stack.attributes.get("ngpt:previousFrame")
+    return previous is None or frame is None or previous == frame
+
+
+class _Member:
+    """A frame of a run, and the sum of its results so far."""
+
+    def __init__(self, number: int, stack: GradientStack):
+        self.number, self.stack = number, stack
+        self.sum, self.weight, self.seconds = np.zeros(stack["primal"].shape), 0.0, 0.0
+
+    @cached_property
+    def frame(self) -> Frame:
+        data, stack = self.data, self.stack
+        light = CLASSICAL["wcv"](data)
+        apart = np.zeros_like(light) if data.caustic is None else caustic.denoised(data)
+        link = None
+        if all(name in stack for name in LINK):
+            link = Link(*(stack[name] for name in LINK))
+        return Frame(data.image, apart, data.dx, data.dy, data.variances, data.trusted, light + apart, link)
+
+    @cached_property
+    def data(self) -> Repaired:
+        self.stack.require(*METHODS["wcv"].needs, why="method 'wcv'")
+        return repair(self.stack)
+
+    def result(self) -> tuple[int, GradientStack, Result]:
+        image = (self.sum / self.weight + self.data.direct).astype(np.float32)
+        if not np.isfinite(image).all():
+            raise NgptError(f"{self.stack.path}: method 'wcv' over time gave non-finite pixels; scale the stacks down")
+        options = {"window": LENGTH}
+        made = Result(image, "wcv", self.seconds, self.data.pixels, self.data.gradients, options=options)
+        return self.number, self.stack, made
+
+
+class _Run:
+    """Frames that hang together."""
+
+    def __init__(self, wanted: Callable[[int], bool]):
+        self.wanted = wanted
+        self.members: list[_Member] = []
+        self.solved = 0  # of members, that were in a window
+
+    def add(self, member: _Member) -> Iterator[tuple[int, GradientStack, Result]]:
+        self.members.append(member)
+        if len(self.members) == LENGTH:
+            self._solve()
+            yield from self._give(HOP)
+
+    def end(self) -> Iterator[tuple[int, GradientStack, Result]]:
+        if self.solved < len(self.members):
+            self._solve()
+        yield from self._give(len(self.members))
+
+    def _solve(self) -> None:
+        self.solved = length = len(self.members)
+        if not any(self.wanted(member.number) for member in self.members):
+            return
+        begun = time.perf_counter()
+        frames = [member.frame for member in self.members]
+        images = wcv_frames(frames)
+        seconds = (time.perf_counter() - begun) / length
+        for place, (member, image) in enumerate(zip(self.members, images, strict=True)):
+            weight = min(place + 1, length - place)
+            member.sum += weight * image
+            member.weight += weight
+            member.seconds += seconds
+
+    def _give(self, count: int) -> Iterator[tuple[int, GradientStack, Result]]:
+        given, self.members = self.members[:count], self.members[count:]
+        self.solved -= count
+        for member in given:
+            if self.wanted(member.number):
+                yield member.result()

@@ -1,0 +1,124 @@
+"""Light groups: found by the names of renderers, denoised, and still adding up to the whole."""
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.api import lightgroups
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+
+
+@pytest.fixture
+def lights(rng):
+    """Two lights from left and right with noise, 40x24, and albedo; what has no noise of each."""
+    y, x = np.mgrid[0:24, 0:40] / 40
+    clean = {
+        "Key": np.stack([1 - x, 0.8 * (1 - x), 0.5 * (1 - x)], axis=-1) * (y[..., None] > 0.2),
+        "Fill": np.stack([0.2 * x, 0.3 * x, 0.6 * x], axis=-1) * (x[..., None] > 0.4),
+    }
+    noisy = {name: (light * rng.gamma(4, 0.25, light.shape)).astype(np.float32) for name, light in clean.items()}
+    return clean, noisy
+
+
+def written(path, layers, header=None, type=np.float32):
+    """A file with these layers: name -> (H, W, 3)."""
+    channels = {}
+    for name, image in layers.items():
+        for i, c in enumerate("RGB"):
+            channels[f"{name}.{c}" if name else c] = np.ascontiguousarray(image[..., i], type)
+    write_exr(path, ExrImage([ExrPart("", dict(header or {}), channels)]))
+    return path
+
+
+def cycles(path, noisy, more=(), **options):
+    layers = {"ViewLayer.Combined": sum(noisy.values())} | dict(more)
+    return written(path, layers | {f"ViewLayer.Combined_{name}": light for name, light in noisy.items()}, **options)
+
+
+def total(path, *names):
+    layers = lightgroups.layers_of_light(ngpt.read(path))
+    return sum(layers[name].astype(np.float64) for name in names)
+
+
+@pytest.mark.parametrize("method", ["auto", "ngpt-colour", "primal"])
+def test_groups_add_up_to_the_result(lights, tmp_path, method):
+    clean, noisy = lights
+    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
+    assert main(["denoise", str(path), "-o", str(out), "-m", method, "--groups"]) == 0
+    result = ngpt.read_image(out)
+    names = [f"ViewLayer.Combined_{name}" for name in clean]
+    assert np.abs(total(out, *names) - result).max() <= 1e-5 * np.abs(result).max()
+    denoised = lightgroups.layers_of_light(ngpt.read(out))
+    for name in clean:
+        before, after = (
+            np.mean((image - clean[name]) ** 2) for image in (noisy[name], denoised[f"ViewLayer.Combined_{name}"])
+        )
+        assert method == "primal" or after < 0.5 * before, name
+
+
+def test_light_in_no_group_is_left_to_none(lights, tmp_path):
+    clean, noisy = lights
+    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
+    stack = ngpt.read(path)
+    groups = {"Key": noisy["Key"]}
+    parts = lightgroups.denoised(stack, groups, ngpt.denoise(stack, "ngpt-colour"), "ngpt-colour")
+    assert list(parts) == ["Key"]
+    assert np.mean((parts["Key"] - clean["Key"]) ** 2) < 0.5 * np.mean((noisy["Key"] - clean["Key"]) ** 2)
+    assert not out.exists()
+
+
+def test_shares_keep_the_sum_and_the_sign(rng):
+    parts = rng.random((3, 8, 9, 3)) * (rng.random((3, 8, 9, 3)) > 0.5)
+    parts[:, 2, 3] = 0
+    whole = (rng.random((8, 9, 3)) * 1e4).astype(np.float32)
+    shared = lightgroups.shares(list(parts), whole)
+    assert np.abs(np.sum(shared, axis=0, dtype=np.float64) - whole).max() <= 1e-5 * whole.max()
+    assert np.min(shared) >= 0
+    assert np.allclose(shared[0][2, 3], whole[2, 3] / 3)
+
+
+def test_a_method_that_needs_gradients_gives_way_to_one_that_groups_allow(lights, noisy_stack):
+    stack, _ = noisy_stack
+    half = {"a": 0.25 * stack["primal"], "b": 0.75 * stack["primal"]}
+    whole = ngpt.denoise(stack, "l1")
+    parts = lightgroups.denoised(stack, half, whole, "l1", alpha=0.3)
+    assert np.abs(parts["a"] + parts["b"] - whole).max() < 1e-5 * whole.max()
+
+
+def test_groups_are_found_by_the_names_of_renderers(lights, tmp_path):
+    _, noisy = lights
+    key, fill = noisy.values()
+    arnold = written(tmp_path / "arnold.exr", {"": key + fill, "RGBA_key": key, "RGBA_default": fill, "coat": key})
+    assert set(lightgroups.find(ngpt.read(arnold))) == {"RGBA_key", "RGBA_default"}
+    own = written(tmp_path / "own.exr", {"": key + fill, "light_a": key, "light_b": fill})
+    assert set(lightgroups.find(ngpt.read(own), ["light_*"])) == {"light_a", "light_b"}
+    with pytest.raises(NgptError, match=r"no light groups called Combined_\* or RGBA_\*; .*: light_a, light_b"):
+        lightgroups.find(ngpt.read(own))
+
+
+def test_groups_of_another_view_layer_are_left_alone(lights, tmp_path):
+    _, noisy = lights
+    path = cycles(tmp_path / "two.exr", noisy, {"Other.Combined_Key": noisy["Key"]})
+    assert set(lightgroups.find(ngpt.read(path))) == {"ViewLayer.Combined_Key", "ViewLayer.Combined_Fill"}
+
+
+def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
+    _, noisy = lights
+    mist = {"ViewLayer.Mist": noisy["Key"]}
+    path, out = cycles(tmp_path / "half.exr", noisy, mist, type=np.float16), tmp_path / "out.exr"
+    assert main(["denoise", str(path), "-o", str(out), "-m", "ngpt-colour", "--groups"]) == 0
+    before, after = (ngpt.read(file) for file in (path, out))
+    assert np.array_equal(*(lightgroups.layers_of_light(s)["ViewLayer.Mist"] for s in (before, after)))
+    assert after.source.image.parts[0].channels["ViewLayer.Combined_Key.R"].dtype == np.float16
+    assert after.attributes["ngpt:groups"] == "ViewLayer.Combined_Fill, ViewLayer.Combined_Key"
+    with pytest.raises(NgptError, match="denoised already"):
+        lightgroups.find(after)
+
+
+def test_without_being_asked_for_groups_pass_through(lights, tmp_path):
+    _, noisy = lights
+    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
+    assert main(["denoise", str(path), "-o", str(out), "-m", "ngpt-colour"]) == 0
+    assert np.array_equal(lightgroups.layers_of_light(ngpt.read(out))["ViewLayer.Combined_Key"], noisy["Key"])

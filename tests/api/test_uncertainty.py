@@ -1,0 +1,127 @@
+"""The standard error of a reconstruction: what it says of noise, of scale, and of what a stack must hold."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+
+@pytest.fixture
+def stack(rng):
+    """Noise of 0.1 on the left, of 0.4 on the right, on a grey image, 48x32; gradients with a tenth of it."""
+    noise = np.full((32, 48, 3), 0.1)
+    noise[:, 24:] = 0.4
+    primal = 1 + noise * rng.standard_normal(noise.shape)
+    dx, dy = (0.1 * noise * rng.standard_normal(noise.shape) for _ in range(2))
+    variances = {"primal_var": noise**2, "dx_var": (0.1 * noise) ** 2, "dy_var": (0.1 * noise) ** 2}
+    return GradientStack.from_arrays(primal=primal, dx=dx, dy=dy, **variances)
+
+
+def test_the_error_of_an_image_as_it_is_is_its_noise(stack):
+    result = ngpt.reconstruct_with_error(stack, "primal")
+    assert np.array_equal(result.image, ngpt.denoise(stack, "primal"))
+    expected = FACTORS["primal"] * np.sqrt(stack["primal_var"])
+    assert result.error.shape == result.image.shape and result.error.dtype == np.float32
+    for side in (np.s_[:, :18], np.s_[:, 30:]):
+        assert np.mean(result.error[side]) == pytest.approx(np.mean(expected[side]), rel=0.05)
+
+
+def test_it_says_how_far_the_truth_is(stack):
+    """Of a method that removes noise, on a flat image, where there is no bias: never too little."""
+    result = ngpt.reconstruct_with_error(stack, "wcv")
+    within = np.mean(np.abs(result.image - 1) <= result.error)
+    assert 0.6 < within < 0.95
+    assert np.mean(result.error) < 0.5 * np.mean(np.sqrt(stack["primal_var"]))
+
+
+@pytest.mark.parametrize("method", ["wcv", "l1", "ngpt-colour"])
+def test_it_scales_with_the_image_and_is_the_same_again(stack, method):
+    error = ngpt.reconstruct_with_error(stack, method).error
+    assert np.array_equal(error, ngpt.reconstruct_with_error(stack, method).error)
+    for k in (2.0**-10, 2.0**10):
+        layers = {name: stack[name] * (k * k if name.endswith("_var") else k) for name in stack.names}
+        scaled = ngpt.reconstruct_with_error(GradientStack(layers), method).error
+        assert np.abs(scaled / k - error).max() < 0.01 * error.max()
+
+
+def test_without_noise_there_is_none(stack):
+    silent = stack.replace(**{name: 0 * stack[name] for name in ("primal_var", "dx_var", "dy_var")})
+    assert not ngpt.reconstruct_with_error(silent, "wcv").error.any()
+
+
+def test_variances_that_are_not_finite_count_as_no_noise(stack):
+    variance = stack["primal_var"].copy()
+    variance[3, 4], variance[5, 6] = np.nan, np.inf
+    noisy = noisier(stack.replace(primal_var=variance))
+    assert np.array_equal(noisy["primal"][[3, 5], [4, 6]], stack["primal"][[3, 5], [4, 6]])
+    assert np.isfinite(ngpt.reconstruct_with_error(stack.replace(primal_var=variance), "wcv").error).all()
+
+
+def test_the_light_apart_is_part_of_the_primal(stack, rng):
+    light = np.abs(rng.standard_normal(stack["primal"].shape)).astype(np.float32)
+    with_light = stack.replace(caustic=light, caustic_var=0.01 * light, primal=stack["primal"] + light)
+    noisy = noisier(with_light)
+    # Of one draw: what is added to the rest is what is added to a stack without such light.
+    rest = noisy["primal"] - noisy["caustic"]
+    assert np.allclose(rest, noisier(stack)["primal"], atol=1e-5)
+    assert np.var(noisy["caustic"] - light) == pytest.approx(np.mean(0.01 * light), rel=0.1)
+
+
+def test_a_change_of_any_size_is_measured():
+    image = np.zeros((12, 12, 3), np.float32)
+    for size in (1e-30, 1.0, 1e30):
+        assert np.allclose(change(image, image + np.float32(size)), size)
+    assert not change(image, image).any()
+
+
+def test_stacks_without_variances_are_refused(stack):
+    colour = GradientStack.from_arrays(primal=stack["primal"])
+    with pytest.raises(NgptError, match="an estimate of the error needs layer 'primal_var'"):
+        ngpt.reconstruct_with_error(colour)
+    some = {name: stack[name] for name in stack.names if name != "dy_var"}
+    with pytest.raises(NgptError, match="what gradients give needs layer 'dy_var'"):
+        ngpt.reconstruct_with_error(GradientStack(some))
+
+
+def test_the_command_writes_the_layer(stack, tmp_path):
+    ngpt.write(tmp_path / "stack.exr", stack)
+    out = tmp_path / "out.exr"
+    assert main(["denoise", str(tmp_path / "stack.exr"), "-o", str(out), "-m", "wcv", "--error"]) == 0
+    result = ngpt.read(out)
+    expected = ngpt.reconstruct_with_error(stack, "wcv")
+    assert np.array_equal(result["error"], expected.error)
+    assert np.array_equal(ngpt.read_image(out), expected.image)
+    # A result of the result has its own, or none.
+    assert main(["denoise", str(out), "-o", str(tmp_path / "again.exr"), "-m", "l2"]) == 0
+    assert "error" not in ngpt.read(tmp_path / "again.exr")
+    assert main(["denoise", str(out), "-o", str(tmp_path / "third.exr"), "-m", "primal", "--error"]) == 0
+    assert not np.array_equal(ngpt.read(tmp_path / "third.exr")["error"], expected.error)
+
+
+def test_the_page_has_the_numbers_of_the_benchmark():
+    from bench.uncertainty import line
+
+    root = Path(__file__).parents[2]
+    methods = json.loads((root / "bench" / "results" / "uncertainty.json").read_text())["methods"]
+    page = (root / "docs" / "use" / "uncertainty.md").read_text()
+    assert FACTORS.keys() <= methods.keys()
+    for name, row in methods.items():
+        assert row["factor"] == FACTORS.get(name, FACTOR), f"{name}: run python -m bench.uncertainty"
+        assert line(name, row) in page
+
+
+def test_coverage_counts_the_noise_of_the_reference():
+    from bench.uncertainty import covered, miss
+
+    rng = np.random.default_rng(0)
+    error, noise = 0.3 * rng.standard_normal(100_000), 0.4 * rng.standard_normal(100_000)
+    one = (error + noise, np.full(100_000, 0.3), np.full(100_000, 0.4**2))
+    assert covered(one, 1.0) == pytest.approx({"68": 0.683, "95": 0.95}, abs=0.01)
+    assert miss([one], 1.0) < 0.01 < miss([one], 2.0)

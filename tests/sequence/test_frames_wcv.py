@@ -1,0 +1,157 @@
+"""wcv over frames: the known answers, and what it is without differences in time."""
+
+import numpy as np
+import pytest
+
+from ngpt.classical.controlvariates import decay, wcv
+from ngpt.classical.gradients import forward_differences
+from ngpt.sequence import wcv_frames as module
+from ngpt.sequence.warp import bilinear_taps, warped
+from ngpt.sequence.wcv_frames import FLOOR, Frame, Link, wcv_frames
+
+SIZE = (12, 16, 3)
+
+
+def frame(image, noise, rng, link=None, spread=1.0, trusted=None):
+    """A frame of an image with that much noise, and none in its differences."""
+    dx, dy = forward_differences(image)
+    variances = np.full(SIZE, noise**2), np.full(SIZE, spread), np.full(SIZE, spread)
+    noisy = image + noise * rng.normal(size=SIZE)
+    return Frame(noisy, np.zeros(SIZE), dx, dy, variances, trusted, noisy, link)
+
+
+def link(now, before, motion, variance=1e-6, noise=0.0, rng=None):
+    there, found = warped(before, motion)
+    dt = np.where(found[..., None], now - there, np.nan)
+    if noise:
+        dt = dt + noise * rng.normal(size=SIZE)
+    return Link(motion, dt, np.full(SIZE, variance))
+
+
+def error(results, truth):
+    return np.mean([np.square(result - image).mean() for result, image in zip(results, truth, strict=True)])
+
+
+def test_without_differences_in_time_it_is_wcv(rng):
+    image = rng.random(SIZE)
+    stills = [frame(image, 0.3, rng, spread=0.01) for _ in range(2)]
+    unknown = Link(np.zeros((*SIZE[:2], 2)), np.full(SIZE, np.nan), np.full(SIZE, np.nan))
+    trusted = rng.random(SIZE[:2]) > 0.1, rng.random(SIZE[:2]) > 0.1
+    alone = frame(image, 0.3, rng, spread=0.01, trusted=trusted)
+    for given in ([stills[0]], [stills[0], frame(image, 0.3, rng, unknown)], [alone]):
+        f = given[0]
+        expected = wcv(*(a.astype(float) for a in (f.image, f.dx, f.dy, *f.variances)), f.trusted)
+        if len(given) == 1:
+            assert np.allclose(wcv_frames(given)[0], expected, atol=1e-5)
+    pair = [stills[0], frame(image, 0.3, rng, unknown, spread=0.01)]
+    assert np.allclose(wcv_frames(pair)[0], wcv_frames([stills[0], stills[1]])[0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("motion", "share"), [((0.0, 0.0), 0.35), ((2.0, -1.0), 0.55), ((0.3, 0.6), 0.55)])
+def test_frames_share_what_they_know(rng, motion, share):
+    """Light that changes by what dt says: the noise of a frame falls with their number, and nothing is biased."""
+    truth = [rng.random(SIZE) + t for t in range(6)]
+    moved = np.broadcast_to(motion, (*SIZE[:2], 2))
+    noise = [0.3 * rng.normal(size=SIZE) for _ in truth]
+
+    def results(linked):
+        found = []
+        for t, image in enumerate(truth):
+            known = link(image, truth[t - 1], moved) if t and linked else None
+            one = frame(image, 0.3, rng, known, spread=100.0)
+            noisy = image + noise[t]
+            # A first guess without noise has what interpolation does not know.
+            found.append(Frame(noisy, one.apart, one.dx, one.dy, one.variances, None, np.zeros(SIZE), known))
+        return wcv_frames(found)
+
+    alone, together = error(results(False), truth), error(results(True), truth)
+    assert together < share * alone
+
+
+def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
+    """Against sums over the neighbours of each pixel, one after the other, for whole motion."""
+    monkeypatch.setattr(module, "INTERPOLATION", 0)
+    height, width = SIZE[:2]
+    shift = (1, -2)
+    motion = np.broadcast_to(np.float64(shift), (height, width, 2))
+    images = [rng.random(SIZE), rng.random(SIZE)]
+    frames = [frame(image, 0.2, rng, spread=0.02) for image in images]
+    frames[1] = frame(images[1], 0.2, rng, link(images[1], images[0], motion, 0.01, 0.1, rng), spread=0.02)
+    found = wcv_frames(frames, sweeps=3)
+
+    flat = [0.2**2 * 3, 0.02 * 3, module.DOUBT * max(0.03, 3 * 0.03)]
+    sums = {"p": flat[0], "d": max(flat[1], 3 * flat[1])}
+    counts = [height * width, height * (width - 1), (height - 1) * width]
+    level = (counts[0] * sums["p"] + (counts[1] + counts[2]) * sums["d"]) / sum(counts)
+    p, d, t = (v / level + FLOOR for v in (sums["p"], sums["d"], flat[2]))
+    u = [np.array(f.image) for f in frames]
+    for factor in decay(3):
+        own, new = factor * p, [np.array(v) for v in u]
+        for k in (0, 1):
+            for y in range(height):
+                for x in range(width):
+                    change, weight = np.zeros(3), 1.0
+                    for oy, ox, layer, ly, lx in (
+                        (0, 1, "dx", 0, 0),
+                        (0, -1, "dx", 0, -1),
+                        (1, 0, "dy", 0, 0),
+                        (-1, 0, "dy", -1, 0),
+                    ):
+                        if 0 <= y + oy < height and 0 <= x + ox < width:
+                            difference = getattr(frames[k], layer)[y + ly, x + lx]
+                            sign = 1 if oy + ox > 0 else -1
+                            a = own / (own + d)
+                            change += a * (u[k][y + oy, x + ox] - sign * difference - u[k][y, x])
+                            weight += a
+                    qy, qx = (y + shift[1], x + shift[0]) if k else (y - shift[1], x - shift[0])
+                    if 0 <= qy < height and 0 <= qx < width:
+                        dt = frames[1].link.dt[(y, x) if k else (qy, qx)]
+                        a = own / (own + t)
+                        change += a * (u[1 - k][qy, qx] + (dt if k else -dt) - u[k][y, x])
+                        weight += a
+                    new[k][y, x] = u[k][y, x] + change / weight
+        u = new
+    for result, expected in zip(found, u, strict=True):
+        assert np.allclose(result, expected, atol=2e-5)
+
+
+def test_noisy_differences_in_time_count_little(rng):
+    truth = [np.ones(SIZE) * (1 + t) for t in range(5)]
+    still = np.zeros((*SIZE[:2], 2))
+    spread = [frame(image, 0.1, rng, spread=0.01) for image in truth]
+    bad = [
+        frame(image, 0.1, rng, link(image, truth[t - 1], still, 4.0, 2.0, rng) if t else None, spread=0.01)
+        for t, image in enumerate(truth)
+    ]
+    assert error(wcv_frames(bad), truth) < 1.3 * error(wcv_frames(spread), truth)
+
+
+def test_it_follows_the_exposure_and_keeps_values_far_apart(rng):
+    truth = [rng.random(SIZE) for _ in range(3)]
+    still = np.zeros((*SIZE[:2], 2))
+
+    def results(k):
+        found = []
+        own = np.random.default_rng(3)
+        for t, image in enumerate(truth):
+            known = link(k * image, k * truth[t - 1], still, 1e-4 * k**2) if t else None
+            one = frame(image, 0.2, own, None, spread=0.01)
+            variances = tuple(v * k**2 for v in one.variances)
+            found.append(Frame(k * one.image, one.apart, k * one.dx, k * one.dy, variances, None, k * one.image, known))
+        return wcv_frames(found)
+
+    plain = results(1.0)
+    for k in (2.0**-10, 2.0**10):
+        assert all(np.allclose(a, k * b, rtol=1e-4) for a, b in zip(results(k), plain, strict=True))
+    image = np.ones(SIZE)
+    image[0, 0] = 1e12
+    lamp = [frame(image, 0.0, rng, link(image, image, still) if t else None) for t in range(3)]
+    assert all(np.allclose(result, image, rtol=1e-6, atol=1e-3) for result in wcv_frames(lamp))
+
+
+def test_taps_are_those_of_the_bilinear_image(rng):
+    image, motion = rng.random(SIZE), rng.uniform(-4, 4, (*SIZE[:2], 2))
+    motion[2, 3] = np.nan
+    places, weights, found = bilinear_taps(motion)
+    value = (image.reshape(-1, 3)[places] * weights[..., None]).sum(axis=0).reshape(SIZE)
+    assert not found[2, 3] and np.allclose(value[found], warped(image, motion)[0][found])

@@ -1,0 +1,197 @@
+"""Reconstruction over time: laws that hold for any method."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scipy.ndimage import gaussian_filter
+
+from ngpt.sequence.flicker import flicker
+from ngpt.sequence.history import LONGEST, Temporal
+from ngpt.stack import GradientStack
+
+SIZE = (40, 56)
+SIGMA = 0.2
+
+
+def scene(height=SIZE[0], width=SIZE[1], offset=0):
+    """A smooth image with an edge, and its features; ``offset`` pixels further to the right."""
+    y, x = np.mgrid[:height, :width].astype(float)
+    x = x + offset
+    image = np.stack([1.5 + np.sin(x / 9 + c) * np.cos(y / 7) for c in range(3)], axis=-1)
+    image[x > 30] *= 0.5
+    albedo = np.where((x > 30)[..., None], 0.3, [0.6, 0.7, 0.8])
+    normal = np.broadcast_to([0.0, 0.0, 1.0], image.shape)
+    return image, {"albedo": albedo, "normal": normal, "depth": 4 + 0.01 * y[..., None] + (x > 30)[..., None]}
+
+
+def frame_of(image, features, rng, motion=(0, 0), sigma=SIGMA, **attributes):
+    layers = dict(features)
+    if motion is not None:
+        layers["motion"] = np.broadcast_to(motion, (*image.shape[:2], 2))
+    noisy = image + rng.normal(0, sigma, image.shape)
+    layers |= {"primal": noisy, "primal_var": np.full(image.shape, sigma**2)}
+    return GradientStack({k: np.ascontiguousarray(v, np.float32) for k, v in layers.items()}, attributes)
+
+
+def smooth(stack):
+    return gaussian_filter(stack["primal"], (1.5, 1.5, 0))
+
+
+def identity(stack):
+    return stack["primal"]
+
+
+def mse(image, truth):
+    return float(np.mean(np.square(image - truth)))
+
+
+@pytest.mark.parametrize("method", [identity, smooth])
+def test_a_shot_at_rest_converges(rng, method):
+    image, features = scene()
+    temporal, stacks = Temporal(), [frame_of(image, features, rng) for _ in range(LONGEST)]
+    alone = [method(stack) for stack in stacks]
+    over_time = [temporal.next(*pair) for pair in zip(stacks, alone, strict=True)]
+    assert np.array_equal(over_time[0], alone[0])
+    blur = mse(method(stacks[0].replace(primal=image)), image)
+    noise = mse(alone[-1], image) - blur
+    assert mse(over_time[-1], image) - blur < 0.25 * noise
+    motions = [stack["motion"] for stack in stacks]
+    truth = [image] * len(stacks)
+    assert flicker(over_time[4:], truth[4:], motions[4:]) < 0.1 * flicker(alone[4:], truth[4:], motions[4:])
+
+
+def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng):
+    """As if at rest: the frame before, moved by a pixel, with the same noise."""
+    image, features = scene()
+    one, other = frame_of(image, features, rng), frame_of(image, features, rng)
+    moved = GradientStack({name: np.roll(layer, -1, axis=1) for name, layer in other.layers.items()})
+    moved = moved.replace(motion=np.broadcast_to([1.0, 0.0], (*SIZE, 2)))
+    rest, path = Temporal(), Temporal()
+    rest.next(one, smooth(one))
+    path.next(one, smooth(one))
+    at_rest, on_path = rest.next(other, smooth(other)), path.next(moved, np.roll(smooth(other), -1, axis=1))
+    # Windows see other things near the border, and some statistics are those of the whole image.
+    inside = np.s_[14:-14, 14:-15]
+    wrong, blended = (np.abs(on_path - np.roll(image, -1, axis=1))[inside] for image in (at_rest, smooth(other)))
+    assert wrong.mean() < 0.15 * blended.mean()
+    assert path.weight[inside].mean() > 0.4
+
+
+@pytest.mark.parametrize("name", ["albedo", "normal", "depth"])
+def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
+    image, features = scene()
+    before = frame_of(3 * image, features, rng)
+    now = frame_of(image, features, rng)
+    changed = now[name].copy()
+    shown = np.s_[10:30, 5:25]
+    changed[shown] = {"albedo": 0.1, "normal": [1, 0, 0], "depth": 9}[name]
+    now = now.replace(**{name: changed})
+    temporal = Temporal()
+    temporal.next(before, smooth(before))
+    result = temporal.next(now, smooth(now))
+    within = np.s_[11:29, 6:24]
+    assert np.allclose(temporal.weight[within], 0, atol=1e-4)
+    assert np.allclose(result[within], smooth(now)[within], atol=1e-3)
+
+
+def test_a_cut_restarts(rng):
+    image, features = scene()
+    stacks = [frame_of(image, features, rng, **{"ngpt:frame": i, "ngpt:previousFrame": i - 1}) for i in range(5)]
+    for second in (
+        stacks[2],  # frame 1 is missing
+        GradientStack({k: v for k, v in stacks[1].layers.items() if k != "motion"}),
+        stacks[1].replace(motion=np.full((*SIZE, 2), np.nan)),
+        stacks[1].replace(motion=np.full((*SIZE, 2), 100.0)),
+        GradientStack({k: v[:20] for k, v in stacks[1].layers.items()}),
+    ):
+        temporal = Temporal()
+        temporal.next(stacks[0], smooth(stacks[0]))
+        assert np.array_equal(temporal.next(second, smooth(second)), smooth(second))
+        assert temporal.share == 0
+    temporal.next(stacks[1], smooth(stacks[1]))  # a cut, too, and a beginning
+    temporal.next(stacks[2], smooth(stacks[2]))
+    assert temporal.share > 0.3
+
+
+def test_history_of_another_light_is_left_alone(rng):
+    image, features = scene()
+    temporal = Temporal()
+    for _ in range(LONGEST):
+        stack = frame_of(image, features, rng)
+        temporal.next(stack, smooth(stack))
+    stack = frame_of(2 * image, features, rng)
+    result = temporal.next(stack, smooth(stack))
+    assert temporal.share < 0.05
+    assert mse(result, 2 * image) < 1.2 * mse(smooth(stack), 2 * image)
+
+
+def test_no_step_of_slow_changes_costs_more_than_it_gains(rng):
+    """Light that grows by 2 % a frame: history lags behind, and the evidence sees to it that it does not by much."""
+    image, features = scene()
+    temporal, alone, over_time = Temporal(), [], []
+    for i in range(24):
+        stack = frame_of(image * 1.02**i, features, rng)
+        truth = image * 1.02**i
+        over_time.append(mse(temporal.next(stack, smooth(stack)), truth) / 1.02 ** (2 * i))
+        alone.append(mse(smooth(stack), truth) / 1.02 ** (2 * i))
+    assert np.mean(over_time[4:]) < 1.1 * np.mean(alone[4:])
+
+
+@pytest.mark.parametrize("k", [2.0**-10, 2.0**10])
+def test_exposure_does_not_matter(rng, k):
+    image, features = scene()
+    stacks = [frame_of(image, features, rng) for _ in range(3)]
+    plain, scaled = Temporal(), Temporal()
+    for stack in stacks:
+        result = plain.next(stack, smooth(stack))
+        bright = stack.replace(primal=k * stack["primal"], primal_var=k**2 * stack["primal_var"])
+        assert np.allclose(scaled.next(bright, k * smooth(stack)), k * result, rtol=1e-3, atol=1e-4 * k)
+
+
+def test_direct_emission_is_that_of_this_frame(rng):
+    image, features = scene()
+    emission = np.zeros_like(image)
+    emission[5:9, 5:9] = 50
+    temporal = Temporal()
+    for i in range(3):
+        stack = frame_of(image, features, rng)
+        lamp = np.roll(emission, 2 * i, axis=1)
+        stack = stack.replace(primal=stack["primal"] + lamp, direct=lamp)
+        result = temporal.next(stack, smooth(stack.replace(primal=stack["primal"] - lamp)) + lamp)
+    assert np.abs(result - lamp - image).max() < 1
+
+
+@pytest.mark.parametrize("without", [("primal_var",), ("albedo", "normal", "depth"), ("primal_var", "depth")])
+def test_variances_and_features_are_not_needed(rng, without):
+    image, features = scene()
+    temporal, last = Temporal(), 0.0
+    for _ in range(8):
+        stack = frame_of(image, features, rng)
+        stack = GradientStack({name: layer for name, layer in stack.layers.items() if name not in without})
+        last = mse(temporal.next(stack, smooth(stack)), image) / mse(smooth(stack), image)
+    assert last < 0.9
+
+
+def test_pixels_that_are_not_finite_do_no_harm(rng):
+    image, features = scene()
+    temporal = Temporal()
+    for i in range(3):
+        stack = frame_of(image, features, rng)
+        primal, variance, depth = (stack[name].copy() for name in ("primal", "primal_var", "depth"))
+        primal[3 + i, 4] = np.nan
+        variance[10] = np.nan
+        variance[12, 12] = np.inf
+        depth[20, 20] = np.inf
+        stack = stack.replace(primal=primal, primal_var=variance, depth=depth)
+        result = temporal.next(stack, smooth(stack.replace(primal=np.nan_to_num(primal, nan=1.0))))
+        assert np.isfinite(result).all()
+    assert temporal.share > 0.3
+
+
+def test_neither_torch_nor_mitsuba_is_imported():
+    code = (
+        "import sys, ngpt.sequence.history, ngpt.cli.denoise; print({'torch', 'mitsuba', 'drjit'} & sys.modules.keys())"
+    )
+    assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
