@@ -15,6 +15,8 @@ from ngpt.system.records import from_table, read_toml
 
 # Of which seeds pictures are kept.
 IMAGES = ("first", "all", "none")
+# What equal time is: of the wall, or of all processors, which other work on the machine does not change.
+CLOCKS = ("wall", "processor")
 
 
 @dataclass(frozen=True)
@@ -48,10 +50,12 @@ class Config:
     samplers: tuple[str, ...] = (KINDS["gradients"],)
     rivals: tuple[str, ...] = (KINDS["features"],)
     clock: str = KINDS["gradients"]
+    time: str = "wall"
     metrics: tuple[str, ...] = ("relMSE", "relMSE trimmed", "relMSE NGPT", "SMAPE", "PSNR", "SSIM", "FLIP")
     primary: str = "relMSE trimmed"
     reference_spp: int = 0
     reference_seconds: float = 60.0
+    reference_sampler: str = KINDS["path"]
     timing_spp: int = 32
     timing_repeats: int = 3
     images: str = "first"
@@ -71,6 +75,7 @@ class Config:
             (bool(unknown), f"no metric '{''.join(unknown[:1])}'; there are: {', '.join(METRICS)}"),
             (self.primary not in self.metrics, f"primary = '{self.primary}' is not among metrics"),
             (self.images not in IMAGES, f"images = '{self.images}': choose one of: {', '.join(IMAGES)}"),
+            (self.time not in CLOCKS, f"time = '{self.time}': choose one of: {', '.join(CLOCKS)}"),
             (len(set(self.methods)) < len(self.methods), "a method is listed twice"),
             (not self.samplers or not self.rivals, "samplers and rivals must not be empty"),
             (len({*self.samplers, *self.rivals}) < len(self.samplers) + len(self.rivals), "a sampler is listed twice"),
@@ -102,11 +107,9 @@ class Config:
         method, kind, sampler = table.pop("method", name), table.pop("stack", ""), table.pop("sampler", "")
         layers = (*METHODS[method].needs, *METHODS[method].uses) if method in METHODS else ()
         kind = kind or ("gradients" if "dx" in layers else "features" if len(layers) > 1 else "path")
-        if sampler:
-            return [Column(name, name, method, Render(kind, sampler), table)]
-        samplers = self.samplers if kind == "gradients" else self.rivals
+        samplers = (sampler,) if sampler else self.samplers if kind == "gradients" else self.rivals
         names = [f"{name} ({sampler})" if len(samplers) > 1 else name for sampler in samplers]
-        return [Column(n, name, method, Render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
+        return [Column(n, name, method, _render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
 
     def scene_files(self) -> dict[str, str]:
         """Name -> built-in scene, scene file or folder of stacks; patterns are resolved."""
@@ -124,6 +127,11 @@ class Config:
 
     def to_dict(self) -> dict:
         return asdict(self)
+
+
+def _render(kind: str, sampler: str) -> Render:
+    """Features are left out where they can be: by the sampler that the image alone is usually rendered by."""
+    return Render("features" if kind == "path" and sampler != KINDS["path"] else kind, sampler)
 
 
 def file_part(column: str) -> str:

@@ -21,7 +21,7 @@ from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
 from ngpt.evaluation.keys import renderer_hash, scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
-from ngpt.evaluation.renders import DEFAULTS, Render
+from ngpt.evaluation.renders import DEFAULTS, KINDS, Render
 from ngpt.io.exr import read, write
 from ngpt.stack import GradientStack
 from ngpt.system.machine import version
@@ -68,7 +68,8 @@ class SceneStacks:
         if self.given:
             return find_reference(self.folder)
         limit = f"{config.reference_spp}spp" if config.reference_spp else f"{config.reference_seconds:g}s"
-        paths = [self.folder / f"reference-{limit}{half}.exr" for half in HALVES]
+        by = "" if config.reference_sampler == KINDS["path"] else f"{config.reference_sampler}-"
+        paths = [self.folder / f"reference-{by}{limit}{half}.exr" for half in HALVES]
         for i, path in enumerate(paths):
             if not path.exists():
                 self.say(f"{self.name}: rendering the reference, half {i + 1} of {limit}")
@@ -77,7 +78,8 @@ class SceneStacks:
 
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
-                write(path, render_stack(scene, spp, REFERENCE_SEED + i, "primal", seconds=seconds))
+                sampler = config.reference_sampler
+                write(path, render_stack(scene, spp, REFERENCE_SEED + i, sampler, seconds=seconds))
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
@@ -90,23 +92,26 @@ class SceneStacks:
         if self.given:
             return {}
         spp, repeats = self.config.timing_spp, self.config.timing_repeats
-        path = self.folder / f"cost-{spp}-{repeats}.json"
+        clock = "" if self.config.time == "wall" else f"{self.config.time}-"
+        path = self.folder / f"cost-{clock}{spp}-{repeats}.json"
         known: Costs = json.loads(path.read_text()) if path.exists() else {}
         self._auto = known[USUAL.name]["sampler"] if known else _sampler(self._warm_up(USUAL))
-        clock = self.clock
-        new = {r.name: r for r in map(self.resolve, (clock, *DEFAULTS, *renders)) if r.name not in known}
+        unit_of = self.clock
+        new = {r.name: r for r in map(self.resolve, (unit_of, *DEFAULTS, *renders)) if r.name not in known}
         new = {name: render for name, render in new.items() if self._can(render)}
-        if clock.name in self.lacks:
-            raise NgptError(f"the clock, sampler '{clock.sampler}', cannot be measured: {self.lacks[clock.name]}")
+        if unit_of.name in self.lacks:
+            raise NgptError(f"the clock, sampler '{unit_of.sampler}', cannot be measured: {self.lacks[unit_of.name]}")
         if new:
             self.say(f"{self.name}: measuring what samples cost")
             scene = self.load()
             from data_gen.choosing.costs import measure
 
-            timed = {clock.name: clock} | new
-            seconds, _ = measure(scene, {name: r.options for name, r in timed.items()}, spp, repeats)
+            timed = {unit_of.name: unit_of} | new
+            seconds, _ = measure(
+                scene, {name: r.options for name, r in timed.items()}, spp, repeats, clock=self.config.time
+            )
             found = {name: summary(values) for name, values in seconds.items()}
-            unit = known[clock.name]["median"] / found[clock.name]["median"] if clock.name in known else 1.0
+            unit = known[unit_of.name]["median"] / found[unit_of.name]["median"] if unit_of.name in known else 1.0
             for name in new:
                 known[name] = {key: value * unit for key, value in found[name].items()}
                 known[name]["sampler"] = _sampler(self._warm[name])
@@ -141,7 +146,7 @@ class SceneStacks:
             from data_gen.choosing.costs import timed
 
             self._warm_up(render)
-            stack, seconds = timed(scene, render.options, spp, seed)
+            stack, seconds = timed(scene, render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
             write(path, stack)
         # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.

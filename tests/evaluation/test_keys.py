@@ -70,7 +70,7 @@ def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):
     before = key_of("diffuse", tmp_path)
     film = tree / "film" / "gradient_film.py"
     film.write_text("# A remark.\n" + re.sub(r'"""(?=[A-Z])', '"""More words. ', film.read_text()))
-    for name in ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "costs.py", "__main__.py"):
+    for name in ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/costs.py", "__main__.py"):
         (tree / name).write_text((tree / name).read_text() + "\nsomething = 1\n")
     assert key_of("diffuse", tmp_path) == before
 

@@ -8,6 +8,7 @@ import pytest
 from folders import read, write_scene
 
 import ngpt
+from ngpt.errors import NgptError
 from ngpt.evaluation.config import Config
 from ngpt.evaluation.renders import Render
 from ngpt.evaluation.run import evaluate
@@ -34,7 +35,7 @@ def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack():
     assert columns(methods=methods, samplers=("gpt-basic",))["wcv"] == ("wcv", "gradients gpt-basic")
     assert columns(methods=methods, samplers=("auto", "gpt-basic"), rivals=("primal", "ppm")) == {
         "primal (primal)": ("primal", "path"),
-        "primal (ppm)": ("primal", "path ppm"),
+        "primal (ppm)": ("primal", "features ppm"),
         "wcv (auto)": ("wcv", "gradients"),
         "wcv (gpt-basic)": ("wcv", "gradients gpt-basic"),
         "oidn (primal)": ("oidn", "features"),
@@ -53,7 +54,7 @@ def test_a_variant_names_its_own_sampler():
         "wcv (toy)": ("wcv", "gradients toy"),
         "wcv-replayed": ("wcv", "gradients gpt-basic"),
         "raw": ("primal", "gradients gpt"),
-        "photons": ("primal", "path ppm"),
+        "photons": ("primal", "features ppm"),
     }
 
 
@@ -146,6 +147,25 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
     slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "")
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
+
+
+def test_processor_time_and_a_reference_by_another_sampler(renderer, tmp_path, monkeypatch):
+    from itertools import count
+
+    from data_gen.choosing import costs
+
+    ticks = count()
+    monkeypatch.setitem(costs.CLOCKS, "processor", lambda: float(next(ticks)))
+    config = read(SETTINGS + 'time = "processor"\nreference_sampler = "gpt"\n', tmp_path)
+    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, lambda text: None)
+    stacks.reference()
+    halves = [ngpt.read(path) for path in sorted(stacks.folder.glob("reference-gpt-128spp*"))]
+    assert [half.attributes["ngpt:sampler"] for half in halves] == ["gpt", "gpt"]
+    # Every render takes a tick of that clock, so samples cost the same; so does a stack.
+    assert {cost["median"] for cost in stacks.costs().values()} == {1 / 8}
+    assert stacks.stack(stacks.clock, 4, 0).attributes["ngpt:seconds"] == 1
+    with pytest.raises(NgptError, match="time = 'cpu': choose one of: wall, processor"):
+        read(SETTINGS + 'time = "cpu"\n', tmp_path)
 
 
 def test_a_sampler_of_the_other_kind_is_refused_with_the_entry_it_belongs_to(renderer, tmp_path):
