@@ -42,7 +42,8 @@ def measure(
 ) -> tuple[dict[str, list[float]], GradientStack]:
     """Seconds per sample of the whole image for each render, name -> options, and the last stack of the first of them.
 
-    Seconds are by one of ``CLOCKS``. Each is rendered ``repeats`` times, with seeds from ``seed`` on, in turn, so that a busy moment hits all alike.
+    Seconds are by one of ``CLOCKS``. Each is rendered ``repeats`` times, with seeds from ``seed`` on, in turn, so that
+    a busy moment hits all alike.
     """
     seconds: dict[str, list[float]] = {name: [] for name in renders}
     first = next(iter(renders))
