@@ -41,7 +41,7 @@ def frames(args: argparse.Namespace) -> Iterator[np.ndarray]:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
-    from data_gen.frames.sequence import Shot, render_sequence
+    from data_gen.frames.shot import Shot, render_shot
 
     size = tuple(map(int, args.size.split("x")))
     path = sideways(Shot(lambda frame: (args.scene, {}), size).at(0), SPEEDS[args.shot])
@@ -51,7 +51,7 @@ def frames(args: argparse.Namespace) -> Iterator[np.ndarray]:
         files = [args.cache / sampler / f"{frame:04d}.exr" for frame in range(args.frames)]
         files[0].parent.mkdir(parents=True, exist_ok=True)
         there = [file.exists() for file in files]
-        for frame, stack in render_sequence(shot, range(args.frames), spp, 1, skip=there.__getitem__, sampler=sampler):
+        for frame, stack in render_shot(shot, range(args.frames), spp, 1, skip=there.__getitem__, sampler=sampler):
             ngpt.write(files[frame], stack)
         kinds.append([ngpt.read(file) for file in files])
     temporal, exposure = Temporal(), None

@@ -71,7 +71,7 @@ def main() -> None:
 
 def shot_of(args: argparse.Namespace, scene: str, shot: str, size: str):
     """The scene with what moves in that shot."""
-    from data_gen.frames.sequence import Shot
+    from data_gen.frames.shot import Shot
 
     pixels = tuple(map(int, size.split("x")))
     name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
@@ -138,25 +138,25 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
 
 def compare(args: argparse.Namespace, scene: str, shot: str, cost: dict) -> dict:
     """Noise of a frame, and errors of reconstructions at equal processor time."""
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
     camera = shot_of(args, scene, shot, args.size)
     reference = {"sampler": "primal", "with_features": False}
     wanted = range(args.skip, args.frames)
     references = [
         stack
-        for _, stack in render_sequence(
+        for _, stack in render_shot(
             camera, range(args.frames), args.reference_spp, 2, skip=lambda frame: frame not in wanted, **reference
         )
     ]
     stacks, noise = {}, {}
     for name, options in RIVALS.items():
         spp = max(2, round(args.chains * cost["restir"]["processor"] / cost[name]["processor"]))
-        stacks[name] = [stack for _, stack in render_sequence(camera, range(args.frames), spp, 1, **options)]
+        stacks[name] = [stack for _, stack in render_shot(camera, range(args.frames), spp, 1, **options)]
         last = stacks[name][-1]
         if name == "gpt":
             # Elsewhere caustics are in the differences.
-            *_, (_, last) = render_sequence(
+            *_, (_, last) = render_shot(
                 camera, range(args.frames), 64, 5, skip=lambda f: f != args.frames - 1, sampler="gpt", caustic=False
             )
         noise[name] = {"spp": spp} | {n: spread(last, n) * last.attributes["ngpt:spp"] for n in ("primal", "dx", "dy")}

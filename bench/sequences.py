@@ -131,7 +131,7 @@ def render_shot(args: argparse.Namespace, scene: str, shot: str, folder: Path) -
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(DEFAULT_VARIANT)
-    from data_gen.frames.sequence import Shot, render_sequence
+    from data_gen.frames.shot import Shot, render_shot
 
     size = tuple(map(int, args.size.split("x")))
     name = str(args.folder / scene / "scene.xml") if args.folder and (args.folder / scene).is_dir() else scene
@@ -157,13 +157,13 @@ def render_shot(args: argparse.Namespace, scene: str, shot: str, folder: Path) -
         target = {frame: folder / kind / f"{frame:04d}.exr" for frame in frames}
         missing = [frame for frame, file in target.items() if not file.exists()]
         moving = Shot(lambda frame: (name, {}), size, path, update)
-        for frame, stack in render_sequence(moving, frames, skip=lambda f, m=missing: f not in m, **options):
+        for frame, stack in render_shot(moving, frames, skip=lambda f, m=missing: f not in m, **options):
             ngpt.write(target[frame], stack)
     return ("without" if args.pairs else "in"), "in", "ref"
 
 
 def mover(shape: str, way: tuple[float, float, float]):
-    """What moves a shape so far a frame: see ``data_gen.frames.sequence.Shot``."""
+    """What moves a shape so far a frame: see ``data_gen.frames.shot.Shot``."""
     import mitsuba as mi
 
     start: dict = {}

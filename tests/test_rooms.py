@@ -34,7 +34,9 @@ ngpt.report
 ngpt.measure
 ngpt.sequence.flicker
 ngpt.training
+ngpt.sequence.train
 ngpt.export
+ngpt.sequence.export
 data_gen data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths

@@ -1,1 +1,1 @@
-"""Sequences: scenes over time, cameras along paths, and where what is seen was one frame before."""
+"""Shots: scenes over time, cameras along paths, and where what is seen was one frame before."""

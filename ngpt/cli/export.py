@@ -40,7 +40,7 @@ def write(args: argparse.Namespace) -> list[Path]:
 
         models = {args.output: l2_model(args.alpha)}
     elif kind_of(args.weights) == "temporal":
-        from ngpt.export.temporal import temporal_model
+        from ngpt.sequence.export import temporal_model
 
         if args.statistics or args.vector:
             raise NgptError(f"{args.weights}: blends frames; leave --statistics and --vector out")

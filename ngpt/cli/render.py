@@ -10,7 +10,7 @@ from pathlib import Path
 
 from data_gen.samplers import FRAME_SAMPLERS, summaries
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
-from ngpt.cli.frames import filled, frames, targets, varies
+from ngpt.cli.frame_patterns import filled, frames, targets, varies
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.system.console import Console

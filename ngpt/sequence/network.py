@@ -7,7 +7,7 @@ variances (``ngpt.sequence.evidence``), c_s is what the network says, from ``Ble
 = 0, y is that of the rules. It corrects them by no more than C: where their evidence is plain, as after a change of all
 light, it stands. Changes of light are of coarse scales, and moving reflections of fine ones; noise that is left in x is
 of both. So y lies between x and h at each scale, and what comes into sight takes nothing from what hid it, whatever the
-network says. It was trained on frames of moving shots, by histories of its own making (``ngpt.training.temporal``).
+network says. It was trained on frames of moving shots, by histories of its own making (``ngpt.sequence.train``).
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _signed_log(x: np.ndarray) -> np.ndarray:
 
 
 class Network:
-    """The network of a file (``ngpt.export.temporal``), as ``Corrections``.
+    """The network of a file (``ngpt.sequence.export``), as ``Corrections``.
 
     Raises NgptError for a file that is no such network, or one of other inputs.
     """

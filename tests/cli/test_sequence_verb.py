@@ -8,7 +8,7 @@ import pytest
 
 import ngpt
 from ngpt.cli import main
-from ngpt.cli.frames import filled, frames, targets
+from ngpt.cli.frame_patterns import filled, frames, targets
 from ngpt.errors import NgptError
 
 

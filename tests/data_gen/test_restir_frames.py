@@ -17,7 +17,7 @@ KEYS = [
 
 def shot(size=(16, 12), **options):
     from data_gen.frames.camera_path import CameraPath, Key, look_at
-    from data_gen.frames.sequence import Shot
+    from data_gen.frames.shot import Shot
 
     views = [(np.array([key["origin"], key["target"], (0, 1, 0)], float), key["frame"]) for key in KEYS]
     path = CameraPath([Key(frame, look_at(*look), look) for look, frame in views])
@@ -25,9 +25,9 @@ def shot(size=(16, 12), **options):
 
 
 def rendered(frames=range(3), spp=2, seed=7, size=(16, 12), **options):
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
-    return dict(render_sequence(shot(size), frames, spp, seed, sampler="restir", **options))
+    return dict(render_shot(shot(size), frames, spp, seed, sampler="restir", **options))
 
 
 @pytest.fixture(scope="module")
@@ -97,17 +97,17 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
     ],
 )
 def test_what_cannot_be_rendered_is_refused(renderer, options, message):
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
     with pytest.raises(NgptError, match=message):
-        next(render_sequence(shot((32, 24)), range(3), 4, sampler="restir", **options))
+        next(render_shot(shot((32, 24)), range(3), 4, sampler="restir", **options))
 
 
 def test_a_change_that_changes_nothing_gives_the_same_frames(renderer, frames):
     """Two scenes in turn, and all records carried from one to the other."""
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
-    changing = dict(render_sequence(shot(update=lambda params, frame: None), range(3), 2, 7, sampler="restir"))
+    changing = dict(render_shot(shot(update=lambda params, frame: None), range(3), 2, 7, sampler="restir"))
     for name in ("primal", "dx", "dy", "motion"):
         same = np.isclose(changing[2][name], frames[2][name], rtol=1e-3, atol=1e-5, equal_nan=True).all(axis=-1)
         assert same.mean() > 0.95, name
@@ -126,7 +126,7 @@ SCENE = """<scene version="3.0.0"><default name="power" value="1"/>
 
 def test_a_scene_that_is_loaded_anew_in_each_frame_keeps_its_history(renderer, tmp_path):
     """Frames resumed are the same bits, and light that doubles is followed at once."""
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
     file = tmp_path / "scene.xml"
     file.write_text(SCENE)
@@ -134,7 +134,7 @@ def test_a_scene_that_is_loaded_anew_in_each_frame_keeps_its_history(renderer, t
 
     def found(**options):
         scene = shot(describe=lambda frame: (str(file), {"power": powers[frame]}))
-        return dict(render_sequence(scene, range(3), 8, sampler="restir", **options))
+        return dict(render_shot(scene, range(3), 8, sampler="restir", **options))
 
     stacks = found()
     assert stacks[2].attributes["ngpt:confidence"] > 2

@@ -1,6 +1,6 @@
 """Training of the network that blends frames (``ngpt.sequence.network``), on shots of training sets.
 
-    python -m ngpt.training.temporal DATA... --out temporal.safetensors
+    python -m ngpt.sequence.train DATA... --out temporal.safetensors
 
 A frame's history is made by the network itself: in each round the network, as it is by then, plays the shots, and what
 it meets is what it learns from until the next [Ross et al. 2011, "A reduction of imitation learning and structured

@@ -12,7 +12,7 @@ def moving(scene, camera=0.0, **moved):
     """A shot of a built-in scene whose camera goes to the right, and whose shapes go somewhere, by so much a frame."""
     import mitsuba as mi
 
-    from data_gen.frames.sequence import Shot
+    from data_gen.frames.shot import Shot
 
     start = {}
 
@@ -29,7 +29,7 @@ def moving(scene, camera=0.0, **moved):
 def estimates(shot, count, pairs):
     """dt of frame 1 with ``count`` seeds, the same of samples that are no pairs, its variances, the frame's light."""
     from data_gen.frames.motion import motion_vectors
-    from data_gen.frames.pairs import difference, light
+    from data_gen.frames.time_differences import difference, light
 
     seeds = range(count)
     before = shot.snapshot(0)
@@ -55,7 +55,7 @@ def estimates(shot, count, pairs):
     ],
 )
 def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, camera, moved):
-    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
+    monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
     paired, apart, _, _ = estimates(moving(scene, camera, **moved), 16, 16)
     known = np.isfinite(paired[0]).all(axis=-1)
     assert known.mean() > 0.85
@@ -67,7 +67,7 @@ def test_the_mean_is_the_difference_of_the_frames(renderer, monkeypatch, scene, 
 
 
 def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
-    monkeypatch.setattr("data_gen.frames.pairs.BATCHES", 2)
+    monkeypatch.setattr("data_gen.frames.time_differences.BATCHES", 2)
     from data_gen.render import render_stack
 
     shot = moving("diffuse", lamp=(0.3, 0, 0))
@@ -107,7 +107,7 @@ def test_where_nothing_changes_it_is_zero(renderer):
 
 
 def test_it_is_not_known_where_motion_is_not_or_leads_off_the_film(renderer):
-    from data_gen.frames.pairs import difference, light
+    from data_gen.frames.time_differences import difference, light
 
     scene = moving("diffuse").at(0)
     motion = np.zeros((*SIZE[::-1], 2))
@@ -120,7 +120,7 @@ def test_it_is_not_known_where_motion_is_not_or_leads_off_the_film(renderer):
 
 
 def test_batches_count_by_their_samples(rng):
-    from data_gen.frames.pairs import difference
+    from data_gen.frames.time_differences import difference
 
     samples = rng.normal(1, 2, (1000, 5, 1, 1, 3))
     parts = [samples[:, :2].mean(axis=1), samples[:, 2:4].mean(axis=1), samples[:, 4:].mean(axis=1)]
@@ -133,11 +133,11 @@ def test_batches_count_by_their_samples(rng):
 
 
 def test_sequences_have_it_and_nothing_else_changes(renderer):
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
     def stacks(frames, **options):
         shot = moving("diffuse", 0.05, lamp=(0.1, 0, 0))
-        return dict(render_sequence(shot, frames, 2, 7, sampler="primal", **options))
+        return dict(render_shot(shot, frames, 2, 7, sampler="primal", **options))
 
     plain, paired = stacks([0, 1, 2]), stacks([0, 1, 2], dt=3)
     for frame, stack in plain.items():

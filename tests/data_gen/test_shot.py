@@ -18,7 +18,7 @@ def look(origin, target=(0, 0, 0), up=(0, 1, 0)):
 
 
 def shot(tmp_path, camera=None, update=None, moving=True):
-    from data_gen.frames.sequence import Shot
+    from data_gen.frames.shot import Shot
 
     path = tmp_path / "scene.xml"
     path.write_text(XML)
@@ -26,9 +26,9 @@ def shot(tmp_path, camera=None, update=None, moving=True):
 
 
 def rendered(shot, frames, **options):
-    from data_gen.frames.sequence import render_sequence
+    from data_gen.frames.shot import render_shot
 
-    return dict(render_sequence(shot, frames, 2, 7, sampler="primal", **options))
+    return dict(render_shot(shot, frames, 2, 7, sampler="primal", **options))
 
 
 def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):
@@ -71,7 +71,7 @@ def test_parameters_can_be_set_in_place(renderer, tmp_path):
 
 
 def test_a_first_frame_with_nothing_before_it_has_no_motion(renderer, tmp_path):
-    from data_gen.frames.sequence import Shot
+    from data_gen.frames.shot import Shot
 
     for frame in (1, 2):
         (tmp_path / f"{frame}.xml").write_text(XML)

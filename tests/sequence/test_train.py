@@ -2,14 +2,22 @@
 
 import numpy as np
 import pytest
+
+pytest.importorskip("torch")
+
 import torch
 
+from ngpt.sequence import train as training
 from ngpt.sequence.network import BANDS, INPUTS, Network
+from ngpt.sequence.train import Clip, as_corrections, errors, loss, network, play, scores, train
 from ngpt.stack import GradientStack
-from ngpt.training import temporal
-from ngpt.training.temporal import Clip, as_corrections, errors, loss, network, play, scores, train
 
 SIZE = 16
+
+
+@pytest.fixture(autouse=True)
+def quietly(one_thread):
+    """All of them on one thread."""
 
 
 def clip_of(seed, frames=5, flash=0.0):
@@ -34,7 +42,7 @@ def test_errors_are_free_of_the_references_noise():
     clip = clip_of(0, frames=12)
     error, flicker = errors(clip, [stack["primal"] for stack in clip.stacks])
     squares = np.square(clip.references[0]).mean(axis=-1)
-    expected = 0.04 * np.mean(1 / (squares + temporal.DARK * squares.mean()))
+    expected = 0.04 * np.mean(1 / (squares + training.DARK * squares.mean()))
     assert error == pytest.approx(expected, rel=0.2) and flicker == pytest.approx(2 * expected, rel=0.2)
 
 
@@ -46,23 +54,23 @@ def test_a_network_that_says_nothing_has_the_loss_of_the_rules():
     batch = {name: torch.from_numpy(np.stack([frame[name] for frame in frames])) for name in frames[0]}
     value = loss(model, batch).item()
     # Frame by frame it is 1 + FLICKER.
-    assert 0.1 < value < 0.8 * (1 + temporal.FLICKER)
+    assert 0.1 < value < 0.8 * (1 + training.FLICKER)
 
 
 def test_it_learns_and_its_onnx_file_is_the_same(tmp_path):
     """Light flashes: the rules average some of it away, a network can learn better."""
-    training = [clip_of(seed, flash=0.15) for seed in range(4)]
+    seen = [clip_of(seed, flash=0.15) for seed in range(4)]
     said = []
-    model = train(training, 2, 25, say=said.append)
+    model = train(seen, 2, 25, say=said.append)
     assert len(said) == 2 and "round 2 of 2" in said[1]
     held_out = [clip_of(9, flash=0.15)]
     ours, rules = (scores(held_out, which)[0] for which in (as_corrections(model), None))
     assert ours[0] < rules[0]
     pytest.importorskip("onnx")
-    from ngpt.export.temporal import temporal_model
     from ngpt.network.weights import write_tensors
+    from ngpt.sequence.export import temporal_model
 
-    header = {"kind": "temporal", "inputs": list(INPUTS), "widths": list(temporal.WIDTHS)}
+    header = {"kind": "temporal", "inputs": list(INPUTS), "widths": list(training.WIDTHS)}
     write_tensors(tmp_path / "t.safetensors", model.state_dict(), header)
     (tmp_path / "t.onnx").write_bytes(temporal_model(tmp_path / "t.safetensors").SerializeToString())
     inputs = np.random.default_rng(0).normal(size=(22, 19, len(INPUTS))).astype(np.float32)
@@ -91,9 +99,9 @@ def test_results_are_kept_by_what_they_are_of(tmp_path, monkeypatch):
         made.append(stack)
         return SimpleNamespace(image=np.full((2, 2, 3), float(stack == "b"), np.float32))
 
-    monkeypatch.setattr(temporal, "reconstruct", reconstruct)
+    monkeypatch.setattr(training, "reconstruct", reconstruct)
     for scenes in ("b", "ab"):
         crops = Set(crop(scene, frame) for scene in scenes for frame in range(2))
-        monkeypatch.setattr(temporal, "Dataset", lambda folder, crops=crops: crops)
-        found = list(temporal.clips(["set"], ["primal"], tmp_path))
+        monkeypatch.setattr(training, "Dataset", lambda folder, crops=crops: crops)
+        found = list(training.clips(["set"], ["primal"], tmp_path))
     assert made == ["b", "b", "a", "a"] and [clip.results[0].max() for clip in found] == [0, 1]

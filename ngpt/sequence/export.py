@@ -9,12 +9,12 @@ from ngpt.errors import NgptError
 from ngpt.export.network import convolutions
 from ngpt.network.weights import fill, read_tensors
 from ngpt.sequence.network import INPUTS
-from ngpt.training.temporal import WIDTHS, network
+from ngpt.sequence.train import WIDTHS, network
 from ngpt.version import __version__
 
 
 def temporal_model(weights: str | Path) -> onnx.ModelProto:
-    """The graph of weights that ``ngpt.training.temporal`` wrote; raises NgptError for others."""
+    """The graph of weights that ``ngpt.sequence.train`` wrote; raises NgptError for others."""
     tensors, header = read_tensors(weights)
     if header.get("kind") != "temporal" or header.get("inputs") != list(INPUTS) or header.get("widths") != list(WIDTHS):
         raise NgptError(f"{weights}: holds no network that blends frames, or one of another version; train it anew")

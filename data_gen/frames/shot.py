@@ -1,0 +1,185 @@
+"""Shots: a scene over time, and its stacks frame by frame."""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
+
+import mitsuba as mi
+import numpy as np
+
+from data_gen.frames.camera_path import CameraPath, horizontal
+from data_gen.frames.frame_sampler import Remembering
+from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot
+from data_gen.frames.time_differences import difference, light
+from data_gen.render import render_stack
+from data_gen.samplers import FRAME_SAMPLERS
+from data_gen.scenes.geometry import Geometry
+from data_gen.scenes.load import load_scene
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+
+class Shot:
+    """A scene over time: ``at(frame)`` is the scene in the state of that frame.
+
+    ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
+                  they change; kernels are compiled once, as long as frames consist of the same kinds of things.
+    ``camera``    moves the first sensor
+    ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
+    """
+
+    def __init__(
+        self,
+        describe: Callable[[int], tuple[str, Mapping[str, str]]],
+        size: tuple[int, int] | None = None,
+        camera: CameraPath | None = None,
+        update: Callable[[mi.SceneParameters, int], None] | None = None,
+    ):
+        self.describe, self.size, self.camera, self.update = describe, size, camera, update
+        self._loaded: Any = None
+        self._scene: mi.Scene | None = None
+        self._shapes: tuple[Geometry, ...] | None = None
+
+    def at(self, frame: int) -> mi.Scene:
+        """The scene in the state of a frame; what was returned before changes, or is no longer used."""
+        name, parameters = self.describe(frame)
+        wanted = (name, dict(parameters))
+        if self._scene is None or wanted != self._loaded:
+            self._scene = self._shapes = None
+            gc.collect()  # two scenes in memory would make kernels larger
+            self._scene, self._loaded = load_scene(name, self.size, wanted[1]), wanted
+        scene = self._scene
+        if self.update is not None:
+            params = mi.traverse(scene)
+            self.update(params, frame)
+            params.update()
+            self._shapes = None
+        if self.camera is not None:
+            self._place_camera(scene.sensors()[0], frame)
+        return scene
+
+    def snapshot(self, frame: int) -> Snapshot:
+        """What motion needs of a frame."""
+        taken = snapshot(self.at(frame), self._shapes)
+        self._shapes = taken.shapes
+        return taken
+
+    def twin(self) -> Shot:
+        """The same shot, with a scene of its own."""
+        return Shot(self.describe, self.size, self.camera, self.update)
+
+    def changes(self, frames: Sequence[int]) -> bool:
+        """Whether anything but the camera may change in these frames."""
+        return self.update is not None or any(self.describe(frame) != self.describe(frames[0]) for frame in frames)
+
+    def _place_camera(self, sensor: mi.Sensor, frame: int) -> None:
+        view, params = self.camera.at(frame), mi.traverse(sensor)
+        params["to_world"] = type(params["to_world"])(mi.ScalarTransform4f(view.to_world).matrix)
+        if view.fov is not None:
+            if "x_fov" not in params:
+                raise NgptError(f"sensor '{sensor.class_name()}' has no field of view; leave fov out of the path")
+            width, height = sensor.film().size()
+            params["x_fov"] = horizontal(view.fov, view.fov_axis, float(width) / float(height))
+        params.update()
+
+
+def frame_seed(seed: int, frame: int, use: int = 0) -> int:
+    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
+    # Entropy must not be negative, frames may be.
+    entropy = [seed, frame % 2**64]
+    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
+
+
+def render_shot(
+    shot: Shot,
+    frames: Sequence[int],
+    spp: int | None,
+    seed: int = 0,
+    dt: int = 0,
+    skip: Callable[[int], bool] = lambda frame: False,
+    progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
+    sampler: str = "auto",
+    **options: Any,
+) -> Iterator[tuple[int, GradientStack]]:
+    """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
+
+    Stacks have the layer ``motion`` to the frame before in ``frames``; of the first, to the one that a shot of the same
+    step would have before it, all NaN where there is none. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
+    frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
+    ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
+
+    A ``sampler`` of ``data_gen.samplers.FRAME_SAMPLERS`` reuses the frames before. Where frames are left out, up to its
+    ``warm_up`` of them are rendered nevertheless, and not given. Such a sampler has ``seed`` for all frames. Where more
+    than the camera changes, it needs the scene of the frame before: two scenes are in memory, in turn.
+
+    With ``dt`` pairs of samples a pixel, 2 or more, stacks have ``dt`` and ``dt_var``, of samples of their own
+    (``data_gen.frames.time_differences``), by Mitsuba's integrator, without features. Each pair is two paths, one in
+    the scene of the frame before: where parameters change, scenes are loaded twice a frame. Their seconds are in
+    ``ngpt:seconds``.
+    """
+    before: Snapshot | None = None
+    last = None
+    step = frames[1] - frames[0] if len(frames) > 1 else 1
+    remembers = FRAME_SAMPLERS.get(sampler)
+    remembering, turns = None, [shot]
+    if remembers is not None:
+        changes = shot.changes(frames)
+        remembering = Remembering(remembers, changes, spp, seed, options)
+        turns += [shot.twin()] if changes else []
+    done = 0
+    for i, wanted in enumerate(frames):
+        if skip(wanted):
+            continue
+        # Frames before it, for their history alone
+        for j in range(max(done, i - remembers.warm_up if remembers else i), i + 1):
+            frame, previous = frames[j], frames[j - 1] if j else frames[0] - step
+            shot, other = turns[j % len(turns)], turns[(j - 1) % len(turns)]
+            if last != previous:
+                before = _before(other, previous, first=j == 0)
+            now = shot.snapshot(frame)
+            scene = shot.at(frame)
+            width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
+            motion, what = np.full((height, width, 2), np.nan), None
+            if before is not None:
+                what = seen(scene)
+                motion = motion_vectors(scene, now, before, what)
+            if remembering is not None:
+                far = None if what is None else depth(scene, now, what)
+                stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
+            else:
+                stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
+            before, last = now, frame
+        done = i + 1
+        stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
+        stack = stack.replace(motion=motion)
+        del scene  # two scenes in memory would make kernels larger
+        yield frame, _with_dt(stack, shot, other, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
+
+
+def _with_dt(
+    stack: GradientStack, shot: Shot, other: Shot, frame: int, previous: int, pairs: int, seed: int
+) -> GradientStack:
+    """The stack with ``dt`` and ``dt_var``; the ``other`` shot has the scene of the frame before."""
+    motion = stack["motion"]
+    mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
+    if np.isfinite(motion).any():
+        scene, begun = shot.at(frame), time.perf_counter()
+        now, seconds = light(scene, seed, pairs), time.perf_counter() - begun
+        del scene
+        scene, begun = other.at(previous), time.perf_counter()
+        mean, variance = difference(now, light(scene, seed, pairs, motion))
+        stack.attributes["ngpt:seconds"] += seconds + time.perf_counter() - begun
+    stack.attributes["ngpt:pairs"] = pairs
+    return stack.replace(dt=mean, dt_var=variance)
+
+
+def _before(shot: Shot, frame: int, first: bool) -> Snapshot | None:
+    try:
+        return shot.snapshot(frame)
+    except NgptError:
+        if not first:
+            raise
+        return None
