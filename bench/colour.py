@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.methods import cached
+from bench.common import cached
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack

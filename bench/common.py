@@ -1,11 +1,15 @@
 """What every benchmark records: versions, threads, medians and spread, so that a result can be judged later."""
 
+import argparse
 import statistics
 import time
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
 
+import ngpt
+from ngpt.evaluation.config import scene_name
+from ngpt.stack import GradientStack
 from ngpt.system import machine
 from ngpt.system.writing import write_json
 
@@ -46,3 +50,16 @@ def write_page(page: Path, text: str, marks: tuple[str, str]) -> None:
     before, _, rest = page.read_text().partition(marks[0])
     _, _, after = rest.partition(marks[1])
     page.write_text(f"{before}{marks[0]}\n\n{text}\n\n{marks[1]}{after}")
+
+
+def cached(scene: str, spp: int, sampler: str, seed: int, args: argparse.Namespace) -> GradientStack:
+    """A rendered stack, from the cache if it is there."""
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    width, height = args.size
+    path = args.cache / f"{scene_name(scene)}-{sampler}-{spp}-{width}x{height}.exr"
+    if not path.exists():
+        print(f"rendering {path.name}", flush=True)
+        ngpt.write(path, render_stack(load_scene(scene, (width, height)), spp, seed, sampler))
+    return ngpt.read(path)

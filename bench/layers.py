@@ -18,8 +18,7 @@ from unittest.mock import patch
 import numpy as np
 
 import ngpt
-from bench.common import metadata
-from bench.methods import cached
+from bench.common import cached, metadata
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr

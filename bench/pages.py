@@ -1,6 +1,6 @@
 """Writes the tables of the main evaluation into the pages that quote it.
 
-    python eval.py --config configs/eval-main.toml --out out/eval ... --advice ngpt/measure/advice.json
+    python eval.py --config configs/eval-main.toml --out out/eval ...
     python -m bench.pages out/eval
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
@@ -15,12 +15,20 @@ from pathlib import Path
 import numpy as np
 
 from bench.common import save, write_page
-from bench.groups import GROUPS, heading
-from bench.groups import tables as groups
+from bench.tables import cells_of, heading
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
+# What the shipped networks knew of each scene. docs/train/training.md and the model cards say how.
+GROUPS = {
+    "blind": ("classroom",),
+    "rooms": ("living-room", "dining-room", "bedroom"),
+    "watched": ("lamp", "staircase", "glass-of-water"),
+    "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
+}
+COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn")
+PAIRS = (("ngpt-combine", "oidn"), ("ngpt-primal", "oidn"), ("ngpt-fast", "oidn"), ("ngpt-combine", "ngpt-primal"))
 EVERYONE = tuple(scene for scenes in GROUPS.values() for scene in scenes)
 # Among which gradients are judged by scenes that no network was trained on
 KNOWN = {
@@ -53,20 +61,8 @@ def kept(results: dict) -> dict:
     results["settings"]["groups"] = KNOWN
     worth = worth_of_gradients(results)
     table = worth_tables(results | {"worth": worth})
-    cells = [
-        {
-            "scene": row["scene"],
-            "spp": row["spp"],
-            "method": row["method"],
-            "error": row["metrics"][results["primary"]]["median"],
-            "FLIP": row["metrics"]["FLIP"]["median"],
-            "seconds": row["seconds"]["reconstruct"],
-        }
-        for row in results["summary"]
-        if row["scene"] and row["metrics"]
-    ]
     facts = {name: results[name] for name in ("command", "date", "metadata")}
-    return {"benchmark": "main", **facts, "cells": cells, "worth": list(table.values())}
+    return {"benchmark": "main", **facts, "cells": cells_of(results), "worth": list(table.values())}
 
 
 def every_cell(page: Path) -> str:
@@ -124,6 +120,35 @@ def by_group(table: Cells) -> str:
     means, ratios, counts = groups(table.values("error")).split("\n\n")
     between = "The same means, over those of another method:", "In how many cells one has less error than the other:"
     return "\n\n".join((means, between[0], ratios, between[1], counts))
+
+
+def groups(errors: dict[tuple[str, int, str], float]) -> str:
+    """Three tables as Markdown: mean errors, their ratios, and counts of cells."""
+    counts = sorted({spp for _, spp, _ in errors})
+    groups = {**GROUPS, "all": tuple(scene for scenes in GROUPS.values() for scene in scenes)}
+
+    def mean(scenes: tuple[str, ...], spp: int, method: str) -> float:
+        return float(np.exp(np.mean([np.log(errors[scene, spp, method]) for scene in scenes])))
+
+    def below(scenes: tuple[str, ...], method: str, rival: str) -> int:
+        return sum(errors[s, n, method] < errors[s, n, rival] for s in scenes for n in counts)
+
+    lines = heading("scenes", "spp", *(f"`{method}`" for method in COMPARED))
+    for name, scenes in groups.items():
+        for spp in counts:
+            means = [mean(scenes, spp, method) for method in COMPARED]
+            texts = [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
+            lines.append(f"| {f'{name} ({len(scenes)})' if spp == counts[0] else ''} | {spp} | {' | '.join(texts)} |")
+    lines += ["", *heading("mean error over another's", *(f"{spp} spp" for spp in counts))]
+    for method, rival in PAIRS:
+        for name, scenes in groups.items():
+            ratios = [f"{mean(scenes, spp, method) / mean(scenes, spp, rival):.2f}" for spp in counts]
+            lines.append(f"| `{method}` over `{rival}`, {name} | {' | '.join(ratios)} |")
+    lines += ["", *heading("cells with less error", *(f"{name} ({len(scenes)})" for name, scenes in groups.items()))]
+    for method, rival in PAIRS:
+        won = [f"{below(scenes, method, rival)} of {len(scenes) * len(counts)}" for scenes in groups.values()]
+        lines.append(f"| `{method}` than `{rival}` | {' | '.join(won)} |")
+    return "\n".join(lines)
 
 
 def over_oidn(table: Cells, method: str) -> str:

@@ -3,6 +3,8 @@
 The laws of samplers are in test_samplers.py.
 """
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from unbiased import load, render_references
@@ -138,10 +140,11 @@ def test_chains_accept_enough(renderer, monkeypatch):
 @pytest.mark.slow
 def test_light_through_a_door_ajar(renderer):
     """The mean where chains do most of the work, and few candidates find any light."""
-    from bench.metropolis import ajar
     from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
 
-    scene = load(renderer, lambda: ajar(0.3), (16, 16))
+    ajar = Path(__file__).parents[2] / "bench" / "scenes" / "ajar" / "scene.xml"
+    scene = load_scene(str(ajar), (16, 16), {"wall": "2.6"})  # 30 cm
     references = render_references(renderer, scene, 24, 2048)
     stacks = [render_stack(scene, 32, seed, "gmlt")["primal"] for seed in range(16)]
     result = z_test(np.stack(stacks), references)
