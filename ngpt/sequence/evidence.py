@@ -103,10 +103,12 @@ def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
 def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
     """d: the share of its own noise that a method leaves in a pixel, from 0 (smooth) to 1 (the noisy image itself).
 
-    For a projection, E (p - x)² is σ² (1 - d), and more where x is biased: so d is no less than this.
+    For a projection, E (p - x)² is σ² (1 - d), and more where x is biased: so d is no less than this. It is the median
+    where history counts: elsewhere, as in what just came into sight, a method may leave more noise or less.
     """
     ratio = _mean((np.square(rest) / noise).mean(axis=-1))
-    return float(np.clip(1 - np.median(ratio), 0, 1))
+    trusted = ratio[trust > 0.5]
+    return float(np.clip(1 - np.median(trusted), 0, 1)) if len(trusted) else 0.0
 
 
 def _mean(image: np.ndarray) -> np.ndarray:

@@ -82,9 +82,7 @@ class _Member:
         image = (self.sum / self.weight + self.data.direct).astype(np.float32)
         if not np.isfinite(image).all():
             raise NgptError(f"{self.stack.path}: method 'wcv' over time gave non-finite pixels; scale the stacks down")
-        options = {"window": LENGTH}
-        made = Result(image, "wcv", self.seconds, self.data.pixels, self.data.gradients, options=options)
-        return self.number, self.stack, made
+        return self.number, self.stack, Result(image, "wcv", self.seconds, self.data.pixels, self.data.gradients)
 
 
 class _Run:

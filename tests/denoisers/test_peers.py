@@ -64,6 +64,19 @@ def test_exposure_only_scales(room, name):
     assert reconstruct(bright, name).image == pytest.approx(1000 * reconstruct(stack, name).image, rel=1e-2)
 
 
+@pytest.mark.skipif(bool(nlm.missing()), reason=nlm.missing())
+def test_nlm_takes_steps_of_4_standard_deviations_for_noise_and_of_16_for_edges():
+    def kept(step):
+        image = np.ones((24, 24, 3))
+        image[:, 12:] += 0.1 * step
+        features = {"albedo": 0 * image, "normal": 0 * image, "depth": image[..., :1]}
+        stack = GradientStack.from_arrays(primal=image, primal_var=np.full_like(image, 0.1**2), **features)
+        result = reconstruct(stack, "nlm").image
+        return np.mean(result[:, 12] - result[:, 11]) / (0.1 * step)
+
+    assert kept(4) < 0.25 and kept(16) > 0.9
+
+
 def test_nfor_fits_what_is_linear_in_the_features(rng):
     feature = rng.random((24, 20, 1)).astype(np.float32)
     clean = (2 + 3 * feature) * np.array([1.0, 0.5, 0.25])

@@ -8,6 +8,7 @@ import pytest
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_image
+from ngpt.methods import METHODS
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.windows import HOP, LENGTH, reconstruct_shot
 from ngpt.stack import GradientStack
@@ -44,7 +45,18 @@ def shot(tmp_path, stacks):
 
 
 def results(stacks, **options):
-    return {number: result.image for number, _, result in reconstruct_shot(stacks, **options)}
+    found = {number: result for number, _, result in reconstruct_shot(stacks, **options)}
+    assert all(result.options.keys() <= METHODS[result.method].options.keys() for result in found.values())
+    return {number: result.image for number, result in found.items()}
+
+
+def test_windows_pass_over_into_each_other(stacks):
+    """Frames of two windows: the mean of both, by how far they are from the ends of each."""
+    both, first, second = results(stacks), results(stacks[:LENGTH]), results(stacks[HOP:])
+    for i in range(HOP, LENGTH):
+        near, far = LENGTH - i, min(i - HOP + 1, COUNT - i)
+        assert np.allclose(both[i], (near * first[i] + far * second[i - HOP]) / (near + far), atol=1e-5)
+    assert np.array_equal(both[0], first[0]) and np.allclose(both[COUNT - 1], second[COUNT - HOP - 1], atol=1e-6)
 
 
 def squares(images):
