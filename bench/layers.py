@@ -13,7 +13,6 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from unittest.mock import patch
 
 import numpy as np
 
@@ -22,9 +21,9 @@ from bench.common import cached, metadata
 from ngpt.evaluation.config import scene_name
 from ngpt.io.exr import read
 from ngpt.io.openexr import ExrImage, ExrPart, write_exr
-from ngpt.measure.gains import cases
+from ngpt.measure.gains import NEED_OIDN, cases
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import METHODS, choose, reconstruct
 from ngpt.repair import variance_of_primal
 from ngpt.stack import GradientStack
 from ngpt.system.writing import write_json
@@ -169,19 +168,12 @@ def written(
 def measured(files: Sequence[tuple[GradientStack, np.ndarray]], oidn: bool) -> tuple[str, float, float | None, float]:
     """The method that `auto` took, its error, that of `oidn` if it is there, and that of the input."""
 
-    def error(method: str) -> tuple[str, float]:
-        results = [reconstruct(stack, method) for stack, _ in files]
-        errors = (relmse_trimmed(result.image, truth) for result, (_, truth) in zip(results, files, strict=True))
-        return results[0].method, mean(errors)
+    def error(method: str) -> float:
+        images = (reconstruct(stack, method).image for stack, _ in files)
+        return mean(relmse_trimmed(image, truth) for image, (_, truth) in zip(images, files, strict=True))
 
-    with hidden_oidn() if not oidn else patch.dict({}):
-        method, left = error("auto")
-        return method, left, error("oidn")[1] if oidn else None, error("primal")[1]
-
-
-def hidden_oidn():
-    """As if OIDN were not installed."""
-    return patch("ngpt.denoisers.oidn.find_spec", lambda name: None)
+    method = choose(files[0][0], lambda name: not METHODS[name].missing() and (oidn or name not in NEED_OIDN))
+    return method, error(method), error("oidn") if oidn else None, error("primal")
 
 
 def mean(values) -> float:

@@ -26,7 +26,6 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from unittest.mock import patch
 
 from bench.common import metadata, save
 from ngpt.evaluation.config import scene_name
@@ -93,7 +92,6 @@ class Kept:
 
 def bench_scene(path: str, args: argparse.Namespace) -> dict:
     """What the pilot saw, and what is true: rows of sampler, method, shared -> errors by samples."""
-    from data_gen import passes
     from data_gen.adaptive import LEAST, Adaptive
     from data_gen.choosing import pipelines
     from data_gen.choosing.trials import candidates, noise_of
@@ -132,40 +130,38 @@ def bench_scene(path: str, args: argparse.Namespace) -> dict:
         part[name] = kept.numbers(f"part-{name}", lambda spp=part[name]: {"spp": spp})["spp"]
     even: dict[str, dict[int, list[GradientStack]]] = {name: {part[name]: []} for name in names}
     shared: dict[str, dict[int, list[GradientStack]]] = {}
-    with patch.object(passes, "PASS_SECONDS", 60.0):
-        for i in range(PARTS):
-            for name in names:
-                even[name][part[name]].append(render(f"part{i}", name, part[name], i))
-        cost = {name: _cost(even[name][part[name]]) for name in names}
-        relative = {
-            name: statistics.median(
-                _cost([ours]) / _cost([theirs])
-                for ours, theirs in zip(even[name][part[name]], even[first][part[first]], strict=True)
-            )
-            for name in names
-        }
+    for i in range(PARTS):
         for name in names:
-            few = part[name] // 4
-            if few >= 2 * SAMPLERS[name].batch:  # else it has no variances
-                even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
-            even[name][PARTS * part[name]] = [merge(even[name][part[name]])]
-            if not SAMPLERS[name].batch:
-                shared[name] = {
-                    n: [render("shared", name, n, _SHARED, adaptive=Adaptive())]
-                    for n in (part[name], PARTS * part[name])
-                }
-        # The reference is of the sampler with the least noise at equal time.
-        middle = sum(even[n][PARTS * part[n]][0]["primal"].astype("f8") for n in names) / len(names)
-        noise = {
-            n: noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
-            for n in names
-            if not SAMPLERS[n].biased
-        }
-        quiet = min(noise, key=lambda n: noise[n])
-        batch = max(1, SAMPLERS[quiet].batch)
-        spp = max(1, round(args.reference / relative[quiet] / batch)) * batch
-        spp = kept.numbers(f"reference-{quiet}-{args.reference}", lambda: {"spp": spp})["spp"]
-        halves = [render(f"reference{i}", quiet, spp, _REFERENCE | i)["primal"] for i in range(2)]
+            even[name][part[name]].append(render(f"part{i}", name, part[name], i))
+    cost = {name: _cost(even[name][part[name]]) for name in names}
+    relative = {
+        name: statistics.median(
+            _cost([ours]) / _cost([theirs])
+            for ours, theirs in zip(even[name][part[name]], even[first][part[first]], strict=True)
+        )
+        for name in names
+    }
+    for name in names:
+        few = part[name] // 4
+        if few >= 2 * SAMPLERS[name].batch:  # else it has no variances
+            even[name][few] = [render(f"few{i}", name, few, PARTS + i) for i in range(2)]
+        even[name][PARTS * part[name]] = [merge(even[name][part[name]])]
+        if not SAMPLERS[name].batch:
+            shared[name] = {
+                n: [render("shared", name, n, _SHARED, adaptive=Adaptive())] for n in (part[name], PARTS * part[name])
+            }
+    # The reference is of the sampler with the least noise at equal time.
+    middle = sum(even[n][PARTS * part[n]][0]["primal"].astype("f8") for n in names) / len(names)
+    noise = {
+        n: noise_of(*(s["primal"] for s in even[n][part[n]][:2]), middle) * part[n] * relative[n]
+        for n in names
+        if not SAMPLERS[n].biased
+    }
+    quiet = min(noise, key=lambda n: noise[n])
+    batch = max(1, SAMPLERS[quiet].batch)
+    spp = max(1, round(args.reference / relative[quiet] / batch)) * batch
+    spp = kept.numbers(f"reference-{quiet}-{args.reference}", lambda: {"spp": spp})["spp"]
+    halves = [render(f"reference{i}", quiet, spp, _REFERENCE | i)["primal"] for i in range(2)]
 
     rows: list[dict] = []
     for p in pipelines.measure(trials, time.process_time):

@@ -1,5 +1,7 @@
 """Stacks with all layers that networks read, of any size and brightness, made without a renderer."""
 
+from unittest.mock import patch
+
 import numpy as np
 
 from ngpt.classical.gradients import forward_differences
@@ -24,3 +26,8 @@ def full_layers(height, width, scale=1.0, seed=0):
 
 def full_stack(height, width, scale=1.0, seed=0):
     return GradientStack.from_arrays(**full_layers(height, width, scale, seed))
+
+
+def hidden_oidn():
+    """As if OIDN were not installed."""
+    return patch("ngpt.denoisers.oidn.find_spec", lambda name: None)

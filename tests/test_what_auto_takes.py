@@ -8,8 +8,9 @@ import re
 from pathlib import Path
 
 import pytest
+from full_stack import hidden_oidn
 
-from bench.layers import CHOICES, RENDERERS, hidden_oidn, renderers
+from bench.layers import CHOICES, RENDERERS, renderers
 from ngpt.denoisers import oidn
 from ngpt.measure.gains import NEED_OIDN
 from ngpt.methods import METHODS, choose

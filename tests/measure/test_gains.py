@@ -5,10 +5,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from full_stack import full_stack
+from full_stack import full_stack, hidden_oidn
 
 import ngpt
-from bench.layers import TABLE, by_layers, hidden_oidn
+from bench.layers import TABLE, by_layers
 from ngpt.cli import main
 from ngpt.denoisers import oidn
 from ngpt.measure import gains as module
