@@ -26,7 +26,7 @@ from scipy.ndimage import uniform_filter
 
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, SamplePass
-from data_gen.samplers import SAMPLERS, Sampler
+from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError
@@ -95,7 +95,7 @@ def render_adaptive(
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
-    lane_bytes: int = 256,
+    lane_bytes: int = LANE_BYTES,
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 

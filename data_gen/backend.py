@@ -39,7 +39,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         mi.set_variant(name)
         # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
-        for module in ("data_gen.samplers.common", *filter(None, (s.module for s in SAMPLERS.values()))):
+        for module in ("data_gen.samplers.common", *(s.module for s in SAMPLERS.values() if s.module)):
             if module in sys.modules:
                 importlib.reload(sys.modules[module])
             else:

@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
 
 Progress = Callable[[int, int], None]
@@ -21,8 +22,6 @@ SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
 # What a render may use, in MiB, beside the scene itself; see blocks_within().
 DEFAULT_MEMORY = 6144
-# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more.
-LANE_BYTES = 256
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
 PACKET = 16
 _BLOCK_LANES = 1 << 21

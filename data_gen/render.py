@@ -12,6 +12,7 @@ from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
+from data_gen.samplers.registry import Entry
 from data_gen.scenes.facts import scene_facts
 from ngpt.errors import NgptError
 from ngpt.io.exr import with_channels
@@ -37,9 +38,9 @@ def render_stack(
     """Renders a stack from the scene's first sensor.
 
     ``spp`` is the number of (base) paths per pixel, ``seconds`` a limit of wall-clock time (one of them may be None),
-    ``sampler`` "auto" or one of ``data_gen.samplers.SAMPLERS``, ``options`` are the sampler's own. ``progress`` is
-    called with (samples done, spp) before the first pass and after each; for it, ``memory`` and ``stop`` see
-    ``data_gen.passes.render_passes()``. With ``diagnostics`` the stack carries the images of
+    ``sampler`` "auto" or one of ``data_gen.samplers.SAMPLERS``, ``options`` are the sampler's own, which may be texts.
+    ``progress`` is called with (samples done, spp) before the first pass and after each; for it, ``memory`` and
+    ``stop`` see ``data_gen.passes.render_passes()``. With ``diagnostics`` the stack carries the images of
     ``data_gen.film.GradientFilm.diagnose()`` as further channels; without ``with_features``, which sampler "primal"
     alone can do without, it holds the primal alone. The scene's reconstruction filter is not used: the pixels of a
     stack, and so their differences, are box-filtered.
@@ -62,14 +63,11 @@ def render_stack(
         options["features"] = False
     if diagnostics and "diagnostics" in entry.options:
         options["diagnostics"] = True
-    for option in options:
-        if option not in entry.options:
-            have = ", ".join(entry.options) or "none"
-            raise NgptError(f"sampler '{sampler}' has no option '{option}'; it has: {have}")
+    settings = entry.settings(options)
     if adaptive is not None:
-        check_adaptive(adaptive, entry, options, spp)
+        check_adaptive(adaptive, entry, settings, spp)
     start = time.perf_counter()
-    sample, sensor, chosen = entry.make(scene, **options), scene.sensors()[0], {}
+    sample, sensor, chosen = entry.make(scene, **settings), scene.sensors()[0], {}
     if adaptive is None:
         film = render_passes(sample, sensor, seed, spp, progress, seconds, memory, stop, entry.lane_bytes, entry.batch)
     else:
@@ -78,7 +76,13 @@ def render_stack(
         )
     if adaptive is not None:
         chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
-    return stack_of(film, seed, sampler, start, diagnostics, chosen)
+    return stack_of(film, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))
+
+
+def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:
+    """What a header says of a sampler's options, where some are not the defaults."""
+    unusual = entry.unusual(settings)
+    return {"ngpt:samplerOptions": unusual} if unusual else {}
 
 
 def stack_of(

@@ -11,8 +11,9 @@ import numpy as np
 
 from data_gen import passes
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, LANE_BYTES, PACKET, SamplePass, lanes_within, recording
+from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, lanes_within, recording
 from data_gen.paths.camera import CameraSamples
+from data_gen.samplers.registry import LANE_BYTES
 
 # Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
 BLOCK = PACKET

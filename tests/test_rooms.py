@@ -39,7 +39,7 @@ ngpt.export
 ngpt.sequence.export
 data_gen data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
-data_gen.film data_gen.paths
+data_gen.film data_gen.paths data_gen.samplers.registry
 data_gen.passes
 data_gen.uneven
 data_gen.samplers

@@ -10,7 +10,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.passes import DEFAULT_MEMORY
-from data_gen.render import stack_of
+from data_gen.render import options_as_attribute, stack_of
 from data_gen.samplers import FrameSampler
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.geometry import Geometry
@@ -40,9 +40,7 @@ class Remembering:
         self.memory = self.options.pop("memory", None) or DEFAULT_MEMORY
         self.diagnostics = self.options.pop("diagnostics", False)
         self.options.pop("stop", None)
-        if unknown := [name for name in self.options if name not in entry.options]:
-            have = ", ".join(entry.options)
-            raise NgptError(f"sampler '{entry.name}' has no option '{unknown[0]}'; it has: {have}")
+        self.options = entry.settings(self.options)
         self._sampler: Any = None
 
     def render(
@@ -65,7 +63,7 @@ class Remembering:
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
             self._sampler = self.entry.make(scene, self.seed, self.spp, self.memory, **self.options)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
-        more = {"ngpt:confidence": self._sampler.confidence}
+        more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
         stack = stack_of(film, self.seed, self.entry.name, start, self.diagnostics, more)
         progress(self.spp, self.spp)
         return stack

@@ -13,9 +13,6 @@ import numpy as np
 # direction at all counts as DELTA.
 SMOOTH, DELTA, NULL = 0, 1, 2
 
-# α of Beckmann and GGX above which a material is connectable, unless an integrator is given another.
-ROUGHNESS_THRESHOLD = 0.05
-
 # Parameters that hold a microfacet roughness, as mi.traverse() spells them: constants and textures, at any nesting.
 _ROUGHNESS = re.compile(r"(?:^|\.)(alpha|alpha_u|alpha_v|roughness)(?:\.value|\.data)?$")
 

@@ -15,6 +15,7 @@ from data_gen.paths import segments
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
+from data_gen.samplers import SAMPLERS
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
@@ -42,10 +43,17 @@ class GradientIntegrator(mi.SamplingIntegrator):
     ``render()`` returns a tensor (height, width, channels) whose channels ``aov_names()`` lists, in the order of the
     layers of a stack. The film's reconstruction filter is not used, since a gradient is a difference of box-filtered
     pixels. Derived classes implement ``prepare()`` and ``sample()``.
+
+    ``name``     of the sampler, whose entry says which options there are
+    ``options``  all of them, as given or by default
     """
+
+    name = ""
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
+        entry = SAMPLERS[self.name]
+        self.options = entry.settings({name: props[name] for name in entry.options if name in props})
         self.channels: list[str] = []
 
     def prepare(self, scene) -> SamplePass:
@@ -130,4 +138,11 @@ def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
             f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
             "use --sampler gpt-basic"
         )
-    return mi.load_dict({"type": plugin, "hide_emitters": path.hide_emitters, **depths, **options})
+    try:
+        return mi.load_dict({"type": plugin, "hide_emitters": path.hide_emitters, **depths, **options})
+    except RuntimeError as error:
+        # Mitsuba makes a text of what a plugin raises, with the lines where it was raised.
+        _, ours, message = str(error).rpartition("NgptError: ")
+        if not ours:
+            raise
+        raise NgptError(message) from None

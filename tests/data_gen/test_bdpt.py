@@ -148,13 +148,6 @@ def test_what_it_cannot_render(renderer, change, message):
         render_stack(scene, 1, 0, "bdpt")
 
 
-def test_options_out_of_range(renderer):
-    from data_gen.render import render_stack
-
-    with pytest.raises((NgptError, RuntimeError), match=r"joined_depth 0 is out of range; use 1 \.\. 64"):
-        render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "bdpt", joined_depth=0)
-
-
 def test_scenes_without_lights_are_black(renderer):
     from data_gen.render import render_stack
 

@@ -642,11 +642,9 @@ def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monk
     assert followed < 0.8 * noise()
 
 
-def test_options_and_refusals(renderer):
+def test_cameras_that_gbdpt_refuses(renderer):
     from data_gen.render import render_stack
 
-    with pytest.raises((NgptError, RuntimeError), match=r"joined_depth 0 is out of range; use 1 \.\. 64"):
-        render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "gbdpt", joined_depth=0)
     scene = load(renderer, lambda: corner() | {"sensor": {"type": "orthographic"}}, (8, 8))
     with pytest.raises(NgptError, match=r"sampler 'gbdpt' cannot render this scene: light paths cannot reach a camera"):
         render_stack(scene, 1, 0, "gbdpt")

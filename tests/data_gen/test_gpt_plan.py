@@ -44,12 +44,6 @@ def test_plans(renderer):
     assert not make_plan(load(renderer, plenty, (4, 4))).lights.shared
 
 
-def test_unknown_shift(renderer):
-    # Mitsuba wraps what a plugin raises.
-    with pytest.raises(RuntimeError, match="unknown shift 'guess'; choose one of: replay, half-vector, manifold"):
-        renderer.load_dict({"type": "gpt", "shift": "guess"})
-
-
 def test_no_light_at_all(renderer):
     scene = renderer.load_dict({"type": "scene", "sensor": {"type": "perspective"}, "ball": {"type": "sphere"}})
     image = renderer.render(scene, integrator=renderer.load_dict({"type": "gpt"}), spp=2)

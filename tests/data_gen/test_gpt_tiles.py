@@ -178,7 +178,6 @@ def test_depth_limits(renderer):
     [
         (fog, {}, "'gpt-tiles' knows only 'path'"),
         (hidden_lamp, {}, "hides emitters; use --sampler gpt"),
-        ("diffuse", {"tile": 3}, "a tile of 3x3 pixels; choose tile=2 or tile=4"),
         ("diffuse", {"adaptive": Adaptive()}, "'gpt-tiles' depend on each other, so all pixels have as many"),
     ],
 )

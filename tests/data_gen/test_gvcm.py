@@ -329,7 +329,7 @@ def test_maps_of_gvcm_larger_than_memory_are_refused(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (128, 128))
-    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than --option joined_depth=\d+"):
+    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than -O joined_depth=\d+"):
         render_stack(scene, 1, 0, "gvcm", memory=60, joined_depth=64)
 
 

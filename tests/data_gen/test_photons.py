@@ -266,7 +266,7 @@ def test_maps_larger_than_memory_are_refused_with_what_fits(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (128, 128))
-    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than --option photons=(\d+)") as caught:
+    with pytest.raises(NgptError, match=r"pass --memory \d+, or .* or no more than -O photons=(\d+)") as caught:
         render_stack(scene, 1, 0, "ppm", memory=400, photons=64)
     words = str(caught.value)
     fits, needed = int(words.rsplit("=", 1)[1]), int(words.split("--memory ")[1].split(",")[0])
@@ -274,17 +274,6 @@ def test_maps_larger_than_memory_are_refused_with_what_fits(renderer):
     render_stack(scene, 1, 0, "ppm", memory=400, photons=fits)
     with pytest.raises(NgptError, match=r"render a smaller image$"):
         render_stack(scene, 1, 0, "ppm", memory=20)
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"radius": 0.0}, "a radius of 0 pixels; use one above 0"), ({"photons": 0}, "0 photons for each pixel are out")],
-)
-def test_options_of_ppm_out_of_range(renderer, options, message):
-    from data_gen.render import render_stack
-
-    with pytest.raises((NgptError, RuntimeError), match=message):
-        render_stack(load(renderer, "diffuse", (8, 8)), 1, 0, "ppm", **options)
 
 
 def test_variants_that_photons_refuse(renderer):

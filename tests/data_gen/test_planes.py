@@ -14,7 +14,6 @@ from test_beams import alike
 from unbiased import REFERENCES, load, render_ours
 
 from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
-from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
 
@@ -140,14 +139,3 @@ def test_small_radii_have_the_image_of_volpath(renderer, name):
 def test_planes_go_on_behind_boundaries(renderer):
     """In from outside, where the lamp is, and out again."""
     alike(renderer, fog, sampler="planes", planes=512)
-
-
-def test_light_paths_for_planes_are_counted(renderer):
-    from data_gen.render import render_stack
-
-    scene = load(renderer, media_scenes.haze, (4, 4))
-    for planes in (0, 1 << 20):
-        with pytest.raises(
-            (NgptError, RuntimeError), match=f"planes of {planes} light paths are out of range; use 1 .. 65536"
-        ):
-            render_stack(scene, 1, 0, "planes", planes=planes)

@@ -90,8 +90,7 @@ def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
     ("options", "message"),
     [
         ({"seconds": 2.0}, "--spp"),
-        ({"history": 0}, "1 or more"),
-        ({"gradients": "none"}, "pairs or after"),
+        ({"history": 0}, "'0' is not allowed; it takes a number of 1 or more"),
         ({"shift": "replay"}, "no option 'shift'"),
         ({"memory": 1}, "--memory"),
     ],

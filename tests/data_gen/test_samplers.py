@@ -11,19 +11,19 @@ import pytest
 from data_gen_scenes import fog, leaf
 from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
 
-from data_gen.samplers import SAMPLERS, Sampler, choose, find, register
+from data_gen.samplers import SAMPLERS, Option, Sampler, choose, find, register
 from ngpt.errors import NgptError
 
 
 class Toy:
-    """Random replay in batches: the samples of a pixel in a pass are all the same one, and half of it is splatted."""
+    """Random replay in batches: the samples of a pixel in a pass are all one and the same, and a share is splatted."""
 
-    def __init__(self, scene, shy=False):
+    def __init__(self, scene, share):
         from data_gen.samplers.common import radiance
         from data_gen.samplers.teaching.gpt_basic import make
 
         make(scene)  # refuses what it cannot render
-        self.scene, self.estimate = scene, radiance(scene, scene.integrator())
+        self.scene, self.estimate, self.share = scene, radiance(scene, scene.integrator()), share
 
     def __call__(self, camera, film):
         import drjit as dr
@@ -45,18 +45,18 @@ class Toy:
             L_shifted, inside = radiance(shift)
             values[name] = (L_shifted - L, inside)
         for name, (value, active) in values.items():
-            film.put(name, value / 2, active)
-            film.splat(name, camera.pixel, value / 2, active)
+            film.put(name, value * (1 - self.share), active)
+            film.splat(name, camera.pixel, value * self.share, active)
         film.put_all(features(self.scene, camera.sensor, camera.random.clone(), camera.rays()[0]))
 
 
 TOY = Sampler(
     "toy",
     "a toy",
-    Toy,
-    lambda facts: "" if facts.integrator in ("path", "volpath") else "toys know only 'path' and 'volpath'",
-    lambda facts: [f"a note on {facts.integrator}"],
-    {"shy": "does nothing"},
+    make=Toy,
+    refuses=lambda facts: "" if facts.integrator in ("path", "volpath") else "toys know only 'path' and 'volpath'",
+    notes=lambda facts: [f"a note on {facts.integrator}"],
+    options={"share": Option(0.5, "of each value that is splatted", range=(0, 1))},
     rank=5,
     batch=8,
 )
@@ -281,7 +281,7 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     with pytest.raises(NgptError, match=r"toys know only 'path' and 'volpath'; use --sampler gpt-basic"):
         find("toy", Facts("spectral", ()))
     scene = scene_for(renderer, "toy", (6, 4))
-    with pytest.raises(NgptError, match="sampler 'toy' has no option 'loud'; it has: shy"):
+    with pytest.raises(NgptError, match="sampler 'toy' has no option 'loud'; it has: share"):
         render_stack(scene, 1, sampler="toy", loud=True)
     with pytest.raises(NgptError, match="sampler 'toy' always renders features; only 'primal'"):
         render_stack(scene, 1, sampler="toy", with_features=False)
@@ -312,7 +312,7 @@ def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
         timing_repeats=1,
     )
 
-    def timed(scene, options, spp, seed):
+    def timed(scene, options, spp, seed, clock):
         """A sample of the toy takes 3 s, one of the others 2 s."""
         return costs.render_stack(scene, spp, seed, **options), spp * (3.0 if options["sampler"] == "toy" else 2.0)
 
@@ -326,10 +326,3 @@ def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
 
 def find_reason(name, facts):
     return SAMPLERS[name].refuses(facts)
-
-
-def test_names_are_taken_once():
-    with pytest.raises(NgptError, match="there is a sampler 'toy' already"):
-        register(TOY)
-    with pytest.raises(NgptError, match="unknown sampler 'gtp'; choose one of: auto, gpt, gpt-basic"):
-        find("gtp")

@@ -84,17 +84,14 @@ class BDPT(GradientIntegrator):
     areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
     """
 
-    # Of ``joined_depth``, where the user gives none
-    usually_joined = 10
+    name = "bdpt"
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         max_depth = props.get("max_depth", -1)
         self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
         self.rr_depth = props.get("rr_depth", 5)
-        self.joined_depth = props.get("joined_depth", self.usually_joined)
-        if not 1 <= self.joined_depth <= 64:
-            raise NgptError(f"bdpt: joined_depth {self.joined_depth} is out of range; use 1 .. 64")
+        self.joined_depth = self.options["joined_depth"]
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene)

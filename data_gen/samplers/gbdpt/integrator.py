@@ -37,7 +37,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
+from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
@@ -70,9 +70,11 @@ class GBDPT(BDPT):
     Not handled: what ``bdpt`` does not handle.
     """
 
+    name = "gbdpt"
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+        self.roughness_threshold = self.options["roughness_threshold"]
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, "gbdpt")

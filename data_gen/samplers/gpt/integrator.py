@@ -50,17 +50,14 @@ from data_gen.paths import media, segments
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
-from data_gen.samplers import VOLUMETRIC
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.base_path import base_step
 from data_gen.samplers.gpt.manifold_shift import add_followed, no_chain
 from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
+from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name, media_of
 from ngpt.errors import NgptError
-
-_SHIFTS = ("replay", "half-vector", "manifold")
 
 
 class GPT(GradientIntegrator):
@@ -88,19 +85,17 @@ class GPT(GradientIntegrator):
     limit to the collisions in grids, and each null event at a mask or a thin pane counts in ``max_depth``.
     """
 
+    name = "gpt"
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         max_depth = props.get("max_depth", -1)
         self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
         self.rr_depth = props.get("rr_depth", 5)
-        self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
-        self.shift = props.get("shift", "replay")
-        self.reuse = props.get("reuse", False)
-        self.diagnostics = props.get("diagnostics", False)
-        self.caustic = props.get("caustic", True)
+        self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
+        self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
+        self.diagnostics = self.options["diagnostics"]
         self.volumes = props.get("volumes", False)
-        if self.shift not in _SHIFTS:
-            raise NgptError(f"gpt: unknown shift '{self.shift}'; choose one of: {', '.join(_SHIFTS)}")
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 

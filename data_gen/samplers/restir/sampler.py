@@ -11,7 +11,6 @@ from data_gen.film import GradientFilm
 from data_gen.passes import lanes_within, recording
 from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD
 from data_gen.samplers.gpt.plan import make_plan
 from data_gen.samplers.restir.carry import Stage
 from data_gen.samplers.restir.history import Frame, History
@@ -37,14 +36,10 @@ class Restir:
         seed: int,
         spp: int,
         memory: int,
-        history: float = 32,
-        gradients: str = "pairs",
-        roughness_threshold: float = ROUGHNESS_THRESHOLD,
+        history: float,
+        gradients: str,
+        roughness_threshold: float,
     ):
-        if history < 1:
-            raise NgptError(f"restir: a history of {history:g} frames; give 1 or more")
-        if gradients not in ("pairs", "after"):
-            raise NgptError(f"restir: unknown gradients '{gradients}'; choose pairs or after")
         self.spp, self._roughness = spp, roughness_threshold
         self.stage = self._stage(scene, ())
         film = self._film()

@@ -44,12 +44,11 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, evaluate, seen_from
+from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.samplers.common import like_path
 from data_gen.samplers.teaching.gpt_simple import GPTSimple, base_step, reflected
 from ngpt.errors import NgptError
 
-SIDES = (2, 4)
 # Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
@@ -69,15 +68,14 @@ class GPTTiles(GPTSimple):
     variants; for the last three rendering raises NgptError, as for other sides of a tile.
     """
 
+    name = "gpt-tiles"
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.tile = int(props.get("tile", SIDES[0]))
-        self.roughness_threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
+        self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
 
     def prepare(self, scene) -> SamplePass:
         refuse(self.hide_emitters)
-        if self.tile not in SIDES:
-            raise NgptError(f"gpt-tiles: a tile of {self.tile}x{self.tile} pixels; choose tile=2 or tile=4")
         return Tiles(self, scene)
 
 

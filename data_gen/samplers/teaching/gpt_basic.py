@@ -39,6 +39,8 @@ class GPTBasic(GradientIntegrator):
     noisier than those of a shift that reconnects.
     """
 
+    name = "gpt-basic"
+
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]

@@ -39,8 +39,9 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials, consistent, evaluate, seen_from
+from data_gen.paths.vertex import Materials, consistent, evaluate, seen_from
 from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.shared import CONNECTABLE
 from ngpt.errors import NgptError
 
 
@@ -53,6 +54,8 @@ class GPTSimple(GradientIntegrator):
     Not handled: mirrors, glass, polish and holes, media, hidden emitters and polarised variants. Media are not seen;
     for the others rendering raises NgptError.
     """
+
+    name = "gpt-simple"
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -238,7 +241,7 @@ def refuse(scene, hide_emitters: bool) -> None:
         reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
     elif hide_emitters:
         reason, other = "its integrator hides emitters", "gpt"
-    elif materials := Materials(scene, ROUGHNESS_THRESHOLD).unconnectable:
+    elif materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""
         reason, other = f"paths cannot be reconnected at {', '.join(materials[:3])}{more}", "gpt"
     else:

@@ -36,7 +36,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.vertex import ROUGHNESS_THRESHOLD, Materials
+from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.bdpt.lights import LightEnds
@@ -45,7 +45,6 @@ from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.ppm import refuse
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
-from ngpt.errors import NgptError
 
 # Of a camera sample, its features and its light path, beside the map: what was seen, and some more
 SAMPLE_BYTES = 1536
@@ -69,19 +68,13 @@ class VCM(BDPT):
     other than areas, points, spots and those infinitely far away. Rendering raises NgptError for them.
     """
 
-    # Light through glass and back has long paths, which the camera finds by rare and bright ones alone. Of a light path
-    # 16 vertices are kept.
-    usually_joined = 17
     # What becomes of light paths that end at the camera
     splatter = Splatter
     name, sample_bytes = "vcm", SAMPLE_BYTES
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.radius = float(props.get("radius", 2.0))
-        self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
-        if not 0 < self.radius < float("inf"):
-            raise NgptError(f"{self.name}: a radius of {self.radius:g} pixels; use one above 0")
+        self.radius, self.threshold = self.options["radius"], self.options["roughness_threshold"]
 
     @property
     def longest(self) -> int:
@@ -104,7 +97,7 @@ class VCM(BDPT):
         """What else than a smaller image would fit into so many bytes for each camera sample."""
         places = (lane_bytes - self.sample_bytes) // VERTEX_BYTES
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
-        return f", or no more than --option joined_depth={fits}" if fits else ""
+        return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)

@@ -43,7 +43,6 @@ from data_gen.samplers.photons.media.planes import (
     AcrossPlanes,
     Crossing,
     crossing,
-    known_planes,
     only_beams,
     planes_of,
     scattered_of,
@@ -138,7 +137,7 @@ class GPLANES(GBEAMS):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.planes = known_planes(self, props)
+        self.planes = self.options["planes"]
 
     def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
         yield from super().gathered(passes, starts, only_beams(photons), number, paths)

@@ -126,7 +126,7 @@ class GVPM(VPM):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.diagnostics = props.get("diagnostics", False)
+        self.diagnostics = self.options["diagnostics"]
 
     def prepare(self, scene) -> SamplePass:
         return with_media(super().prepare(scene), self)

@@ -40,11 +40,7 @@ from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.beams import BEAMS
 from data_gen.samplers.photons.media.bre import Both, seen_along
 from data_gen.samplers.photons.passes import Passes
-from ngpt.errors import NgptError
 
-# Light paths of a map that are swept, and the most
-SWEPT = 64
-MOST = 1 << 16
 # Of a plane, and of the edge of a map that it may be swept from
 PLANE_BYTES = (18 + 3) * 4
 
@@ -212,14 +208,6 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
     )
 
 
-def known_planes(integrator, props: mi.Properties) -> int:
-    """The parameter ``planes``. Raises NgptError if it is out of range."""
-    planes = int(props.get("planes", SWEPT))
-    if not 1 <= planes <= MOST:
-        raise NgptError(f"{integrator.name}: planes of {planes} light paths are out of range; use 1 .. {MOST}")
-    return planes
-
-
 class PLANES(BEAMS):
     """Photon planes for light scattered in homogeneous media twice or more, beams and photons for the rest.
 
@@ -236,7 +224,7 @@ class PLANES(BEAMS):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.planes = known_planes(self, props)
+        self.planes = self.options["planes"]
 
     def of_map(self, passes: Passes, photons, number: int, paths: int) -> Iterator[Both]:
         yield from super().of_map(passes, only_beams(photons), number, paths)

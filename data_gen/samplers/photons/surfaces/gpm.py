@@ -64,7 +64,7 @@ class GPM(PPM):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        self.diagnostics = props.get("diagnostics", False)
+        self.diagnostics = self.options["diagnostics"]
 
     def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
         """What is near in the map ``photons`` of pass ``number``, of so many light paths that begin at ``starts``."""

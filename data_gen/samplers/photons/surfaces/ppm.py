@@ -34,7 +34,7 @@ from data_gen.paths.features import features
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.streams import sample_streams
-from data_gen.paths.vertex import NULL, ROUGHNESS_THRESHOLD, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
@@ -113,12 +113,8 @@ class PPM(GradientIntegrator):
         max_depth = props.get("max_depth", -1)
         self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
         self.rr_depth = props.get("rr_depth", 5)
-        self.radius, self.photons = float(props.get("radius", 3.0)), int(props.get("photons", 1))
-        self.threshold = props.get("roughness_threshold", ROUGHNESS_THRESHOLD)
-        if not 0 < self.radius < float("inf"):
-            raise NgptError(f"{self.name}: a radius of {self.radius:g} pixels; use one above 0")
-        if not 1 <= self.photons <= 1 << 16:
-            raise NgptError(f"{self.name}: {self.photons} photons for each pixel are out of range; use 1 .. {1 << 16}")
+        self.radius, self.photons = self.options["radius"], self.options["photons"]
+        self.threshold = self.options["roughness_threshold"]
 
     @property
     def lane_bytes(self) -> int:
@@ -128,7 +124,7 @@ class PPM(GradientIntegrator):
     def instead(self, lane_bytes: int) -> str:
         """What else than a smaller image would fit into so many bytes for each camera sample."""
         fits = (lane_bytes - self.camera_bytes) // self.map_bytes
-        return f", or no more than --option photons={fits}" if fits > 0 else ""
+        return f", or no more than -O photons={fits}" if fits > 0 else ""
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)

@@ -16,7 +16,7 @@ from data_gen.samplers.common import radiance
 from data_gen.scenes.load import reference_integrator
 
 
-def make(scene: mi.Scene, features: bool = True) -> SamplePass:
+def make(scene: mi.Scene, features: bool) -> SamplePass:
     """The sampler ``primal``; without ``features`` it holds the primal alone."""
     integrator = reference_integrator(scene)
     return partial(sample_pass, scene, integrator, radiance(scene, integrator), features)

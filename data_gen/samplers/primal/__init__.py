@@ -1,0 +1,1 @@
+"""The scene's own integrator, without gradients."""

@@ -1,0 +1,15 @@
+"""The entry of ``primal``."""
+
+from data_gen.samplers.registry import Option, Sampler, register
+
+register(
+    Sampler(
+        "primal",
+        "the scene's own integrator without gradients (references, primal denoisers)",
+        "data_gen.samplers.primal.sampler",
+        standing="use",
+        options={"features": Option(True, "albedo, normal, depth and emission seen directly")},
+        gradients=False,
+        tried=True,
+    )
+)

@@ -1,0 +1,269 @@
+"""What a sampler says of itself, and how it is found by that: entries, their typed options, and the registry.
+
+Nothing here imports Mitsuba: a sampler's module, whose classes belong to a variant of Mitsuba, is imported when the
+sampler is made.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from difflib import get_close_matches
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from ngpt.errors import NgptError
+
+if TYPE_CHECKING:
+    from data_gen.scenes.facts import Facts
+
+# Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
+LANE_BYTES = 256
+# Whom samplers are for: users; users who know why; those who study them
+STANDINGS = ("use", "niche", "study")
+
+Value = bool | int | float | str
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option of a sampler, of the type of its ``default``.
+
+    ``meaning``  one line for the user
+    ``choices``  the values there are; () for all within the range
+    ``range``    least and greatest value of a number
+    """
+
+    default: Value
+    meaning: str
+    choices: tuple[Value, ...] = ()
+    range: tuple[float, float] = (-math.inf, math.inf)
+
+    @property
+    def allowed(self) -> str:
+        """What values it takes, in words."""
+        if isinstance(self.default, bool):
+            return "true or false"
+        if self.choices:
+            return ", ".join(written(choice) for choice in self.choices)
+        low, high = (f"{bound:g}" for bound in self.range)
+        limits = "" if low == "-inf" else f" of {low} or more" if high == "inf" else f" from {low} to {high}"
+        return {int: "a whole number", float: "a number", str: "a text"}[type(self.default)] + limits
+
+    def check(self, value: Any) -> Value:
+        """The ``value``, or what a text says, as the option's type. Raises NgptError for what is not allowed."""
+        typed = self._typed(value)
+        inside = not isinstance(typed, int | float) or self.range[0] <= typed <= self.range[1]
+        if typed is None or not inside or (self.choices and typed not in self.choices):
+            given = value if isinstance(value, str) else written(value)
+            near = get_close_matches(given, [written(choice) for choice in self.choices], 1)
+            meant = f"; did you mean '{near[0]}'?" if near else ""
+            raise NgptError(f"'{given}' is not allowed; it takes {self.allowed}{meant}")
+        return typed
+
+    def _typed(self, value: Any) -> Value | None:
+        kind = type(self.default)
+        if isinstance(value, str) and kind is bool:
+            return {"true": True, "false": False}.get(value.lower())
+        if isinstance(value, str) and kind in (int, float):
+            try:
+                return kind(value)
+            except ValueError:
+                return None
+        # To Python, true is a number.
+        if isinstance(value, bool) or kind in (bool, str):
+            return value if type(value) is kind else None
+        try:
+            return kind(value) if kind(value) == value else None
+        except (TypeError, ValueError, OverflowError):
+            return None
+
+
+def written(value: Any) -> str:
+    """A value of an option as users write it."""
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def _of_no_module(*args: Any, **options: Any) -> Any:
+    raise NotImplementedError
+
+
+def _anything(facts: Facts) -> str:
+    return ""
+
+
+def _nothing_to_note(facts: Facts) -> list[str]:
+    return []
+
+
+def _from_module(module: str) -> Callable[..., Any]:
+    """The function ``make`` of a module, which is imported when it is first called."""
+    return lambda *args, **options: import_module(module).make(*args, **options)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """What all samplers have.
+
+    ``name``      as users call it
+    ``summary``   one line for the user
+    ``module``    where its function ``make`` is, and its Mitsuba classes, which are made anew with each variant
+    ``make``      what makes it, where there is no ``module``
+    ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
+    ``options``   name -> ``Option``; ``make`` takes all of them
+    ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
+    ``notes``     facts about a scene -> what the user should know about rendering it, a line each
+    """
+
+    name: str
+    summary: str
+    module: str = ""
+    make: Callable[..., Any] = field(default=_of_no_module, kw_only=True)
+    standing: str = field(default="niche", kw_only=True)
+    options: Mapping[str, Option] = field(default_factory=dict, kw_only=True)
+    refuses: Callable[[Facts], str] = field(default=_anything, kw_only=True)
+    notes: Callable[[Facts], list[str]] = field(default=_nothing_to_note, kw_only=True)
+
+    def __post_init__(self) -> None:
+        if self.standing not in STANDINGS:
+            raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
+        if self.module:
+            object.__setattr__(self, "make", _from_module(self.module))
+
+    def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """All options, those ``given``, which may be texts, and the others' defaults.
+
+        Raises NgptError for options that do not exist, and for values that are not allowed.
+        """
+        found: dict[str, Any] = {name: option.default for name, option in self.options.items()}
+        for name, value in given.items():
+            if name not in self.options:
+                have, near = ", ".join(self.options) or "none", get_close_matches(name, self.options, 1)
+                meant = f"; did you mean '{near[0]}'?" if near else ""
+                raise NgptError(f"sampler '{self.name}' has no option '{name}'{meant or f'; it has: {have}'}")
+            try:
+                found[name] = self.options[name].check(value)
+            except NgptError as error:
+                raise NgptError(f"sampler '{self.name}', option '{name}': {error}") from None
+        return found
+
+    def unusual(self, settings: Mapping[str, Any]) -> str:
+        """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
+        other = {name: value for name, value in settings.items() if value != self.options[name].default}
+        return ", ".join(f"{name}={written(value)}" for name, value in other.items())
+
+    def made(self, *args: Any, **options: Any) -> Any:
+        """What ``make`` makes, with ``options`` that may be texts, and the others' defaults; raises NgptError."""
+        return self.make(*args, **self.settings(options))
+
+
+@dataclass(frozen=True)
+class Sampler(Entry):
+    """What renders the layers of a gradient stack.
+
+    ``make``        (scene, options) -> what takes the samples of a pass (``data_gen.passes.SamplePass``); raises
+                    NgptError for a scene it cannot render
+    ``gradients``   whether it renders dx and dy
+    ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
+    ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene: those that were
+                    seen to be chosen where they are best (``data_gen.choosing.pilot``)
+    ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
+    ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
+                    has so many, and variances are over passes
+    ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
+    ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
+    ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
+    """
+
+    gradients: bool = field(default=True, kw_only=True)
+    rank: int = field(default=0, kw_only=True)
+    tried: bool = field(default=False, kw_only=True)
+    finds: tuple[str, ...] = field(default=(), kw_only=True)
+    batch: int = field(default=0, kw_only=True)
+    together: bool = field(default=False, kw_only=True)
+    lane_bytes: int = field(default=LANE_BYTES, kw_only=True)
+    biased: bool = field(default=False, kw_only=True)
+
+    @property
+    def even(self) -> bool:
+        """Whether all pixels must have as many samples."""
+        return bool(self.batch) or self.together
+
+
+# What samplers find: light that is seen in mirrors or through glass after glass has focussed it on something rough;
+# lamps that are hidden from what they light; and light in media whose density varies, by photons
+FINDS = ("caustics", "hidden lamps", "grids")
+
+
+@dataclass(frozen=True)
+class FrameSampler(Entry):
+    """What renders the frames of a shot one after the other, for it remembers those before; no single images.
+
+    ``make``     (scene, seed, samples per pixel, memory in MiB, options) -> an object whose ``film(index, motion,
+                 depth)`` is the film of a frame, numbered in the shot; raises NgptError for what it cannot render
+    ``spp``      samples per pixel of a frame, where the user gives none
+    ``warm_up``  frames before, that are rendered where a shot is gone on with: its history
+    ``alone``    why it renders no single images
+    """
+
+    spp: int = field(kw_only=True)
+    warm_up: int = field(kw_only=True)
+    alone: str = field(kw_only=True)
+
+
+SAMPLERS: dict[str, Sampler] = {}
+FRAME_SAMPLERS: dict[str, FrameSampler] = {}
+
+
+def register(entry: Sampler | FrameSampler) -> None:
+    """Adds a sampler, behind those there are. Raises NgptError if its name is taken."""
+    if entry.name in ("auto", *SAMPLERS, *FRAME_SAMPLERS):
+        raise NgptError(f"there is a sampler '{entry.name}' already")
+    if isinstance(entry, FrameSampler):
+        FRAME_SAMPLERS[entry.name] = entry
+    else:
+        SAMPLERS[entry.name] = entry
+
+
+def find(name: str, facts: Facts | None = None) -> Sampler:
+    """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
+    if name in FRAME_SAMPLERS:
+        raise NgptError(
+            f"sampler '{name}' is for sequences (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt"
+        )
+    if name not in SAMPLERS:
+        near = get_close_matches(name, [*SAMPLERS, *FRAME_SAMPLERS], 1)
+        meant = f"did you mean '{near[0]}'? " if near else ""
+        raise NgptError(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}")
+    sampler = SAMPLERS[name]
+    if facts is not None and (reason := sampler.refuses(facts)):
+        able = [other for other in SAMPLERS.values() if not other.refuses(facts)]
+        names = [other.name if other.gradients else f"{other.name} (no gradients)" for other in able]
+        raise NgptError(f"sampler '{name}' cannot render this scene: {reason}; use --sampler {', or '.join(names)}")
+    return sampler
+
+
+def choose(facts: Facts) -> tuple[str, str]:
+    """The sampler that "auto" stands for by the description alone, and why."""
+    reasons: list[str] = []
+    for sampler in sorted(SAMPLERS.values(), key=lambda sampler: sampler.rank):
+        if not sampler.rank:
+            continue
+        reason = sampler.refuses(facts)
+        if not reason:
+            media = "there are media" if facts.media else "there are no media"
+            return sampler.name, "; ".join(reasons) or f"the integrator is '{facts.integrator}' and {media}"
+        reasons.append(reason)
+    raise NgptError(f"no sampler can render this scene with gradients: {'; '.join(reasons)}; use --sampler primal")
+
+
+def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:
+    """The samplers of a standing, by name."""
+    entries: list[Sampler | FrameSampler] = [*SAMPLERS.values(), *FRAME_SAMPLERS.values()]
+    return {entry.name: entry for entry in entries if entry.standing == standing}
+
+
+def summaries() -> dict[str, str]:
+    """Name -> summary, for help texts."""
+    return {name: entry.summary for name, entry in (*SAMPLERS.items(), *FRAME_SAMPLERS.items())}

@@ -1,0 +1,80 @@
+"""What entries of several families share: why they refuse a scene, and options and notes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from data_gen.samplers.registry import Option
+
+if TYPE_CHECKING:
+    from data_gen.scenes.facts import Facts
+
+# Integrators that render media, of those that samplers of ours follow
+VOLUMETRIC = ("volpath", "volpathmis")
+
+Refusal = Callable[["Facts"], str]
+
+
+def refused_if_polarised(facts: Facts, name: str) -> str:
+    return f"variant '{facts.polarised}' is polarised, which '{name}' does not follow" if facts.polarised else ""
+
+
+def surfaces_alone(name: str) -> Refusal:
+    """Of a sampler that sees no media."""
+
+    def refuses(facts: Facts) -> str:
+        if facts.integrator != "path":
+            reason = f"the integrator is '{facts.integrator}', and '{name}' knows only 'path'"
+        else:
+            media = ", ".join(facts.media)
+            reason = f"there are media ({media}), which '{name}' does not see" if media else ""
+        return refused_if_polarised(facts, name) or reason
+
+    return refuses
+
+
+def media_alone(name: str, grids: bool = True) -> Refusal:
+    """Of a sampler for scenes with media; ``grids``: also ones whose density varies."""
+
+    def refuses(facts: Facts) -> str:
+        if facts.integrator not in VOLUMETRIC:
+            reason = f"the integrator is '{facts.integrator}', and '{name}' knows only 'volpath' and 'volpathmis'"
+        elif not facts.media:
+            reason = "there are no media, and 'ppm' has the same image"
+        else:
+            varies = facts.grids and not grids
+            reason = f"there are media whose density varies, which '{name}' does not render" if varies else ""
+        return refused_if_polarised(facts, name) or reason
+
+    return refuses
+
+
+# Options that several samplers have
+CONNECTABLE = Option(0.05, "the microfacet roughness above which materials are connectable", range=(0, math.inf))
+DIAGNOSTICS = Option(False, "rates of failed shifts")
+GATHERING = Option(0.05, "the microfacet roughness above which photons are gathered at materials", range=(0, math.inf))
+
+
+def joined_depth(default: int) -> Option:
+    """Of samplers by paths from both ends."""
+    meaning = "edges of a path, up to which it is found from both ends; longer ones from the camera"
+    return Option(default, meaning, range=(1, 64))
+
+
+def first_radius(default: float) -> Option:
+    """Of samplers by photons."""
+    meaning = "how far photons are gathered from in the first pass, in pixels where most is seen"
+    return Option(default, meaning, range=(1e-6, 1e6))
+
+
+def notes_on_photons(facts: Facts) -> list[str]:
+    how = "found by photons; blurred, less with every sample"
+    return [f"transport: Mitsuba's '{facts.integrator}', {how}", *notes_on_mirrors(facts)]
+
+
+def notes_on_mirrors(facts: Facts) -> list[str]:
+    """Of samplers by photons."""
+    line = "mirrors or clear glass: followed from the camera and from the lights, caustics seen in them too"
+    return [line] if facts.mirrors else []

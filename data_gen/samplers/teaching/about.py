@@ -1,0 +1,45 @@
+"""The entries of ``gpt-basic`` and ``gpt-simple``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from data_gen.samplers.registry import Sampler, register
+from data_gen.samplers.shared import surfaces_alone
+
+if TYPE_CHECKING:
+    from data_gen.scenes.facts import Facts
+
+
+def _notes_on_replay(facts: Facts) -> list[str]:
+    lines = [f"transport: Mitsuba's '{facts.integrator}', replayed as a whole"]
+    if facts.media:
+        lines.append("media: replayed with everything else; albedo counts them, normal and depth do not")
+    return lines
+
+
+def _refused_by_simple(facts: Facts) -> str:
+    mirrors = "there are mirrors or clear glass, at which paths cannot be reconnected" if facts.mirrors else ""
+    return surfaces_alone("gpt-simple")(facts) or mirrors
+
+
+register(
+    Sampler(
+        "gpt-basic",
+        "gradients by random sequence replay (any transport; five paths per sample)",
+        "data_gen.samplers.teaching.gpt_basic",
+        notes=_notes_on_replay,
+        rank=9,
+    )
+)
+register(
+    Sampler(
+        "gpt-simple",
+        "gradients by reconnection alone (surfaces that scatter widely; the code to read before that of gpt)",
+        "data_gen.samplers.teaching.gpt_simple",
+        refuses=_refused_by_simple,
+        notes=lambda facts: [
+            f"transport: Mitsuba's '{facts.integrator}', offset paths join it at the second vertex",
+        ],
+    )
+)

@@ -1,0 +1,79 @@
+"""What entries say of samplers: typed options, one place for each default, names that are nearly right."""
+
+import pytest
+
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Option, Sampler, find, register
+from ngpt.errors import NgptError
+
+ENTRIES = {**SAMPLERS, **FRAME_SAMPLERS}
+OPTIONS = [(name, option) for name, entry in ENTRIES.items() for option in entry.options]
+
+
+@pytest.mark.parametrize(("name", "option"), OPTIONS)
+def test_defaults_are_allowed_and_other_values_are_not(name, option):
+    entry = ENTRIES[name]
+    default = entry.options[option].default
+    assert entry.settings({option: default})[option] == default
+    wrong = [None, [], "nonsense", "nan", *(["no", 1] if isinstance(default, bool) else [True])]
+    low, high = entry.options[option].range
+    wrong += [low - 1] if low > float("-inf") else []
+    wrong += [high * 2] if high < float("inf") else []
+    for value in wrong:
+        with pytest.raises(NgptError, match=f"^sampler '{name}', option '{option}': .* is not allowed; it takes "):
+            entry.settings({option: value})
+
+
+@pytest.mark.parametrize(
+    ("option", "given", "typed"),
+    [
+        (Option(True, ""), "False", False),
+        (Option(1, ""), "4", 4),
+        (Option(1, ""), 4.0, 4),
+        (Option(1.0, ""), "4e-2", 0.04),
+        (Option(1.0, ""), 4, 4.0),
+        (Option("a", "", choices=("a", "b")), "b", "b"),
+        (Option(2, "", choices=(2, 4)), "4", 4),
+    ],
+)
+def test_texts_become_what_the_default_is(option, given, typed):
+    assert option.check(given) == typed and type(option.check(given)) is type(typed)
+
+
+@pytest.mark.parametrize(
+    ("name", "options", "message"),
+    [
+        ("bdpt", {"joined_depth": 0}, "'joined_depth': '0' is not allowed; it takes a whole number from 1 to 64$"),
+        ("gbdpt", {"joined_depth": 2.5}, "'2.5' is not allowed"),
+        ("ppm", {"radius": 0}, "'radius': '0' is not allowed; it takes a number from 1e-06 to 1e.06$"),
+        ("ppm", {"photons": 1 << 20}, "it takes a whole number from 1 to 65536"),
+        ("gpt", {"shift": "half-vektor"}, "it takes replay, half-vector, manifold; did you mean 'half-vector'"),
+        ("gpt", {"roughness_threshold": "x"}, "'x' is not allowed; it takes a number of 0 or more"),
+        ("gpt", {"reus": True}, "sampler 'gpt' has no option 'reus'; did you mean 'reuse'"),
+        ("split", {"reuse": True}, "sampler 'split' has no option 'reuse'; it has: none"),
+    ],
+)
+def test_errors_come_before_the_plugin_and_say_what_goes(renderer, name, options, message):
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    with pytest.raises(NgptError, match=message):
+        render_stack(load_scene("diffuse", (4, 4)), 1, sampler=name, **options)
+
+
+def test_settings_that_are_not_defaults_are_written_as_they_are_typed():
+    gpt = SAMPLERS["gpt"]
+    settings = gpt.settings({"caustic": "false", "roughness_threshold": 0.1, "shift": "replay"})
+    assert gpt.unusual(settings) == "roughness_threshold=0.1, caustic=false"
+    assert gpt.settings(dict(part.split("=") for part in gpt.unusual(settings).split(", "))) == settings
+    assert gpt.unusual(gpt.settings({})) == ""
+
+
+def test_names():
+    with pytest.raises(NgptError, match="there is a sampler 'gpt' already"):
+        register(Sampler("gpt", "another"))
+    with pytest.raises(NgptError, match="there is a sampler 'restir' already"):
+        register(Sampler("restir", "another"))
+    with pytest.raises(NgptError, match=r"unknown sampler 'gtp'; did you mean 'gpt'\? choose one of: auto, gpt,"):
+        find("gtp")
+    with pytest.raises(NgptError, match="standing 'useful' is none of use, niche, study"):
+        Sampler("new", "another", standing="useful")
