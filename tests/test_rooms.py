@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 # longest that fits counts.
 FLOORS = """
 ngpt.errors ngpt.version
-ngpt.system
+ngpt.system ngpt.options
 ngpt.report.display ngpt.report.png
 ngpt.api.tensors ngpt.layers ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack

@@ -1,0 +1,106 @@
+"""Options of samplers and methods: typed, with default and meaning; the same in commands, files and Python."""
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from difflib import get_close_matches
+from typing import Any
+
+from ngpt.errors import NgptError
+
+# Whom samplers and methods are for: users; users who know why; those who study them
+STANDINGS = ("use", "niche", "study")
+
+Value = bool | int | float | str
+_ANY = (-math.inf, math.inf)
+
+
+@dataclass(frozen=True)
+class Option:
+    """An option, of the type of its ``default``.
+
+    ``meaning``  one line for the user
+    ``choices``  the values there are; () for all within the range
+    ``range``    least and greatest value of a number; with ``choices`` too, either will do: a number, or "auto"
+    """
+
+    default: Value
+    meaning: str
+    choices: tuple[Value, ...] = ()
+    range: tuple[float, float] = _ANY
+
+    @property
+    def allowed(self) -> str:
+        """What values it takes, in words."""
+        if isinstance(self.default, bool):
+            return "true or false"
+        words = ", ".join(written(choice) for choice in self.choices)
+        if self.choices and self.range == _ANY:
+            return words
+        low, high = (f"{bound:g}" for bound in self.range)
+        limits = "" if low == "-inf" else f" of {low} or more" if high == "inf" else f" from {low} to {high}"
+        kind = {int: "a whole number", float: "a number", str: "a text"}[self._kind] + limits
+        return f"{kind}, or {words}" if words else kind
+
+    def check(self, value: Any) -> Value:
+        """The ``value``, or what a text says, as the option's type. Raises NgptError for what is not allowed."""
+        if self.choices and (given := self._typed(value, type(self.choices[0]))) in self.choices:
+            assert given is not None
+            return given
+        typed = self._typed(value, self._kind)
+        outside = isinstance(typed, int | float) and not self.range[0] <= typed <= self.range[1]
+        if typed is None or outside or (self.choices and self.range == _ANY):
+            text = value if isinstance(value, str) else written(value)
+            near = get_close_matches(text, [written(choice) for choice in self.choices], 1)
+            meant = f"; did you mean '{near[0]}'?" if near else ""
+            raise NgptError(f"'{text}' is not allowed; it takes {self.allowed}{meant}")
+        return typed
+
+    @property
+    def _kind(self) -> type:
+        """The type of values that are none of the choices."""
+        return float if isinstance(self.default, str) and self.range != _ANY else type(self.default)
+
+    def _typed(self, value: Any, kind: type) -> Value | None:
+        if kind is str:
+            return os.fspath(value) if isinstance(value, str | os.PathLike) else None
+        if isinstance(value, str) and kind is bool:
+            return {"true": True, "false": False}.get(value.lower())
+        # To Python, true is a number.
+        if isinstance(value, bool) or kind is bool:
+            return bool(value) if type(value) is kind else None
+        try:
+            return kind(value) if isinstance(value, str) or kind(value) == value else None
+        except (TypeError, ValueError, OverflowError):
+            return None
+
+
+def written(value: Any) -> str:
+    """A value of an option as users write it."""
+    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Values of all ``options``: those ``given``, which may be texts, and the others' defaults.
+
+    Raises NgptError, which names the ``owner`` ("method 'l2'"), for options that do not exist, and for values that are
+    not allowed.
+    """
+    found: dict[str, Any] = {name: option.default for name, option in options.items()}
+    for name, value in given.items():
+        if name not in options:
+            near = get_close_matches(name, options, 1)
+            help = f"did you mean '{near[0]}'?" if near else f"it has: {', '.join(options) or 'none'}"
+            raise NgptError(f"{owner} has no option '{name}'; {help}")
+        try:
+            found[name] = options[name].check(value)
+        except NgptError as error:
+            raise NgptError(f"{owner}, option '{name}': {error}") from None
+    return found
+
+
+def unusual(options: Mapping[str, Option], settings: Mapping[str, Any]) -> str:
+    """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
+    other = {name: value for name, value in settings.items() if value != options[name].default}
+    return ", ".join(f"{name}={written(value)}" for name, value in other.items())
