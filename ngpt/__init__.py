@@ -6,6 +6,7 @@ ngpt.write("out.exr", image, like=stack)
 
 image = ngpt.denoise(noisy, albedo=albedo, normal=normal)       # arrays, tensors, bitmaps; the same kind comes back
 denoiser = ngpt.Denoiser(size, albedo=True, normals=True)       # called as mi.OptixDenoiser is
+temporal = ngpt.Temporal()                                      # frames of a shot: image = temporal.next(stack, image)
 
 help(ngpt.denoise) lists the methods, what they need, and their options.
 """
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from ngpt.io.exr import read, read_image, write
     from ngpt.merging import merge
     from ngpt.methods import METHODS, Result, reconstruct
+    from ngpt.sequence.history import Temporal
     from ngpt.stack import GradientStack
 
 __all__ = [
@@ -30,6 +32,7 @@ __all__ = [
     "GradientStack",
     "NgptError",
     "Result",
+    "Temporal",
     "denoise",
     "merge",
     "read",
@@ -44,7 +47,7 @@ __all__ = [
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
-_HOMES["reconstruct_with_error"] = "api.uncertainty"
+_HOMES |= {"reconstruct_with_error": "api.uncertainty", "Temporal": "sequence.history"}
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 

@@ -15,16 +15,17 @@ import numpy as np
 from ngpt.api.tensors import is_bitmap, layer, like, to_numpy
 from ngpt.errors import NgptError
 from ngpt.io.aliases import resolve
-from ngpt.layers import LAYERS
 from ngpt.methods import METHODS, reconstruct
+from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
 
 T = TypeVar("T")
 
-# What goes beside the image; alpha is a channel of it, and no method looks at other frames.
-_BESIDE = tuple(name for name in LAYERS if name not in ("primal", "alpha", "error", "motion", "samples"))
-# Of those, what Mitsuba's denoiser does not know.
-_FURTHER = tuple(name for name in _BESIDE if name not in ("albedo", "normal"))
+# What Mitsuba's denoiser does not know: further layers that methods take beside the image.
+_FURTHER = ("depth", "dx", "dy", "direct", "caustic", "primal_var", "dx_var", "dy_var", "caustic_var")
+_BESIDE = ("albedo", "normal", *_FURTHER)
+# What a denoiser is given only if it was announced -> the keyword that announces it.
+_ANNOUNCED = {"albedo": "albedo", "normals": "normals", "flow": "temporal", "previous_denoised": "temporal"}
 # From Mitsuba's sensor (+x left, +y up, +z forward) to the camera of the contract (+x right, +y up, +z backward).
 _TO_CAMERA = np.array([-1, 1, -1], np.float32)
 
@@ -99,7 +100,8 @@ def denoise(
         given.pop("image")
     pixels = layer("denoise", "image", noisy, (3, 4))
     layers = _layers("denoise", given, pixels.shape[:2])
-    return like(_denoised("denoise", pixels, layers, method, options), image)
+    stack = _stack("denoise", pixels, layers, method, options)
+    return like(_with_alpha(reconstruct(stack, method, **options).image, pixels), image)
 
 
 @_with_methods
@@ -108,7 +110,8 @@ class Denoiser:
 
     ``input_size``  (width, height) in pixels
     ``albedo``, ``normals``  whether they will be given; what is not announced is refused
-    ``temporal``    must be False: no method looks at earlier frames yet
+    ``temporal``    whether the calls are frames of one shot, in order, with ``flow``: each result is blended with those
+                    before it (``ngpt.Temporal``)
     ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is
     ``method``      as of ``ngpt.denoise``: "auto", the default, takes the best method for the layers each call gives
     ``options``     of the method
@@ -131,14 +134,11 @@ class Denoiser:
             self.width, self.height = (int(n) for n in np.ravel(to_numpy(input_size)))
         except (TypeError, ValueError, NgptError):
             raise NgptError(f"Denoiser: input_size is {input_size!r}; it must be (width, height)") from None
-        if temporal:
-            raise NgptError(
-                "Denoiser: temporal denoising is not there yet: leave temporal=False, and denoise frame by frame"
-            )
         if method not in ("auto", *METHODS):
             raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(METHODS)}")
         _check_options("Denoiser", method, options, ())
-        self.announced = {"albedo": albedo, "normals": normals}
+        self.announced = {"albedo": albedo, "normals": normals, "temporal": temporal}
+        self._temporal = Temporal() if temporal else None
         self.denoise_alpha, self.method, self.options = denoise_alpha, method, options
 
     @overload
@@ -191,25 +191,28 @@ class Denoiser:
         are ``dx``, ``dy``, ``depth``, ``direct``, ``caustic``, ``primal_var``, ``dx_var``, ``dy_var`` and
         ``caustic_var``, with the meaning of the layers of ``GradientStack``; ``depth`` may be (H, W).
 
+        ``flow`` (H, W, 2) is OptiX's: pixels to the right and down, from where in the last frame this point was, to
+        here: the layer ``motion`` times -1. Zeros where it is not known, NaN where the point was not there.
+        ``previous_denoised`` is the last result, and need be given only if it was changed since, or made elsewhere.
+        ``noisy`` itself, which OptiX wants in a first frame, begins another shot.
+
         A bitmap may hold the others as channels: ``denoiser(bitmap, "albedo", "normals", to_sensor)``, or by keyword,
         ``albedo_ch="albedo", normals_ch="normals"``. ``noisy_ch`` is the layer to denoise, by default the root.
 
-        Raises NgptError for arrays of another size, for albedo or normals that were not announced or are missing though
-        they were, for ``flow`` and ``previous_denoised``, and as ``ngpt.denoise`` does.
+        Raises NgptError for arrays of another size, for what was not announced or is missing though it was, and as
+        ``ngpt.denoise`` does.
         """
         if unknown := [name for name in layers if name not in _FURTHER]:
             raise NgptError(f"Denoiser: no layer is called '{unknown[0]}'; there are: {', '.join(_FURTHER)}")
         given: dict[str, Any] = {"albedo": _first(albedo, albedo_ch), "normals": _first(normals, normals_ch)}
-        earlier = {"flow": _first(flow, flow_ch), "previous_denoised": _first(previous_denoised, previous_denoised_ch)}
-        for name, value in earlier.items():
-            if value is not None:
-                raise NgptError(f"Denoiser: {name} is given, but temporal denoising is not there yet: leave it out")
-        for name, announced in self.announced.items():
-            if given[name] is not None and not announced:
-                raise NgptError(f"Denoiser: {name} is given, but was not announced: Denoiser(size, {name}=True)")
-            if announced and given[name] is None:
+        given["flow"] = _first(flow, flow_ch)
+        given["previous_denoised"] = _first(previous_denoised, previous_denoised_ch)
+        for name, keyword in _ANNOUNCED.items():
+            if given[name] is not None and not self.announced[keyword]:
+                raise NgptError(f"Denoiser: {name} is given, but was not announced: Denoiser(size, {keyword}=True)")
+            if given[name] is None and self.announced[keyword] and name != "previous_denoised":
                 raise NgptError(
-                    f"Denoiser: {name} was announced, but is not given: pass {name}=..., or leave it out there"
+                    f"Denoiser: {keyword}=True announced {name}, which is not given: pass {name}=..., or leave it out"
                 )
         image = noisy
         if is_bitmap(noisy):
@@ -218,40 +221,56 @@ class Denoiser:
             given = {name: _part(parts, part) if isinstance(part, str) else part for name, part in given.items()}
         size = self.height, self.width
         pixels = layer("Denoiser", "noisy", image, (3, 4), size)
+        previous = given.pop("previous_denoised")
+        if previous is not None:
+            previous = layer("Denoiser", "previous_denoised", previous, (3, 4), size)[..., :3]
         beside = {name: value for name, value in (given | layers).items() if value is not None}
         arrays = _layers("Denoiser", beside, size)
         if "normals" in arrays:
             # Normals that are not finite stay so, and are repaired where all layers are.
             with np.errstate(invalid="ignore", over="ignore"):
                 arrays["normal"] = (arrays.pop("normals") @ _rotation(to_sensor).T).astype(np.float32) * _TO_CAMERA
-        result = _denoised("Denoiser", pixels, arrays, self.method, self.options)
+        if self._temporal is not None:
+            arrays["motion"] = -arrays.pop("flow")
+            if previous is not None and np.array_equal(previous, pixels[..., :3], equal_nan=True):
+                del arrays["motion"]  # a cut
+        stack = _stack("Denoiser", pixels, arrays, self.method, self.options)
+        result = reconstruct(stack, self.method, **self.options).image
+        if self._temporal is not None:
+            result = self._temporal.next(stack, result, previous)
+        result = _with_alpha(result, pixels)
         if self.denoise_alpha and pixels.shape[2] == 4:
             result = np.concatenate([result[..., :3], _alpha(pixels[..., 3:], arrays)], axis=-1)
         return like(result, noisy)
 
 
-def _denoised(
+def _stack(
     where: str, image: np.ndarray, layers: Mapping[str, np.ndarray], method: str, options: Mapping[str, Any]
-) -> np.ndarray:
-    """The image, with its alpha as it was; ``where`` begins the messages."""
+) -> GradientStack:
+    """What the method needs; ``where`` begins the messages."""
     stack = GradientStack({"primal": image[..., :3], **layers}, path=where)
     needs = METHODS[method].needs if method in METHODS and not options.get("weights") else ()
     if lacking := [name for name in needs if name not in stack]:
         arguments = ", ".join(f"{name}=..." for name in lacking)
         raise NgptError(f"{where}: method '{method}' needs {', '.join(lacking)}: pass {arguments}")
-    result = reconstruct(stack, method, **options).image
+    return stack
+
+
+def _with_alpha(result: np.ndarray, image: np.ndarray) -> np.ndarray:
+    """The result, with the image's alpha as it was."""
     return np.concatenate([result, image[..., 3:]], axis=-1) if image.shape[2] > 3 else result
 
 
 def _alpha(alpha: np.ndarray, layers: Mapping[str, np.ndarray]) -> np.ndarray:
     """Coverage (H, W, 1) denoised as a grey image, within its own range."""
     features = {name: layers[name] for name in ("albedo", "normal") if name in layers}
-    grey = _denoised("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})
+    grey = reconstruct(_stack("Denoiser: alpha", np.repeat(alpha, 3, axis=-1), features, "auto", {})).image
     return np.clip(grey.mean(axis=-1, keepdims=True), alpha.min(), alpha.max())
 
 
 def _layers(where: str, given: Mapping[str, Any], size: tuple[int, int]) -> dict[str, np.ndarray]:
-    return {name: layer(where, name, value, (1,) if name == "depth" else (3,), size) for name, value in given.items()}
+    channels = {"depth": (1,), "flow": (2,)}
+    return {name: layer(where, name, value, channels.get(name, (3,)), size) for name, value in given.items()}
 
 
 def _check_options(where: str, method: str, options: Iterable[str], layers: tuple[str, ...]) -> None:

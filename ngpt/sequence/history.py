@@ -44,12 +44,13 @@ FAST = 0.005
 
 @dataclass(frozen=True)
 class _History:
-    """What a frame hands on to the next: result without direct emission, its relative variance, features, frame."""
+    """What a frame hands on to the next: result without direct emission, that, relative variance, features, frame."""
 
     light: np.ndarray
+    direct: np.ndarray
     variance: np.ndarray
     features: dict[str, np.ndarray]
-    frame: object
+    frame: object = None
 
 
 class Temporal:
@@ -70,11 +71,13 @@ class Temporal:
         """The mean of b in the last frame, from 0 (a restart) to nearly 1."""
         return float(self.weight.mean())
 
-    def next(self, stack: GradientStack, image: np.ndarray) -> np.ndarray:
+    def next(self, stack: GradientStack, image: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
         """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with those before.
 
         It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is of
-        another size, or says that the frame before it was another one (``ngpt:previousFrame``).
+        another size, or says that the frame before it was another one (``ngpt:previousFrame``). ``previous`` (H, W, 3)
+        is the last frame's result where it is not the one that was returned; also the one before a first frame, whose
+        features are not known then.
         """
         data = repair(stack, gradients=False)
         now = np.asarray(image, np.float32) - data.direct
@@ -83,6 +86,10 @@ class Temporal:
         features = data.features
         self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
         before = self._history
+        if previous is not None:
+            if before is None:
+                before = _History(previous, np.zeros_like(previous), np.ones(previous.shape[:2], np.float32), {})
+            before = replace(before, light=(previous - before.direct).astype(np.float32))
         if before is not None and _follows(stack, before):
             motion = stack["motion"]
             history, found = warped(before.light, motion, sharp=True)
@@ -103,7 +110,7 @@ class Temporal:
             self.weight = b
             # They have noise as well, and are blended as the light is, that they stay those of its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
-        self._history = _History(now, relative, features, frame)
+        self._history = _History(now, data.direct, relative, features, frame)
         return (now + data.direct).astype(np.float32)
 
     def assume(self, variance: float) -> None:

@@ -1,5 +1,7 @@
 """ngpt.denoise on arrays of any library: the same kind comes back; what does not fit is said with its remedy."""
 
+import inspect
+
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
@@ -222,6 +224,11 @@ def test_names_are_refused_with_the_one_that_was_meant(layers):
             ngpt.denoise(image, **{wrong: image})
     with pytest.raises(NgptError, match="method 'l2' has no option 'weights'; options: alpha; layers: "):
         ngpt.denoise(image, "l2", weights="mine.onnx")
+    # What is offered is taken: not what one image has no use for, as dt.
+    with pytest.raises(NgptError, match=r"no option 'dt'; options: .*; layers: ") as refused:
+        ngpt.denoise(image, dt=image)
+    offered = str(refused.value).rpartition("layers: ")[2].split(", ")
+    assert set(offered) <= set(inspect.signature(ngpt.denoise).parameters)
     with pytest.raises(NgptError, match="unknown method 'l3'; choose one of: auto, primal"):
         ngpt.denoise(image, "l3")
     with pytest.raises(NgptError, match=r"denoise: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):

@@ -10,9 +10,11 @@ from typing import get_overloads
 import numpy as np
 import pytest
 from full_stack import full_layers, full_stack
+from shots import frame_of, mse, view
 
 import ngpt
 from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
 
 
 @pytest.fixture
@@ -203,12 +205,76 @@ def test_alpha_is_denoised_where_that_is_asked_for(arrays, rng):
     assert alpha.min() <= result[..., 3].min() and result[..., 3].max() <= alpha.max()
 
 
-def test_earlier_frames_are_refused_in_words(arrays):
-    with pytest.raises(NgptError, match="leave temporal=False, and denoise frame by frame"):
-        ngpt.Denoiser((26, 18), temporal=True)
+@pytest.fixture
+def shot(rng):
+    """Frames of a camera that goes to the right by a pixel a frame, and the truth."""
+    views = [view(18, 26, offset=i) for i in range(4)]
+    return [frame_of(image, features, rng, (1, 0)) for image, features in views], [image for image, _ in views]
+
+
+def frames(stacks, denoiser, **more):
+    """What a denoiser makes of frames; ``flow`` leads from the last frame to this one, ``motion`` back."""
+    known = [(stack["primal"], stack["albedo"], stack["primal_var"], -stack["motion"]) for stack in stacks]
+    return [denoiser(noisy, albedo, primal_var=var, flow=flow, **more) for noisy, albedo, var, flow in known]
+
+
+def over_time(**options):
+    return ngpt.Denoiser((26, 18), albedo=True, temporal=True, method="primal", **options)
+
+
+def test_frames_are_blended_with_those_before(shot):
+    stacks, truth = shot
+    known = ("primal", "primal_var", "albedo", "motion")
+    temporal, made = ngpt.Temporal(), frames(stacks, over_time())
+    for stack, image in zip(stacks, made, strict=True):
+        stack = GradientStack({name: stack[name] for name in known})
+        assert np.array_equal(temporal.next(stack, stack["primal"]), image)
+    assert np.array_equal(made[0], stacks[0]["primal"])
+    assert mse(made[-1], truth[-1]) < 0.7 * mse(stacks[-1]["primal"], truth[-1])
+
+
+def test_the_previous_frame_is_taken_as_it_was_given(shot):
+    stacks, truth = shot
+    noisy = stacks[1]["primal"]
+    first, second = frames(stacks[:2], over_time())
+    # As OptiX wants it: in a first frame the noisy image.
+    denoiser = over_time()
+    assert np.array_equal(frames(stacks[:1], denoiser, previous_denoised=stacks[0]["primal"])[0], first)
+    assert np.allclose(frames(stacks[1:2], denoiser, previous_denoised=first)[0], second, atol=1e-5)
+    denoiser = over_time()
+    frames(stacks[:1], denoiser)
+    assert np.array_equal(frames(stacks[1:2], denoiser, previous_denoised=noisy)[0], noisy)
+    # Made elsewhere, by somebody who knew better
+    knew = np.float32(truth[0])
+    for denoiser, told in ((over_time(), ()), (over_time(), stacks[:1])):
+        frames(told, denoiser)
+        (result,) = frames(stacks[1:2], denoiser, previous_denoised=knew)
+        assert mse(result, truth[1]) < 0.95 * mse(second, truth[1])
+
+
+def test_channels_of_a_bitmap_may_be_flow_and_previous_frame(renderer, shot):
+    stacks, _ = shot
+    first, second = frames(stacks[:2], over_time())
+    names = [*"RGB", *(f"albedo.{c}" for c in "RGB"), "flow.X", "flow.Y", *(f"last.{c}" for c in "RGB")]
+    denoiser, made = over_time(), []
+    for stack, last in zip(stacks[:2], (stacks[0]["primal"], first), strict=True):
+        pixels = np.concatenate([stack["primal"], stack["albedo"], -stack["motion"], last], axis=-1)
+        bitmap = renderer.Bitmap(pixels, channel_names=names)
+        result = denoiser(bitmap, "albedo", flow_ch="flow", previous_denoised_ch="last", primal_var=stack["primal_var"])
+        made.append(np.array(result))
+    assert np.array_equal(made[0], first) and np.allclose(made[1], second, atol=1e-5)
+
+
+def test_frames_are_announced(arrays):
     for name in ("flow", "previous_denoised"):
-        with pytest.raises(NgptError, match=f"{name} is given, but temporal denoising is not there yet"):
+        with pytest.raises(
+            NgptError, match=rf"{name} is given, but was not announced: Denoiser\(size, temporal=True\)"
+        ):
             ngpt.Denoiser((26, 18))(arrays["noisy"], **{name: arrays["noisy"]})
+    with pytest.raises(NgptError, match="temporal=True announced flow, which is not given"):
+        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"])
+    with pytest.raises(NgptError, match=r"flow has shape \(18, 26, 3\); it must be \(18, 26, 2\)"):
+        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"], flow=arrays["noisy"])
 
 
 def test_transforms_may_scale_and_not_flatten(arrays):
@@ -233,14 +299,15 @@ def test_normals_that_are_not_finite_are_repaired_in_silence(arrays, value):
 def test_bad_calls(arrays):
     with pytest.raises(NgptError, match=r"albedo is given, but was not announced: Denoiser\(size, albedo=True\)"):
         call(ngpt.Denoiser((26, 18), normals=True), arrays)
-    with pytest.raises(NgptError, match="normals was announced, but is not given"):
+    with pytest.raises(NgptError, match="normals=True announced normals, which is not given"):
         ngpt.Denoiser((26, 18), normals=True)(arrays["noisy"])
     with pytest.raises(NgptError, match=r"noisy has shape \(18, 26, 3\); it must be \(26, 18, 3\) or \(26, 18, 4\)"):
         ngpt.Denoiser((18, 26))(arrays["noisy"])
     with pytest.raises(NgptError, match=r"dx has shape \(17, 26, 3\)"):
         ngpt.Denoiser((26, 18))(arrays["noisy"], dx=arrays["dx"][1:], dy=arrays["dy"])
-    with pytest.raises(NgptError, match=r"no layer is called 'dz'; there are: .*dx"):
-        ngpt.Denoiser((26, 18))(arrays["noisy"], dz=arrays["dx"])
+    for strange in ("dz", "dt", "diffuse"):
+        with pytest.raises(NgptError, match=rf"no layer is called '{strange}'; there are: depth, dx.*, caustic_var$"):
+            ngpt.Denoiser((26, 18))(arrays["noisy"], **{strange: arrays["dx"]})
     with pytest.raises(NgptError, match="method 'l2' has no option 'alhpa'; did you mean 'alpha'"):
         ngpt.Denoiser((26, 18), method="l2", alhpa=0.1)
     with pytest.raises(NgptError, match=r"Denoiser: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):

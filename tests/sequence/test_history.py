@@ -6,33 +6,11 @@ import sys
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
+from shots import SIZE, frame_of, mse, view
 
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import LONGEST, Temporal
 from ngpt.stack import GradientStack
-
-SIZE = (40, 56)
-SIGMA = 0.2
-
-
-def scene(height=SIZE[0], width=SIZE[1], offset=0):
-    """A smooth image with an edge, and its features; ``offset`` pixels further to the right."""
-    y, x = np.mgrid[:height, :width].astype(float)
-    x = x + offset
-    image = np.stack([1.5 + np.sin(x / 9 + c) * np.cos(y / 7) for c in range(3)], axis=-1)
-    image[x > 30] *= 0.5
-    albedo = np.where((x > 30)[..., None], 0.3, [0.6, 0.7, 0.8])
-    normal = np.broadcast_to([0.0, 0.0, 1.0], image.shape)
-    return image, {"albedo": albedo, "normal": normal, "depth": 4 + 0.01 * y[..., None] + (x > 30)[..., None]}
-
-
-def frame_of(image, features, rng, motion=(0, 0), sigma=SIGMA, **attributes):
-    layers = dict(features)
-    if motion is not None:
-        layers["motion"] = np.broadcast_to(motion, (*image.shape[:2], 2))
-    noisy = image + rng.normal(0, sigma, image.shape)
-    layers |= {"primal": noisy, "primal_var": np.full(image.shape, sigma**2)}
-    return GradientStack({k: np.ascontiguousarray(v, np.float32) for k, v in layers.items()}, attributes)
 
 
 def smooth(stack):
@@ -43,13 +21,9 @@ def identity(stack):
     return stack["primal"]
 
 
-def mse(image, truth):
-    return float(np.mean(np.square(image - truth)))
-
-
 @pytest.mark.parametrize("method", [identity, smooth])
 def test_a_shot_at_rest_converges(rng, method):
-    image, features = scene()
+    image, features = view()
     temporal, stacks = Temporal(), [frame_of(image, features, rng) for _ in range(LONGEST)]
     alone = [method(stack) for stack in stacks]
     over_time = [temporal.next(*pair) for pair in zip(stacks, alone, strict=True)]
@@ -64,7 +38,7 @@ def test_a_shot_at_rest_converges(rng, method):
 
 def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng):
     """As if at rest: the frame before, moved by a pixel, with the same noise."""
-    image, features = scene()
+    image, features = view()
     one, other = frame_of(image, features, rng), frame_of(image, features, rng)
     moved = GradientStack({name: np.roll(layer, -1, axis=1) for name, layer in other.layers.items()})
     moved = moved.replace(motion=np.broadcast_to([1.0, 0.0], (*SIZE, 2)))
@@ -81,7 +55,7 @@ def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng):
 
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth"])
 def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
-    image, features = scene()
+    image, features = view()
     before = frame_of(3 * image, features, rng)
     now = frame_of(image, features, rng)
     changed = now[name].copy()
@@ -97,7 +71,7 @@ def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
 
 
 def test_a_cut_restarts(rng):
-    image, features = scene()
+    image, features = view()
     stacks = [frame_of(image, features, rng, **{"ngpt:frame": i, "ngpt:previousFrame": i - 1}) for i in range(5)]
     for second in (
         stacks[2],  # frame 1 is missing
@@ -116,7 +90,7 @@ def test_a_cut_restarts(rng):
 
 
 def test_history_of_another_light_is_left_alone(rng):
-    image, features = scene()
+    image, features = view()
     temporal = Temporal()
     for _ in range(LONGEST):
         stack = frame_of(image, features, rng)
@@ -129,7 +103,7 @@ def test_history_of_another_light_is_left_alone(rng):
 
 def test_no_step_of_slow_changes_costs_more_than_it_gains(rng):
     """Light that grows by 2 % a frame: history lags behind, and the evidence sees to it that it does not by much."""
-    image, features = scene()
+    image, features = view()
     temporal, alone, over_time = Temporal(), [], []
     for i in range(24):
         stack = frame_of(image * 1.02**i, features, rng)
@@ -141,7 +115,7 @@ def test_no_step_of_slow_changes_costs_more_than_it_gains(rng):
 
 @pytest.mark.parametrize("k", [2.0**-10, 2.0**10])
 def test_exposure_does_not_matter(rng, k):
-    image, features = scene()
+    image, features = view()
     stacks = [frame_of(image, features, rng) for _ in range(3)]
     plain, scaled = Temporal(), Temporal()
     for stack in stacks:
@@ -151,7 +125,7 @@ def test_exposure_does_not_matter(rng, k):
 
 
 def test_direct_emission_is_that_of_this_frame(rng):
-    image, features = scene()
+    image, features = view()
     emission = np.zeros_like(image)
     emission[5:9, 5:9] = 50
     temporal = Temporal()
@@ -165,7 +139,7 @@ def test_direct_emission_is_that_of_this_frame(rng):
 
 @pytest.mark.parametrize("without", [("primal_var",), ("albedo", "normal", "depth"), ("primal_var", "depth")])
 def test_variances_and_features_are_not_needed(rng, without):
-    image, features = scene()
+    image, features = view()
     temporal, last = Temporal(), 0.0
     for _ in range(8):
         stack = frame_of(image, features, rng)
@@ -175,7 +149,7 @@ def test_variances_and_features_are_not_needed(rng, without):
 
 
 def test_pixels_that_are_not_finite_do_no_harm(rng):
-    image, features = scene()
+    image, features = view()
     temporal = Temporal()
     for i in range(3):
         stack = frame_of(image, features, rng)

@@ -1,0 +1,32 @@
+"""Frames of shots, made without a renderer."""
+
+import numpy as np
+
+from ngpt.stack import GradientStack
+
+SIZE = (40, 56)
+SIGMA = 0.2
+
+
+def view(height=SIZE[0], width=SIZE[1], offset=0):
+    """A smooth image with an edge, and its features; ``offset`` pixels further to the right."""
+    y, x = np.mgrid[:height, :width].astype(float)
+    x = x + offset
+    image = np.stack([1.5 + np.sin(x / 9 + c) * np.cos(y / 7) for c in range(3)], axis=-1)
+    image[x > 30] *= 0.5
+    albedo = np.where((x > 30)[..., None], 0.3, [0.6, 0.7, 0.8])
+    normal = np.broadcast_to([0.0, 0.0, 1.0], image.shape)
+    return image, {"albedo": albedo, "normal": normal, "depth": 4 + 0.01 * y[..., None] + (x > 30)[..., None]}
+
+
+def frame_of(image, features, rng, motion=(0, 0), sigma=SIGMA, **attributes):
+    """A stack of an image with noise of that standard deviation; ``motion`` is that of all pixels, None: unknown."""
+    layers = dict(features)
+    if motion is not None:
+        layers["motion"] = np.broadcast_to(motion, (*image.shape[:2], 2))
+    layers |= {"primal": image + rng.normal(0, sigma, image.shape), "primal_var": np.full(image.shape, sigma**2)}
+    return GradientStack({k: np.ascontiguousarray(v, np.float32) for k, v in layers.items()}, attributes)
+
+
+def mse(image, truth):
+    return float(np.mean(np.square(image - truth)))
