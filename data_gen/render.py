@@ -61,13 +61,12 @@ def render_stack(
             without = ", ".join(name for name, other in SAMPLERS.items() if "features" in other.options)
             raise NgptError(f"sampler '{sampler}' always renders features; only '{without}' can leave them out")
         options["features"] = False
-    if diagnostics and "diagnostics" in entry.options:
-        options["diagnostics"] = True
     settings = entry.settings(options)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     start = time.perf_counter()
-    sample, sensor, chosen = entry.make(scene, **settings), scene.sensors()[0], {}
+    more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
+    sample, sensor, chosen = entry.make(scene, **settings, **more), scene.sensors()[0], {}
     if adaptive is None:
         film = render_passes(sample, sensor, seed, spp, progress, seconds, memory, stop, entry.lane_bytes, entry.batch)
     else:

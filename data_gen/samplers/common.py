@@ -54,6 +54,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
         super().__init__(props)
         entry = SAMPLERS[self.name]
         self.options = entry.settings({name: props[name] for name in entry.options if name in props})
+        # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
+        self.diagnostics = props.get("diagnostics", False)
         self.channels: list[str] = []
 
     def prepare(self, scene) -> SamplePass:

@@ -169,6 +169,7 @@ class Sampler(Entry):
     ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene: those that were
                     seen to be chosen where they are best (``data_gen.choosing.pilot``)
     ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
+    ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
                     has so many, and variances are over passes
     ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
@@ -180,6 +181,7 @@ class Sampler(Entry):
     rank: int = field(default=0, kw_only=True)
     tried: bool = field(default=False, kw_only=True)
     finds: tuple[str, ...] = field(default=(), kw_only=True)
+    diagnoses: bool = field(default=False, kw_only=True)
     batch: int = field(default=0, kw_only=True)
     together: bool = field(default=False, kw_only=True)
     lane_bytes: int = field(default=LANE_BYTES, kw_only=True)

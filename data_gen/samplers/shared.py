@@ -53,7 +53,6 @@ def media_alone(name: str, grids: bool = True) -> Refusal:
 
 # Options that several samplers have
 CONNECTABLE = Option(0.05, "the microfacet roughness above which materials are connectable", range=(0, math.inf))
-DIAGNOSTICS = Option(False, "rates of failed shifts")
 GATHERING = Option(0.05, "the microfacet roughness above which photons are gathered at materials", range=(0, math.inf))
 
 

@@ -174,7 +174,7 @@ def test_gradients_have_less_noise_than_pixels(renderer, name):
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
     for layer, found in zip(("dx", "dy"), gains(renderer, name), strict=True):
         assert all(np.greater(found, FLOORS)), f"{layer}: {found}"
-    if "diagnostics" in SAMPLERS[name].options:
+    if SAMPLERS[name].diagnoses:
         from data_gen.render import render_stack
         from ngpt.io.exr import pass_through
 

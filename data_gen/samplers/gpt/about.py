@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, DIAGNOSTICS, VOLUMETRIC, refused_if_polarised
+from data_gen.samplers.shared import CONNECTABLE, VOLUMETRIC, refused_if_polarised
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -49,9 +49,9 @@ register(
             "caustic": Option(
                 True, "light over rough surfaces and then mirrors or glass has a layer; else it is in the gradients"
             ),
-            "diagnostics": DIAGNOSTICS,
         },
         rank=1,
+        diagnoses=True,
         tried=True,
     )
 )

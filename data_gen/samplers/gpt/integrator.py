@@ -94,7 +94,6 @@ class GPT(GradientIntegrator):
         self.rr_depth = props.get("rr_depth", 5)
         self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
-        self.diagnostics = self.options["diagnostics"]
         self.volumes = props.get("volumes", False)
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")

@@ -3,14 +3,13 @@
 from typing import Any
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import DIAGNOSTICS, GATHERING, first_radius, media_alone, notes_on_photons, surfaces_alone
+from data_gen.samplers.shared import GATHERING, first_radius, media_alone, notes_on_photons, surfaces_alone
 
 _GATHERED: dict[str, Option] = {
     "radius": first_radius(3.0),
     "photons": Option(1, "light paths of a pass for each pixel", range=(1, 1 << 16)),
     "roughness_threshold": GATHERING,
 }
-_SHIFTED = _GATHERED | {"diagnostics": DIAGNOSTICS}
 _PLANES = {"planes": Option(64, "light paths of a photon map that planes are swept from", range=(1, 1 << 16))}
 
 
@@ -35,7 +34,8 @@ _by_photons(
     "gpm",
     "gradients of photons gathered within a shrinking radius (caustics seen in mirrors and through glass)",
     refuses=surfaces_alone("gpm"),
-    options=_SHIFTED,
+    options=_GATHERED,
+    diagnoses=True,
     finds=("caustics",),
 )
 _by_photons(
@@ -52,7 +52,8 @@ _by_photons(
     "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
     standing="study",
     refuses=media_alone("gvpm"),
-    options=_SHIFTED,
+    options=_GATHERED,
+    diagnoses=True,
     finds=("grids",),
 )
 _by_photons(
@@ -68,7 +69,8 @@ _by_photons(
     "gradients of photons in media gathered along whole rays (caustics in fog, beams of lamps in haze)",
     standing="study",
     refuses=media_alone("gbre", grids=False),
-    options=_SHIFTED,
+    options=_GATHERED,
+    diagnoses=True,
     finds=("caustics",),
 )
 _by_photons(
@@ -85,7 +87,8 @@ _by_photons(
     "gradients of photon beams (thin fog, beams of lamps)",
     standing="study",
     refuses=media_alone("gbeams", grids=False),
-    options=_SHIFTED,
+    options=_GATHERED,
+    diagnoses=True,
 )
 _by_photons(
     "planes",
@@ -100,5 +103,6 @@ _by_photons(
     "gradients of photon planes (thin fog)",
     standing="study",
     refuses=media_alone("gplanes", grids=False),
-    options=_SHIFTED | _PLANES,
+    options=_GATHERED | _PLANES,
+    diagnoses=True,
 )

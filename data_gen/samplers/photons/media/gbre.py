@@ -202,10 +202,6 @@ class GBRE(BRE):
     grids = False
     pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.diagnostics = self.options["diagnostics"]
-
     def prepare(self, scene) -> SamplePass:
         return with_media(super().prepare(scene), self)
 

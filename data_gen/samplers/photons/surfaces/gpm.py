@@ -62,10 +62,6 @@ class GPM(PPM):
     name = "gpm"
     pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.diagnostics = self.options["diagnostics"]
-
     def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
         """What is near in the map ``photons`` of pass ``number``, of so many light paths that begin at ``starts``."""
         yield Near(starts, photons, self.radius * passes.width * shrunk(number), paths)
