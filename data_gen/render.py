@@ -51,7 +51,7 @@ def render_stack(
     The same seed and number of samples give the same bits, however they came about. Raises NgptError for options that
     do not exist or make no sense, and for a scene that the sampler cannot render.
     """
-    check_options(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
+    check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(scene)
     if sampler == "auto":
         sampler, _ = choose(facts)
@@ -102,7 +102,7 @@ def stack_of(
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 
-def check_options(
+def check_limits(
     spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int, ends: bool = False
 ) -> None:
     """Raises NgptError for what no scene could be rendered with; ``ends``: something else ends the render."""

@@ -27,8 +27,8 @@ from data_gen.samplers.registry import (
     Option,
     Sampler,
     by_standing,
+    check_options,
     choose,
     find,
     register,
-    summaries,
 )

@@ -40,6 +40,9 @@ class Option:
     choices: tuple[Value, ...] = ()
     range: tuple[float, float] = (-math.inf, math.inf)
 
+    def __str__(self) -> str:
+        return f"{self.meaning} ({self.allowed}; default {written(self.default)})"
+
     @property
     def allowed(self) -> str:
         """What values it takes, in words."""
@@ -260,12 +263,17 @@ def choose(facts: Facts) -> tuple[str, str]:
     raise NgptError(f"no sampler can render this scene with gradients: {'; '.join(reasons)}; use --sampler primal")
 
 
+def check_options(name: str, given: Mapping[str, Any]) -> None:
+    """Raises NgptError for options that the sampler of that name, which may be "auto", does not take."""
+    if name != "auto":
+        (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
+    elif given:
+        option = next(iter(given))
+        having = [name for name, entry in by_standing("use").items() if option in entry.options] or ["gpt"]
+        raise NgptError(f"option '{option}' is a sampler's own; name the sampler: --sampler {', or '.join(having)}")
+
+
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:
     """The samplers of a standing, by name."""
     entries: list[Sampler | FrameSampler] = [*SAMPLERS.values(), *FRAME_SAMPLERS.values()]
     return {entry.name: entry for entry in entries if entry.standing == standing}
-
-
-def summaries() -> dict[str, str]:
-    """Name -> summary, for help texts."""
-    return {name: entry.summary for name, entry in (*SAMPLERS.items(), *FRAME_SAMPLERS.items())}

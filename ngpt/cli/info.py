@@ -28,7 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file",
         nargs="?",
         metavar="FILE",
-        help="an .exr file, a network's weights, a training set or run, a scene file or name",
+        help="an .exr file, a network's weights, a training set or run, a scene file or name, a sampler",
     )
     parser.add_argument(
         "--aliases", action="store_true", help="print the layer names of other renderers that are known"
@@ -54,6 +54,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return 1 if report["problems"] else 0
     elif Path(args.file).suffix.lower() in NETWORKS and Path(args.file).exists():
         show(describe(args.file), args.json)
+    elif not Path(args.file).exists() and (found := sampler(args.file)):
+        show(found, args.json)
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
         show(scene(args.file, dict(args.define)), args.json)
     else:
@@ -71,11 +73,27 @@ def overview() -> dict:
         use_renderer()
     except NgptError as error:
         return report | {"rendering": f"not available: {error}"}
-    from data_gen.samplers import summaries
+    from data_gen.samplers import by_standing
     from data_gen.scenes.builtin import SCENES
 
+    titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
+    samplers = {
+        title: {name: entry.summary for name, entry in by_standing(standing).items()}
+        for title, standing in titles.items()
+    }
     scenes = {name: (scene.__doc__ or "").split("\n")[0] for name, scene in SCENES.items()}
-    return report | {"samplers": summaries(), "built-in scenes": scenes}
+    return report | samplers | {"built-in scenes": scenes}
+
+
+def sampler(name: str) -> dict:
+    """What the registry says of a sampler; nothing where there is none of that name."""
+    from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+
+    entry = SAMPLERS.get(name) or FRAME_SAMPLERS.get(name)
+    if entry is None:
+        return {}
+    options = {option: str(value) for option, value in entry.options.items()}
+    return {"sampler": name, "summary": entry.summary, "standing": entry.standing, "options": options}
 
 
 def scene(name: str, parameters: dict[str, str]) -> dict:

@@ -8,7 +8,7 @@ from concurrent.futures import as_completed
 from contextlib import contextmanager
 from pathlib import Path
 
-from data_gen.samplers import FRAME_SAMPLERS, summaries
+from data_gen.samplers import FRAME_SAMPLERS, by_standing, check_options
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.cli.frame_patterns import filled, frames, targets, varies
 from ngpt.errors import NgptError
@@ -53,8 +53,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "expects of the result; with `auto` it chooses the method too. --time is then that of pilot, render and method",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
-    samplers = "; ".join(f"{name}: {summary}" for name, summary in summaries().items())
-    parser.add_argument("--sampler", default="auto", metavar="NAME", help=f"default: auto. {samplers}")
+    first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
+    others = ", ".join(by_standing("niche"))
+    parser.add_argument(
+        "--sampler",
+        default="auto",
+        metavar="NAME",
+        help=f"auto: by the scene and a pilot (default); {first}; for some scenes: {others}. See `ngpt info`",
+    )
+    parser.add_argument(
+        "-O",
+        "--option",
+        action="append",
+        default=[],
+        type=assignment,
+        metavar="NAME=VALUE",
+        help="an option of the sampler; may be repeated. See `ngpt info SAMPLER`",
+    )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument(
         "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 6144)"
@@ -129,14 +144,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.choosing.pilot import choose_by_pilot
     from data_gen.choosing.pipelines import plan
     from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_options, render_stack
+    from data_gen.render import check_limits, render_stack
     from data_gen.scenes.load import load_scene
 
     spp = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
     memory = args.memory or DEFAULT_MEMORY
     adaptive = sharing(args)
     # Before the scene is loaded, which may take long.
-    check_options(spp, args.seed, args.sampler, args.time, memory, args.error is not None)
+    check_limits(spp, args.seed, args.sampler, args.time, memory, args.error is not None)
+    check_options(args.sampler, dict(args.option))
     scene = load_scene(args.scene, args.size, dict(args.define))
     sampler, seconds, planned = args.sampler, args.time, None
     # A pilot compares samplers at even samples, and may choose one that renders no others.
@@ -162,6 +178,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             stop=stop,
             diagnostics=args.diagnostics,
             adaptive=adaptive,
+            **dict(args.option),
         )
     if planned:
         stack.attributes["ngpt:for"] = planned.method
@@ -258,14 +275,15 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
     from data_gen.frames.gltf import read_gltf_camera
     from data_gen.frames.sequence import Shot, render_sequence
     from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_options
+    from data_gen.render import check_limits
 
     spp = args.spp or (DEFAULT_SPP if args.time is None else None)
     memory = args.memory or DEFAULT_MEMORY
     sampler = args.sampler
     if args.sampler in FRAME_SAMPLERS:
         spp, sampler = args.spp or FRAME_SAMPLERS[args.sampler].spp, "auto"
-    check_options(spp, args.seed, sampler, args.time, memory)
+    check_limits(spp, args.seed, sampler, args.time, memory)
+    check_options(args.sampler, dict(args.option))
     camera = None
     if args.camera:
         animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")
@@ -296,6 +314,7 @@ def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
             memory=memory,
             stop=stop,
             diagnostics=args.diagnostics,
+            **dict(args.option),
         ):
             done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
             if stop():

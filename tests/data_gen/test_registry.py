@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Option, Sampler, find, register
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Option, Sampler, by_standing, check_options, find, register
 from ngpt.errors import NgptError
 
 ENTRIES = {**SAMPLERS, **FRAME_SAMPLERS}
@@ -77,3 +77,39 @@ def test_names():
         find("gtp")
     with pytest.raises(NgptError, match="standing 'useful' is none of use, niche, study"):
         Sampler("new", "another", standing="useful")
+
+
+def test_help_fits_a_screen_and_begins_with_what_users_need(capsys, monkeypatch):
+    from ngpt.cli import main
+
+    monkeypatch.setenv("COLUMNS", "80")
+    with pytest.raises(SystemExit):
+        main(["render", "--help"])
+    text = capsys.readouterr().out
+    assert len(text.splitlines()) <= 80
+    words = " ".join(text.split())
+    places = [words.index(f"{name}: ") for name in ("auto", "gpt", "gbdpt", "ppm", "vcm", "primal")]
+    assert places == sorted(places)
+    assert set(by_standing("use")) == {"gpt", "gbdpt", "ppm", "vcm", "primal"} and "gplanes" not in words
+
+
+def test_options_of_auto_are_refused_with_samplers_that_have_them():
+    check_options("auto", {})
+    with pytest.raises(NgptError, match=r"option 'radius' is a sampler's own; name .*: --sampler ppm, or vcm$"):
+        check_options("auto", {"radius": "2"})
+    check_options("restir", {"history": "4"})
+    with pytest.raises(NgptError, match="sampler 'restir', option 'history': '0' is not allowed"):
+        check_options("restir", {"history": "0"})
+
+
+def test_frames_take_options_from_the_command_line(renderer, tmp_path):
+    import ngpt
+    from ngpt.cli import main
+
+    line = ["render", "diffuse", "--frames", "0:1", "--size", "8x6", "-o", str(tmp_path)]
+    assert main([*line, "--sampler", "restir", "-O", "gradients=after"]) == 0
+    assert ngpt.read(tmp_path / "diffuse.0000.exr").attributes["ngpt:samplerOptions"] == "gradients=after"
+    assert main([*line, "--force", "--spp", "2", "--sampler", "gpt", "-O", "caustic=false"]) == 0
+    stack = ngpt.read(tmp_path / "diffuse.0000.exr")
+    assert stack.attributes["ngpt:samplerOptions"] == "caustic=false"
+    assert main([*line, "--force", "--sampler", "gpt", "-O", "history=4"]) == 2

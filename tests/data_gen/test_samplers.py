@@ -269,8 +269,10 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
 
     with pytest.raises(SystemExit):
         main(["render", "--help"])
-    assert "toy: a toy" in " ".join(capsys.readouterr().out.split())
+    assert "toy" in capsys.readouterr().out
     assert main(["info"]) == 0 and "a toy" in capsys.readouterr().out
+    assert main(["info", "toy"]) == 0
+    assert "of each value that is splatted (a number from 0 to 1; default 0.5)" in capsys.readouterr().out
     # gpt, to which media are invisible where 'path' renders them, leaves this scene to the next in rank.
     assert choose(Facts("path", ("air",))) == ("toy", find_reason("gpt", Facts("path", ("air",))))
     assert choose(Facts("volpath", ("air",)))[0] == "gpt"
@@ -288,8 +290,14 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     assert main(["advise", "diffuse", "--size", "16x12", "--seconds", "5", "--json", "--table", "shipped"]) == 0
     assert '"sampler": "gpt"' in capsys.readouterr().out
     target = tmp_path / "toy.exr"
-    assert main(["render", "diffuse", "--size", "6x4", "--spp", "4", "--sampler", "toy", "-o", str(target)]) == 0
-    assert ngpt.read(target).attributes["ngpt:sampler"] == "toy"
+    line = ["render", "diffuse", "--size", "6x4", "--spp", "4", "--sampler", "toy", "-o", str(target)]
+    assert main([*line, "-O", "share=1.5"]) == 2
+    assert "option 'share': '1.5' is not allowed; it takes a number from 0 to 1" in capsys.readouterr().err
+    assert main([*line, "-O", "share=0.25"]) == 0
+    by_command, by_python = ngpt.read(target), render_stack(scene, 4, sampler="toy", share=0.25)
+    assert by_command.attributes["ngpt:sampler"] == "toy"
+    assert by_command.attributes["ngpt:samplerOptions"] == by_python.attributes["ngpt:samplerOptions"] == "share=0.25"
+    same(by_command, by_python)
 
 
 def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
