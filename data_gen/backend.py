@@ -5,7 +5,7 @@ import sys
 
 from data_gen.llvm import use_llvm
 from data_gen.samplers import SAMPLERS
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -45,6 +45,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
             else:
                 importlib.import_module(module)
     except (ImportError, RuntimeError) as error:
+        stop_if_interrupted(error)
         raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)

@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet."""
+"""The one exception that users of ngpt meet, and the interrupt that others hide."""
 
 LONGEST = 1000
 
@@ -15,3 +15,15 @@ class NgptError(ValueError):
         line = " ".join(message.splitlines())
         half = LONGEST // 2 - 3
         super().__init__(line if len(line) <= LONGEST else f"{line[:half]} ... {line[-half:]}")
+
+
+def stop_if_interrupted(error: BaseException) -> None:
+    """Raises KeyboardInterrupt if that is what ``error`` comes from: Ctrl-C within a library that wraps what it meets.
+
+    Dr.Jit's loops and recordings make a RuntimeError of it, with the cause; Mitsuba's plugins one with a text alone.
+    """
+    cause: BaseException | None = error
+    while cause is not None:
+        if isinstance(cause, KeyboardInterrupt) or str(cause).rstrip().endswith("\nKeyboardInterrupt:"):
+            raise KeyboardInterrupt from error
+        cause = cause.__cause__ or cause.__context__

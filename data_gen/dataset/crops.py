@@ -12,7 +12,7 @@ import numpy as np
 
 from data_gen.backend import use_variant
 from data_gen.dataset.config import Config, Job
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import merge
 from ngpt.methods import denoise
 from ngpt.repair import repair
@@ -69,15 +69,6 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
 
     dr.flush_kernel_cache()
     return job.file
-
-
-def stop_if_interrupted(error: BaseException) -> None:
-    """Raises KeyboardInterrupt if that is what ``error`` comes from: Dr.Jit's loops wrap it in a RuntimeError."""
-    cause: BaseException | None = error
-    while cause is not None:
-        if isinstance(cause, KeyboardInterrupt):
-            raise cause
-        cause = cause.__cause__ or cause.__context__
 
 
 def scene_seed(config: Config, name: str) -> tuple[int, int]:

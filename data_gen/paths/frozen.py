@@ -12,6 +12,8 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
+from ngpt.errors import stop_if_interrupted
+
 
 class Frozen:
     """Calls functions: ``frozen(f, *args)`` is ``f(*args)``, whose kernels are recorded when the types are new.
@@ -37,7 +39,8 @@ class Frozen:
             self.functions[f] = dr.freeze(f if fixed else without_constants(f), **options)
         try:
             return self.functions[f](*args, *([sums()] if sums else []))
-        except RuntimeError:
+        except RuntimeError as error:
+            stop_if_interrupted(error)
             # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does, be it of
             # another scene. It records anew where scenes come and go, so this may be later than at the first call.
             self.functions[f] = f

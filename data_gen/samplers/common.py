@@ -17,7 +17,7 @@ from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.load import path_depths, reference_integrator
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
 
 
@@ -143,6 +143,7 @@ def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
     try:
         return mi.load_dict({"type": plugin, "hide_emitters": path.hide_emitters, **depths, **options})
     except RuntimeError as error:
+        stop_if_interrupted(error)
         # Mitsuba makes a text of what a plugin raises, with the lines where it was raised.
         _, ours, message = str(error).rpartition("NgptError: ")
         if not ours:

@@ -8,7 +8,7 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.scenes.builtin import SCENES
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, stop_if_interrupted
 
 
 def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
@@ -31,6 +31,7 @@ def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[
     except (RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, NgptError):
             raise
+        stop_if_interrupted(error)
         raise NgptError(f"{name}: Mitsuba cannot load it: {complaint(error)}") from error
     if not isinstance(scene, mi.Scene):
         raise NgptError(f"{name}: describes a {type(scene).__name__}, not a whole scene")

@@ -163,20 +163,6 @@ def test_sample_counts_are_stratified():
     assert np.all((counts + 1 > edges[:-1]) & (counts <= edges[1:]))
 
 
-def test_an_interrupt_inside_a_loop_of_drjit_is_no_failure_of_a_crop(renderer):
-    import drjit as dr
-    import mitsuba as mi
-
-    def interrupted(x):
-        raise KeyboardInterrupt
-
-    with pytest.raises(RuntimeError) as caught:
-        dr.while_loop((mi.Float(0, 1),), lambda x: x < 1, interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        crops.stop_if_interrupted(caught.value)
-    crops.stop_if_interrupted(RuntimeError("another"))
-
-
 @pytest.mark.slow
 def test_a_small_object_in_the_middle_of_nowhere_is_found(renderer):
     import mitsuba as mi

@@ -171,6 +171,44 @@ def test_what_is_recorded_once_has_the_width_of_each_call(renderer):
     assert frozen.functions[taken] != taken and frozen.functions[constant] == constant
 
 
+def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
+    """Dr.Jit wraps it in a RuntimeError, as it does what keeps a function from being recorded."""
+    import drjit as dr
+
+    from data_gen.paths.frozen import Frozen
+
+    mi, calls = renderer, []
+
+    def interrupted(*_):
+        calls.append(1)
+        raise KeyboardInterrupt
+
+    frozen, lanes = Frozen(load(mi, "diffuse", (4, 4))), dr.opaque(mi.UInt32, 3, 4)
+    for f in (interrupted, lambda n: dr.while_loop((n,), lambda n: n > 0, interrupted)):
+        with pytest.raises(KeyboardInterrupt):
+            frozen(f, lanes)
+        assert len(calls) == 1
+        # The next call is another try.
+        with pytest.raises(KeyboardInterrupt):
+            frozen(f, lanes)
+        assert len(calls) == 2
+        calls.clear()
+
+
+def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch):
+    """Mitsuba makes a text of what a plugin raises."""
+    from data_gen.samplers import find
+    from data_gen.samplers.photons.surfaces.ppm import PPM
+
+    def interrupted(self, props):
+        raise KeyboardInterrupt
+
+    scene = load(renderer, "diffuse", (4, 4))
+    monkeypatch.setattr(PPM, "__init__", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        find("ppm").make(scene)
+
+
 def test_radii_shrink_as_told():
     from data_gen.samplers.photons.map.radius import ALPHA, shrunk
 
