@@ -132,7 +132,7 @@ def test_the_examples_of_python_run(tmp_path, monkeypatch):
     made: dict = {}
     exec(blocks[0], made)
     assert made["clean"].shape == made["noisy"].shape
-    exec(blocks[2], made)
+    exec(blocks[2] + blocks[3], made)
     assert made["stack"]["primal"].shape == made["noisy"].shape
 
 
