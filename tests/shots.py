@@ -28,5 +28,23 @@ def frame_of(image, features, rng, motion=(0, 0), sigma=SIGMA, **attributes):
     return GradientStack({k: np.ascontiguousarray(v, np.float32) for k, v in layers.items()}, attributes)
 
 
+def wall(rng, count, size=(16, 20, 3), growth=0.1):
+    """A wall that grows brighter by so much a frame, with noise that no gradient tells from light, and ``dt``."""
+    found = []
+    for i in range(count):
+        layers = {"primal": np.full(size, 1 + growth * i), "dx": np.zeros(size), "dy": np.zeros(size)}
+        layers["dt"] = np.full(size, growth)
+        noise = {"primal": SIGMA, "dx": SIGMA, "dy": SIGMA, "dt": 0.01}
+        layers = {name: layer + rng.normal(0, noise[name], size) for name, layer in layers.items()}
+        layers |= {f"{name}_var": np.full(size, sigma**2) for name, sigma in noise.items()}
+        layers["motion"] = np.zeros((*size[:2], 2))
+        found.append(GradientStack(layers, {"ngpt:frame": i, "ngpt:previousFrame": i - 1}))
+    return found
+
+
+def without(stack, *names):
+    return GradientStack({name: stack[name] for name in stack.names if name not in names}, stack.attributes)
+
+
 def mse(image, truth):
     return float(np.mean(np.square(image - truth)))

@@ -3,7 +3,7 @@
 import argparse
 import os
 import time
-from collections.abc import Container
+from collections.abc import Container, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
@@ -26,12 +26,12 @@ from ngpt.cli.arguments import (
     print_json,
     stack_files,
 )
-from ngpt.cli.shot import windowed
+from ngpt.cli.denoise_shot import way, windowed
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, reconstruct
-from ngpt.network.identity import Identity, identify
+from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--temporal",
         action="store_true",
         help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before; "
-        "with -m wcv, and differences in time by `ngpt render --dt`, by those after too",
+        "with -m wcv, and differences in time in all of them (`ngpt render --dt`), by those after too",
     )
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
@@ -135,7 +135,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
     shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     overwrite = partial(write_frame, overwrite=args.force)
     frames: Any
-    if args.temporal and args.method == "wcv" and not options and has_dt(pairs, args):
+    windows = False
+    if args.temporal and not all(args.skip_existing and target.exists() for _, target in pairs):
+        by_wcv = args.method == "wcv" and not options
+        windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
+        console.say(f"--temporal: {told}")
+    if windows:
         everything = {target for _, target in pairs}
         frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)
     else:
@@ -173,22 +178,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 1 if failed else 0
 
 
-def has_dt(pairs: list[tuple[Path, Path]], args: argparse.Namespace) -> bool:
-    """Whether frames have differences in time, and one of them still has to be made."""
-    if all(args.skip_existing and target.exists() for _, target in pairs):
-        return False
-    try:
-        return "dt" in read(pairs[-1][0], dict(args.layer), args.untrusted)
-    except NgptError:
-        return False
-
-
 def _unseen(done: int, total: int) -> None:
     """Progress that nobody is shown."""
 
 
 class Frame(NamedTuple):
-    """A stack on its way from its file to that of its result; with ``there`` its result was there already."""
+    """A stack on its way from its file to that of its result; with ``there`` its result was there already.
+
+    ``over_time`` is what other frames were to the result, as header attributes.
+    """
 
     source: Path
     target: Path
@@ -197,8 +195,7 @@ class Frame(NamedTuple):
     metrics: dict[str, float] | None = None
     groups: tuple[str, ...] = ()
     there: bool = False
-    history: float | None = None
-    blended_by: Identity | None = None
+    over_time: Mapping[str, Any] = {}
 
 
 def read_frame(
@@ -225,32 +222,30 @@ def compute_frame(
         return frame
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
     result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
-    history, blended_by = None, None
+    over_time = {}
     if temporal is not None:
         begun = time.perf_counter()
         image = temporal.next(stack, result.image)
-        seconds = result.seconds + time.perf_counter() - begun
-        result, history = replace(result, image=image, seconds=seconds), temporal.share
-        blended_by = identify(temporal.corrections.path) if isinstance(temporal.corrections, Network) else None
+        result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
+        over_time = {"ngpt:temporal": "history", "ngpt:history": temporal.share}
+        if isinstance(temporal.corrections, Network):
+            over_time["ngpt:historyWeights"] = str(identify(temporal.corrections.path))
     metrics = compare(result.image, reference) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    frame = frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups))
-    return frame._replace(history=history, blended_by=blended_by)
+    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), over_time=over_time)
 
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, history, blended_by = frame
+    source, target, stack, result, metrics, groups, there, over_time = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
-    made = result.attributes | ({} if history is None else {"ngpt:history": history})
-    made |= {"ngpt:historyWeights": str(blended_by)} if blended_by else {}
-    write(target, result.image, like=stack, overwrite=overwrite, attributes=made)
+    write(target, result.image, like=stack, overwrite=overwrite, attributes=result.attributes | over_time)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -265,7 +260,7 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "standard error": result.error is not None,
         "groups": list(groups),
     }
-    report |= {} if history is None else {"history": history}
+    report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     return report | ({"metrics": metrics} if metrics else {})
 
 

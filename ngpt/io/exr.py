@@ -16,8 +16,9 @@ import OpenEXR
 from ngpt.errors import NgptError
 from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
 from ngpt.io.aliases import layers_of_light as find_light
+from ngpt.io.header import read_headers
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.io.openexr import ExrImage, ExrPart, read_exr, regular_file, write_exr
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 from ngpt.system.threads import map_parts
@@ -28,6 +29,7 @@ __all__ = [
     "ExrImage",
     "ExrPart",
     "StackSource",
+    "layers_in",
     "layers_of_light",
     "pass_through",
     "read",
@@ -50,6 +52,7 @@ MADE_BY = (
     "ngpt:options",
     "ngpt:estimated",
     "ngpt:reconstructSeconds",
+    "ngpt:temporal",
     "ngpt:history",
     "ngpt:historyWeights",
 )
@@ -105,6 +108,13 @@ def read(
             )
     alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
     return stack.replace(**alone) if alone else stack
+
+
+def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
+    """The names of the layers that ``read`` would find, by the file's header; raises NgptError as it does for that."""
+    with regular_file(Path(path)) as file:
+        parts = [(part.name, list(part.channels)) for part in read_headers(file, str(path))]
+    return frozenset(resolve(parts, layers, str(path)))
 
 
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:

@@ -1,65 +1,114 @@
-"""``ngpt denoise --temporal``: frames of a shot, in order."""
+"""``ngpt denoise --temporal``: frames of a shot, in order, by history or by windows."""
 
 import json
 
 import numpy as np
 import pytest
+from shots import wall, without
 
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_exr, read_image
-from ngpt.sequence.history import Temporal
-from ngpt.stack import GradientStack
+from ngpt.sequence.windows import LENGTH, reconstruct_shot
+
+
+def written(folder, stacks):
+    folder.mkdir()
+    for i, stack in enumerate(stacks):
+        ngpt.write(folder / f"w.{i:04d}.exr", stack)
+    return folder
+
+
+@pytest.fixture
+def rest(tmp_path, rng):
+    """Five frames at rest, without differences in time."""
+    return written(tmp_path / "rest", [without(stack, "dt", "dt_var") for stack in wall(rng, 5, growth=0)])
 
 
 @pytest.fixture
 def shot(tmp_path, rng):
-    """Five frames at rest of a grey wall with noise."""
-    folder = tmp_path / "shot"
-    folder.mkdir()
-    for i in range(5):
-        image = np.ones((20, 24, 3)) + rng.normal(0, 0.2, (20, 24, 3))
-        layers = {"primal": image, "primal_var": np.full(image.shape, 0.04), "motion": np.zeros((20, 24, 2))}
-        attributes = {"ngpt:frame": i, "ngpt:previousFrame": i - 1}
-        ngpt.write(folder / f"w.{i:04d}.exr", GradientStack(layers, attributes))
-    return folder
+    """Frames of more than one window."""
+    return written(tmp_path / "shot", wall(rng, LENGTH + 4))
 
 
-def test_the_command_does_what_the_class_does(shot, tmp_path, capsys):
-    out = tmp_path / "clean"
-    assert main(["denoise", str(shot), "-o", f"{out}/", "--temporal", "-m", "primal", "--json"]) == 0
+def denoised(shot, out, *more):
+    """The exit status of the command for a shot."""
+    return main(["denoise", str(shot), "-o", f"{out}/", "--temporal", *more])
+
+
+def made_by(folder):
+    """The attribute that says which way a frame went, of each."""
+    return [read_exr(path).parts[0].header["ngpt:temporal"] for path in sorted(folder.iterdir())]
+
+
+def test_history_is_what_the_class_does(rest, tmp_path, capsys):
+    assert denoised(rest, tmp_path / "clean", "-m", "primal", "--json") == 0
     told = capsys.readouterr()
+    temporal = ngpt.Temporal()
     reports = json.loads(told.out)["files"]
-    temporal = Temporal()
-    for path, report in zip(sorted(shot.iterdir()), reports, strict=True):
+    for path, report in zip(sorted(rest.iterdir()), reports, strict=True):
         stack = ngpt.read(path)
-        assert np.array_equal(read_image(out / path.name), temporal.next(stack, stack["primal"]))
-        assert np.isclose(report["history"], temporal.share)
-        header = read_exr(out / path.name).parts[0].header
-        assert np.isclose(header["ngpt:history"], temporal.share)
+        assert np.array_equal(read_image(tmp_path / "clean" / path.name), temporal.next(stack, stack["primal"]))
+        header = read_exr(tmp_path / "clean" / path.name).parts[0].header
+        assert report["history"] == temporal.share and np.isclose(header["ngpt:history"], temporal.share)
         if temporal.corrections is not None:
             assert header["ngpt:historyWeights"].startswith("temporal.onnx sha256:")
-    assert reports[0]["history"] == 0 and reports[4]["history"] > 0.6
-    assert "% history" in told.err
+    assert reports[0]["history"] == 0 and reports[4]["history"] > 0.6 and reports[4]["temporal"] == "history"
+    assert "--temporal: history" in told.err and "% history" in told.err
 
 
-def test_going_on_gives_the_same_bits(shot, tmp_path, capsys):
-    words = ["denoise", str(shot), "--temporal", "-m", "primal"]
-    assert main([*words, "-o", f"{tmp_path / 'whole'}/"]) == 0
-    assert main([*words, "-o", f"{tmp_path / 'parts'}/"]) == 0
+def test_windows_are_what_the_function_does(shot, tmp_path, capsys):
+    assert denoised(shot, tmp_path / "clean", "-m", "wcv", "--json") == 0
+    told = capsys.readouterr()
+    results = reconstruct_shot(ngpt.read(path) for path in sorted(shot.iterdir()))
+    for report, (_, stack, result) in zip(json.loads(told.out)["files"], results, strict=True):
+        assert np.array_equal(read_image(report["output"]), result.image) and report["input"] == stack.path
+        assert (report["method"], report["temporal"], report["options"]) == ("wcv", "windows", {})
+    assert f"--temporal: windows of {LENGTH} frames" in told.err
+
+
+@pytest.mark.parametrize(("which", "method"), [("rest", "primal"), ("shot", "wcv")])
+def test_going_on_gives_the_same_bits(which, method, request, tmp_path, capsys):
+    frames, parts = request.getfixturevalue(which), tmp_path / "parts"
+    assert denoised(frames, tmp_path / "whole", "-m", method) == denoised(frames, parts, "-m", method) == 0
     for gone in (3, 1):
-        (tmp_path / f"parts/w.{gone:04d}.exr").unlink()
-    kept = (tmp_path / "parts/w.0002.exr").stat().st_mtime_ns
+        (parts / f"w.{gone:04d}.exr").unlink()
+    kept = (parts / "w.0002.exr").stat().st_mtime_ns
     capsys.readouterr()
-    assert main([*words, "-o", f"{tmp_path / 'parts'}/", "--skip-existing"]) == 0
-    assert "3 of 5 stacks were skipped" in capsys.readouterr().err
-    assert (tmp_path / "parts/w.0002.exr").stat().st_mtime_ns == kept
-    for i in range(5):
-        images = [read_image(tmp_path / kind / f"w.{i:04d}.exr") for kind in ("whole", "parts")]
-        assert np.array_equal(*images)
+    assert denoised(frames, parts, "-m", method, "--skip-existing") == 0
+    count = len(list(frames.iterdir()))
+    assert f"{count - 2} of {count} stacks were skipped" in capsys.readouterr().err
+    assert (parts / "w.0002.exr").stat().st_mtime_ns == kept
+    for path in parts.iterdir():
+        assert np.array_equal(read_image(path), read_image(tmp_path / "whole" / path.name))
+    assert denoised(frames, parts, "-m", method, "--skip-existing") == 0
+    assert "--temporal" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("damaged", [0, 3, LENGTH + 3])
+def test_a_file_that_cannot_be_read_is_a_cut_and_changes_no_other_frame(shot, tmp_path, damaged, capsys):
+    """Above all not their method: it is chosen by all files that can be read."""
+    (shot / f"w.{damaged:04d}.exr").write_bytes(b"nothing")
+    assert denoised(shot, tmp_path / "clean", "-m", "wcv") == 1
+    told = capsys.readouterr().err
+    assert f"w.{damaged:04d}.exr" in told and "--temporal: windows" in told
+    assert made_by(tmp_path / "clean") == ["windows"] * (LENGTH + 3)
+
+
+def test_one_frame_without_differences_in_time_makes_it_history_and_is_named(shot, tmp_path, capsys):
+    """Wherever it is, but for the first, which needs none."""
+    first = shot / "w.0000.exr"
+    ngpt.write(first, without(ngpt.read(first), "dt"), overwrite=True)
+    assert denoised(shot, tmp_path / "windows", "-m", "wcv") == 0
+    fifth = shot / "w.0004.exr"
+    ngpt.write(fifth, without(ngpt.read(fifth), "dt_var"), overwrite=True)
+    capsys.readouterr()
+    assert denoised(shot, tmp_path / "history", "-m", "wcv") == 0
+    assert f"{fifth} lacks some" in capsys.readouterr().err
+    assert {*made_by(tmp_path / "windows")} == {"windows"} and {*made_by(tmp_path / "history")} == {"history"}
 
 
 @pytest.mark.parametrize("option", [["--error"], ["--groups"], ["--group", "fog*"]])
-def test_what_history_does_not_hold_is_refused(shot, option, capsys):
-    assert main(["denoise", str(shot), "--temporal", *option]) == 2
+def test_what_history_does_not_hold_is_refused(rest, option, tmp_path, capsys):
+    assert denoised(rest, tmp_path / "clean", *option) == 2
     assert "--temporal goes without" in capsys.readouterr().err

@@ -132,3 +132,14 @@ def test_a_cluster_renders_the_parts_that_are_missing(renderer, tmp_path, monkey
     words = ["--frames", "0:2", "--cluster", "tcp://nowhere:1", "--shard", "0/2", "-o", str(tmp_path / "other")]
     assert main(["render", "diffuse", *words]) == 2
     assert "leave --shard out" in capsys.readouterr().err
+
+
+def test_one_pair_is_refused_and_two_are_rendered(renderer, tmp_path, capsys):
+    words = ["render", "diffuse", "--size", "16x12", "--spp", "1", "--sampler", "primal", "-o", str(tmp_path / "shot")]
+    assert main([*words, "--frames", "0:2", "--dt", "1"]) == 2
+    assert "use --dt 2" in capsys.readouterr().err
+    assert main([*words[:-1], str(tmp_path / "a.exr"), "--dt", "2"]) == 2
+    assert "--dt belongs to a sequence" in capsys.readouterr().err
+    assert main([*words, "--frames", "0:2", "--dt", "2"]) == 0
+    stack = ngpt.read(tmp_path / "shot/diffuse.0001.exr")
+    assert not stack["dt"].any() and stack["dt_var"].shape == stack["primal"].shape

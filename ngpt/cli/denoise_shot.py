@@ -1,0 +1,73 @@
+"""``ngpt denoise --temporal``: which way a shot goes, and the way by windows, of the frames before and after."""
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.io.exr import layers_in
+from ngpt.measure.metrics import compare
+from ngpt.sequence.windows import LENGTH, LINK, reconstruct_shot
+from ngpt.stack import GradientStack
+
+
+def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tuple[bool, str]:
+    """Whether windows reconstruct the shot, and what to say of it: by the headers of all its files.
+
+    They do where ``wcv`` is the method, and all frames but the first have the layers that lead to the frame before.
+    ``names`` are those of layers, as of ``ngpt.io.exr.read``. Files that cannot be read do not count: each is a cut,
+    and told when its turn has come.
+    """
+    history = "history, each frame by those before it"
+    if not by_wcv:
+        return False, history
+    known = {}
+    for path in sources:
+        try:
+            known[path] = layers_in(path, names)
+        except NgptError:
+            continue
+    lacking = [path for path, layers in list(known.items())[1:] if not layers.issuperset(LINK)]
+    if len(known) > 1 and not lacking:
+        return True, f"windows of {LENGTH} frames, by the differences in time of all frames"
+    those = f": {lacking[0]} lacks some" if len(lacking) < len(known) - 1 else ""
+    return False, f"{history}; windows need {', '.join(LINK)} in all frames but the first{those}"
+
+
+def windowed(
+    pairs: Sequence[tuple[Path, Path]],
+    read: Callable[[tuple[Path, Path]], Any],
+    write: Callable[[Any], dict],
+    reference: np.ndarray | None,
+) -> Iterator[dict | NgptError]:
+    """What there is to report of each pair, in order: files that cannot be read are cuts, and reported.
+
+    ``read`` and ``write`` are those of ``ngpt.cli.denoise``, of frames; what is ``there`` is read and not written.
+    """
+    frames: dict[int, Any] = {}
+    told: dict[int, dict | NgptError] = {}
+
+    def stacks() -> Iterator[GradientStack | None]:
+        for number, pair in enumerate(pairs):
+            try:
+                frames[number] = read(pair)
+            except NgptError as error:
+                told[number] = error
+                yield None
+                continue
+            yield frames[number].stack
+
+    done = 0
+    for number, _, result in reconstruct_shot(stacks(), lambda number: not frames[number].there):
+        while done < number:
+            yield told[done] if done in told else write(frames.pop(done))
+            done += 1
+        metrics = compare(result.image, reference) if reference is not None else None
+        over_time = {"ngpt:temporal": "windows"}
+        yield write(frames.pop(number)._replace(result=result, metrics=metrics, over_time=over_time))
+        done = number + 1
+    while done < len(pairs):
+        yield told[done] if done in told else write(frames.pop(done))
+        done += 1
