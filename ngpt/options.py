@@ -30,6 +30,9 @@ class Option:
     choices: tuple[Value, ...] = ()
     range: tuple[float, float] = _ANY
 
+    def __str__(self) -> str:
+        return f"{self.meaning} ({self.allowed}; default {written(self.default)})"
+
     @property
     def allowed(self) -> str:
         """What values it takes, in words."""

@@ -12,6 +12,7 @@ OPTIONS = {
     "radius": Option(0.5, "how wide", range=(0, math.inf)),
     "alpha": Option("auto", "a number or a word", choices=("auto",), range=(0, math.inf)),
     "shift": Option("replay", "which one", choices=("replay", "half-vector")),
+    "tile": Option(2, "how many", choices=(2, 4)),
     "caustic": Option(True, "whether"),
     "weights": Option("", "a file"),
 }
@@ -27,6 +28,7 @@ OPTIONS = {
         ("alpha", "auto", "auto"),
         ("alpha", ".25", 0.25),
         ("shift", "half-vector", "half-vector"),
+        ("tile", "4", 4),
         ("caustic", "False", False),
         ("weights", "a.onnx", "a.onnx"),
     ],
@@ -47,6 +49,7 @@ def test_texts_and_values_become_the_options_type(name, given, value):
         ("alpha", "aut", "'aut' is not allowed; it takes a number of 0 or more, or auto; did you mean 'auto'"),
         ("alpha", -1, "'-1' is not allowed"),
         ("shift", "half", "'half' is not allowed; it takes replay, half-vector"),
+        ("tile", 3, "it takes 2, 4"),
         ("caustic", 1, "it takes true or false"),
         ("weights", 3, "it takes a text"),
         ("dept", 3, "method 'x' has no option 'dept'; did you mean 'depth'?"),

@@ -6,7 +6,6 @@ sampler is made.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from difflib import get_close_matches
@@ -14,78 +13,13 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ngpt.errors import NgptError
+from ngpt.options import STANDINGS, Option, settings, unusual
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
 
 # Bytes that a lane takes in a pass: the most that any path tracer was seen to take, 200, and some more
 LANE_BYTES = 256
-# Whom samplers are for: users; users who know why; those who study them
-STANDINGS = ("use", "niche", "study")
-
-Value = bool | int | float | str
-
-
-@dataclass(frozen=True)
-class Option:
-    """An option of a sampler, of the type of its ``default``.
-
-    ``meaning``  one line for the user
-    ``choices``  the values there are; () for all within the range
-    ``range``    least and greatest value of a number
-    """
-
-    default: Value
-    meaning: str
-    choices: tuple[Value, ...] = ()
-    range: tuple[float, float] = (-math.inf, math.inf)
-
-    def __str__(self) -> str:
-        return f"{self.meaning} ({self.allowed}; default {written(self.default)})"
-
-    @property
-    def allowed(self) -> str:
-        """What values it takes, in words."""
-        if isinstance(self.default, bool):
-            return "true or false"
-        if self.choices:
-            return ", ".join(written(choice) for choice in self.choices)
-        low, high = (f"{bound:g}" for bound in self.range)
-        limits = "" if low == "-inf" else f" of {low} or more" if high == "inf" else f" from {low} to {high}"
-        return {int: "a whole number", float: "a number", str: "a text"}[type(self.default)] + limits
-
-    def check(self, value: Any) -> Value:
-        """The ``value``, or what a text says, as the option's type. Raises NgptError for what is not allowed."""
-        typed = self._typed(value)
-        inside = not isinstance(typed, int | float) or self.range[0] <= typed <= self.range[1]
-        if typed is None or not inside or (self.choices and typed not in self.choices):
-            given = value if isinstance(value, str) else written(value)
-            near = get_close_matches(given, [written(choice) for choice in self.choices], 1)
-            meant = f"; did you mean '{near[0]}'?" if near else ""
-            raise NgptError(f"'{given}' is not allowed; it takes {self.allowed}{meant}")
-        return typed
-
-    def _typed(self, value: Any) -> Value | None:
-        kind = type(self.default)
-        if isinstance(value, str) and kind is bool:
-            return {"true": True, "false": False}.get(value.lower())
-        if isinstance(value, str) and kind in (int, float):
-            try:
-                return kind(value)
-            except ValueError:
-                return None
-        # To Python, true is a number.
-        if isinstance(value, bool) or kind in (bool, str):
-            return value if type(value) is kind else None
-        try:
-            return kind(value) if kind(value) == value else None
-        except (TypeError, ValueError, OverflowError):
-            return None
-
-
-def written(value: Any) -> str:
-    """A value of an option as users write it."""
-    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _of_no_module(*args: Any, **options: Any) -> Any:
@@ -139,22 +73,11 @@ class Entry:
 
         Raises NgptError for options that do not exist, and for values that are not allowed.
         """
-        found: dict[str, Any] = {name: option.default for name, option in self.options.items()}
-        for name, value in given.items():
-            if name not in self.options:
-                have, near = ", ".join(self.options) or "none", get_close_matches(name, self.options, 1)
-                meant = f"; did you mean '{near[0]}'?" if near else ""
-                raise NgptError(f"sampler '{self.name}' has no option '{name}'{meant or f'; it has: {have}'}")
-            try:
-                found[name] = self.options[name].check(value)
-            except NgptError as error:
-                raise NgptError(f"sampler '{self.name}', option '{name}': {error}") from None
-        return found
+        return settings(f"sampler '{self.name}'", self.options, given)
 
     def unusual(self, settings: Mapping[str, Any]) -> str:
         """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
-        other = {name: value for name, value in settings.items() if value != self.options[name].default}
-        return ", ".join(f"{name}={written(value)}" for name, value in other.items())
+        return unusual(self.options, settings)
 
     def made(self, *args: Any, **options: Any) -> Any:
         """What ``make`` makes, with ``options`` that may be texts, and the others' defaults; raises NgptError."""

@@ -2,7 +2,7 @@
 
 import pytest
 
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Option, Sampler, by_standing, check_options, find, register
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Sampler, by_standing, check_options, find, register
 from ngpt.errors import NgptError
 
 ENTRIES = {**SAMPLERS, **FRAME_SAMPLERS}
@@ -21,22 +21,6 @@ def test_defaults_are_allowed_and_other_values_are_not(name, option):
     for value in wrong:
         with pytest.raises(NgptError, match=f"^sampler '{name}', option '{option}': .* is not allowed; it takes "):
             entry.settings({option: value})
-
-
-@pytest.mark.parametrize(
-    ("option", "given", "typed"),
-    [
-        (Option(True, ""), "False", False),
-        (Option(1, ""), "4", 4),
-        (Option(1, ""), 4.0, 4),
-        (Option(1.0, ""), "4e-2", 0.04),
-        (Option(1.0, ""), 4, 4.0),
-        (Option("a", "", choices=("a", "b")), "b", "b"),
-        (Option(2, "", choices=(2, 4)), "4", 4),
-    ],
-)
-def test_texts_become_what_the_default_is(option, given, typed):
-    assert option.check(given) == typed and type(option.check(given)) is type(typed)
 
 
 @pytest.mark.parametrize(
