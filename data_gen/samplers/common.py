@@ -15,6 +15,7 @@ from data_gen.paths import segments
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
+from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError, stop_if_interrupted
@@ -46,9 +47,10 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     ``name``     of the sampler, whose entry says which options there are
     ``options``  all of them, as given or by default
+    ``nested``   whether another integrator traces the paths, so that there are no ``limits``
     """
 
-    name = ""
+    name, nested = "", False
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
@@ -56,6 +58,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
         self.options = entry.settings({name: props[name] for name in entry.options if name in props})
         # Whether the film counts failed shifts, where the sampler ``diagnoses`` them
         self.diagnostics = props.get("diagnostics", False)
+        if not self.nested:
+            self.limits = Limits.read(props)
         self.channels: list[str] = []
 
     def prepare(self, scene) -> SamplePass:
@@ -97,7 +101,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def emission_in_pixel(self, scene, camera: CameraSamples, Le, media: Media | None = None, within=None):
         """``lights.emission_in_pixel`` of what this integrator shows, through ``media`` around a camera ``within``."""
-        if self.hide_emitters or self.max_depth < 1:
+        if not self.limits.shows:
             return Le
         if media:
             emission = partial(self.lamps_in_fog, scene, media, within=within, channel=mi.UInt32(0))
@@ -107,7 +111,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def lamps_in_fog(self, scene, media: Media, ray, within, channel) -> mi.Spectrum:
         """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
-        if self.hide_emitters or self.max_depth < 1:
+        if not self.limits.shows:
             return mi.Spectrum(0)
         trace = partial(self.first_surface, scene)
         T, hit, ray = segments.clear_view(media, trace, ray, within, channel, mi.Bool(True))
@@ -121,7 +125,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         scattered on the way, since a path finds one or the other. The environment is here in all pixels. Else the box
         around a cloud would stand out from the sky.
         """
-        if self.hide_emitters or self.max_depth < 1 or not media.grids:
+        if not self.limits.shows or not media.grids:
             return mi.Spectrum(0)
         si = segment.hit.compute_surface_interaction(segment.ray)
         arrives = ~segment.place.scatters & ((segment.nulls.M > 0) | ~segment.hit.is_valid())
@@ -133,15 +137,9 @@ def like_path(scene: mi.Scene, plugin: str, **options) -> GradientIntegrator:
 
     Raises NgptError where the parameters cannot be read.
     """
-    path = reference_integrator(scene)
-    depths = path_depths(path)
-    if not depths:
-        raise NgptError(
-            f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
-            "use --sampler gpt-basic"
-        )
+    limits = Limits.of(reference_integrator(scene))
     try:
-        return mi.load_dict({"type": plugin, "hide_emitters": path.hide_emitters, **depths, **options})
+        return mi.load_dict({"type": plugin, **limits.parameters(), **options})
     except RuntimeError as error:
         stop_if_interrupted(error)
         # Mitsuba makes a text of what a plugin raises, with the lines where it was raised.

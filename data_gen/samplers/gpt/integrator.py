@@ -89,9 +89,6 @@ class GPT(GradientIntegrator):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        max_depth = props.get("max_depth", -1)
-        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
-        self.rr_depth = props.get("rr_depth", 5)
         self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
         self.volumes = props.get("volumes", False)
@@ -100,9 +97,7 @@ class GPT(GradientIntegrator):
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
-        depths = {"max_depth": self.max_depth if self.max_depth < 0xFFFFFFFF else -1, "rr_depth": self.rr_depth}
-        plugin = "volpath" if self.volumes else "path"
-        path = mi.load_dict({"type": plugin, "hide_emitters": self.hide_emitters, **depths})
+        path = mi.load_dict({"type": "volpath" if self.volumes else "path", **self.limits.parameters()})
         return path.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
@@ -119,10 +114,10 @@ class GPT(GradientIntegrator):
         return make_plan(
             scene,
             roughness_threshold=self.roughness_threshold,
-            max_depth=self.max_depth,
-            rr_depth=self.rr_depth,
+            max_depth=self.limits.max_depth,
+            rr_depth=self.limits.rr_depth,
             shift=self.shift,
-            hide_emitters=self.hide_emitters,
+            hide_emitters=self.limits.hide_emitters,
             caustic=self.caustic,
             volumes=self.volumes and bool(media_of(scene)),
         )

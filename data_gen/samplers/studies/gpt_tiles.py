@@ -45,6 +45,7 @@ from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, evaluate, seen_from
+from data_gen.paths.walk import Limits
 from data_gen.samplers.common import like_path
 from data_gen.samplers.teaching.gpt_simple import GPTSimple, base_step, reflected
 from ngpt.errors import NgptError
@@ -75,7 +76,7 @@ class GPTTiles(GPTSimple):
         self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
 
     def prepare(self, scene) -> SamplePass:
-        refuse(self.hide_emitters)
+        refuse(self.limits)
         return Tiles(self, scene)
 
 
@@ -121,7 +122,12 @@ class Tiles:
 
     def trace(self, camera: CameraSamples) -> tuple[mi.Spectrum, Paths]:
         """The layer ``direct``, and the path of each pixel: its first vertex, its suffix, and what it is worth here."""
-        scene, materials, random, limit = self.scene, self.materials, camera.random.clone(), self.integrator.max_depth
+        scene, materials, random, limit = (
+            self.scene,
+            self.materials,
+            camera.random.clone(),
+            self.integrator.limits.max_depth,
+        )
         ray, importance, _ = camera.rays()
         ray = mi.Ray3f(ray)
         hit = scene.ray_intersect_preliminary(ray, coherent=True)
@@ -350,13 +356,13 @@ def rgb(value: mi.Spectrum) -> mi.Color3f:
     return to_rgb(value, mi.Color0f())
 
 
-def refuse(hide_emitters: bool) -> None:
+def refuse(limits: Limits) -> None:
     """Raises NgptError for what tiles cannot render."""
     if mi.is_polarized:
         reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
     elif mi.is_spectral:
         reason, other = f"in variant '{mi.variant()}' pixels of a tile have wavelengths of their own", "gpt"
-    elif hide_emitters:
+    elif limits.hide_emitters:
         reason, other = "its integrator hides emitters", "gpt"
     else:
         return

@@ -27,47 +27,42 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.lobes import Lobes
 from data_gen.paths.spectrum import to_rgb
+from data_gen.paths.walk import Limits, roulette
 from data_gen.samplers.teaching.gpt_simple import base_step
-from data_gen.scenes.load import path_depths, reference_integrator
+from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
 
 
 def make(scene: mi.Scene) -> SamplePass:
     """The sampler ``split``, with the parameters of the scene's own ``path``. Raises NgptError for hidden emitters."""
-    integrator = reference_integrator(scene)
-    if integrator.hide_emitters:
+    limits = Limits.of(reference_integrator(scene))
+    if limits.hide_emitters:
         raise NgptError("sampler 'split' cannot render this scene: its integrator hides emitters; use --sampler primal")
-    depths = path_depths(integrator)
-    if not depths:
-        raise NgptError(f"cannot read max_depth and rr_depth of {str(integrator)!r}; use --sampler primal")
-    max_depth = depths["max_depth"] if depths["max_depth"] >= 0 else 0xFFFFFFFF
-    return partial(sample_pass, scene, integrator, Lobes(scene), max_depth, depths["rr_depth"])
+    return partial(sample_pass, scene, limits, Lobes(scene))
 
 
-def sample_pass(
-    scene, integrator, lobes: Lobes, max_depth: int, rr_depth: int, camera: CameraSamples, film: GradientFilm
-) -> None:
+def sample_pass(scene, limits: Limits, lobes: Lobes, camera: CameraSamples, film: GradientFilm) -> None:
     """One path, and a sample of features, for each camera sample."""
     ray, importance, _ = camera.rays()
-    parts = trace(scene, lobes, camera.random.clone(), ray, importance, max_depth, rr_depth)
+    parts = trace(scene, limits, lobes, camera.random.clone(), ray, importance)
     diffuse, specular = (to_rgb(part, ray.wavelengths) for part in parts)
     direct = mi.Color3f(0)
-    if max_depth > 0:
-        seen = partial(emission_seen, scene, integrator, None, active=mi.Bool(True))
+    if limits.shows:
+        seen = partial(emission_seen, scene, limits, None, active=mi.Bool(True))
         direct = to_rgb(emission_in_pixel(scene, camera, importance * seen(ray), seen), ray.wavelengths)
     film.put_all({"primal": direct + diffuse + specular, "direct": direct, "diffuse": diffuse, "specular": specular})
     film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
 
 
 @dr.syntax
-def trace(scene, lobes: Lobes, random, ray, β, max_depth: int, rr_depth: int) -> tuple[mi.Spectrum, mi.Spectrum]:
+def trace(scene, limits: Limits, lobes: Lobes, random, ray, β) -> tuple[mi.Spectrum, mi.Spectrum]:
     """Diffuse and specular light of paths that begin with ``ray``, of importance ``β``."""
     diffuse, specular = mi.Spectrum(0), mi.Spectrum(0)
     x = scene.ray_intersect(mi.Ray3f(ray))
     # Of the light that comes to x from beyond: what share is diffuse, once that is settled.
     share, settled = mi.Spectrum(0), mi.Bool(False)
     depth = mi.UInt32(1)
-    active = x.is_valid() & (depth < max_depth)
+    active = x.is_valid() & (depth < limits.max_depth)
     while dr.hint(active, label="split"):
         step = base_step(scene, random, x, β, active)
         asked = active & ~settled
@@ -86,9 +81,9 @@ def trace(scene, lobes: Lobes, random, ray, β, max_depth: int, rr_depth: int) -
         specular += (1 - share) * light
 
         # Russian roulette
-        q = dr.select(depth < rr_depth, 1, dr.fmin(dr.max(step.β1), 0.95))
+        q = roulette(dr.max(step.β1), depth >= limits.rr_depth)
         survives = random.next_1d() < q
         x, β = step.x1, step.β1 / q
         depth += 1
-        active = survives & x.is_valid() & (depth < max_depth)
+        active = survives & x.is_valid() & (depth < limits.max_depth)
     return diffuse, specular

@@ -39,19 +39,19 @@ class GPTBasic(GradientIntegrator):
     noisier than those of a shift that reconnects.
     """
 
-    name = "gpt-basic"
+    name, nested = "gpt-basic", True
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
-        self.nested = nested[0] if nested else mi.load_dict({"type": "path"})
+        self.integrator = nested[0] if nested else mi.load_dict({"type": "path"})
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone: see the nested integrator."""
-        return self.nested.sample(scene, sampler, ray, medium, active)
+        return self.integrator.sample(scene, sampler, ray, medium, active)
 
     def prepare(self, scene) -> SamplePass:
-        estimate = radiance(scene, self.nested)
+        estimate = radiance(scene, self.integrator)
         return lambda camera, film: self.sample_pass(scene, estimate, camera, film)
 
     def sample_pass(self, scene, estimate, camera: CameraSamples, film: GradientFilm) -> None:
@@ -75,7 +75,7 @@ class GPTBasic(GradientIntegrator):
         medium = camera.sensor.get_medium()
         # The clone starts from the same state each time: same u.
         L = estimate(camera.random.clone(), ray, medium, inside)
-        Le = emission_seen(scene, self.nested, medium, ray, inside)
+        Le = emission_seen(scene, self.integrator, medium, ray, inside)
         L, Le = to_rgb((L - Le) * importance, ray.wavelengths), to_rgb(Le * importance, ray.wavelengths)
         dr.eval(L, Le, inside)
         return L, Le, inside

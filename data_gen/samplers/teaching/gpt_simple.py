@@ -40,6 +40,7 @@ from data_gen.paths.lights import LightSample, emission, sample_light
 from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, consistent, evaluate, seen_from
+from data_gen.paths.walk import Limits, roulette
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.shared import CONNECTABLE
 from ngpt.errors import NgptError
@@ -57,19 +58,13 @@ class GPTSimple(GradientIntegrator):
 
     name = "gpt-simple"
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        max_depth = props.get("max_depth", -1)
-        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
-        self.rr_depth = props.get("rr_depth", 5)
-
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone."""
         L, Le, _ = self.trace(scene, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.hide_emitters)
+        refuse(scene, self.limits)
         return lambda camera, film: self.sample_pass(scene, camera, film)
 
     def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
@@ -87,15 +82,15 @@ class GPTSimple(GradientIntegrator):
         """L, Le and the four Δ, in the order of SHIFTS, of base paths that begin with ``ray``."""
         # ------------------ First vertex: offset paths are apart ------------------
         x = scene.ray_intersect(mi.Ray3f(ray))
-        Le = importance * x.emitter(scene).eval(x, self.max_depth > 0)
-        active = x.is_valid() & (self.max_depth > 1)
+        Le = importance * x.emitter(scene).eval(x, self.limits.max_depth > 0)
+        active = x.is_valid() & (self.limits.max_depth > 1)
         offsets = [start(scene, active, *ray_and_importance) for *ray_and_importance, _ in shifted]
         step = base_step(scene, random, x, importance, active)
         L = step.β * step.L_light + step.β1 * step.L_bsdf
         offsets = [step_apart(scene, step, y) for y in offsets]
 
         # ------------------ Second vertex: they are joined to it ------------------
-        step = base_step(scene, random, step.x1, step.β1, step.x1.is_valid() & (self.max_depth > 2))
+        step = base_step(scene, random, step.x1, step.β1, step.x1.is_valid() & (self.limits.max_depth > 2))
         L += step.β * step.L_light + step.β1 * step.L_bsdf
         settled = [step_joined(step, y) for y in offsets]
 
@@ -107,16 +102,16 @@ class GPTSimple(GradientIntegrator):
     def walk(self, scene, random, x):
         """R, the radiance that reaches the second vertex from the third, ``x``."""
         R, β, depth = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(3)
-        active = x.is_valid() & (depth < self.max_depth)
+        active = x.is_valid() & (depth < self.limits.max_depth)
         while dr.hint(active, label="gpt_simple"):
             step = base_step(scene, random, x, β, active)
             R += β * step.L_light + step.β1 * step.L_bsdf
             # Roulette by the throughput since the second vertex, which is that of all five paths: none is starved.
-            q = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(step.β1), 0.95))
+            q = roulette(dr.max(step.β1), depth >= self.limits.rr_depth)
             survives = random.next_1d() < q
             x, β = step.x1, step.β1 / q
             depth += 1
-            active = survives & x.is_valid() & (depth < self.max_depth)
+            active = survives & x.is_valid() & (depth < self.limits.max_depth)
         return R
 
 
@@ -235,11 +230,11 @@ def step_joined(step: Step, path: Offset) -> tuple[mi.Spectrum, mi.Spectrum]:
     return Δ, w2 * (β - step.β1)
 
 
-def refuse(scene, hide_emitters: bool) -> None:
+def refuse(scene, limits: Limits) -> None:
     """Raises NgptError for a scene that reconnection alone cannot render."""
     if mi.is_polarized:
         reason, other = f"variant '{mi.variant()}' is polarised", "gpt-basic"
-    elif hide_emitters:
+    elif limits.hide_emitters:
         reason, other = "its integrator hides emitters", "gpt"
     elif materials := Materials(scene, CONNECTABLE.default).unconnectable:
         more = f" and {len(materials) - 3} more" if len(materials) > 3 else ""

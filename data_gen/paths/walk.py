@@ -1,0 +1,109 @@
+"""What all walks of paths have in common: how long they may be, who survives, and what is seen where one escapes.
+
+Every rule stands here once, since samplers must agree in it: two that end their paths otherwise render two images.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.vertex import NULL
+from data_gen.scenes.load import path_depths
+from ngpt.errors import NgptError
+
+UNLIMITED = 0xFFFFFFFF
+
+# None survives a step for certain, were it at a perfect mirror: so all paths end.
+_MOST = 0.95
+
+
+@dataclass
+class Limits:
+    """The parameters that our integrators have from Mitsuba's ``path``."""
+
+    max_depth: int = UNLIMITED  # most edges of a path; 1: only emission that the camera sees
+    rr_depth: int = 5  # vertices from the first that Russian roulette looks at on
+    hide_emitters: bool = False  # from the camera
+
+    @classmethod
+    def read(cls, props: mi.Properties) -> Limits:
+        """Those of a plugin. Raises NgptError for values that ``path`` refuses too."""
+        depth, rr_depth = props.get("max_depth", -1), props.get("rr_depth", cls.rr_depth)
+        for name, value, least, meaning in (
+            ("max_depth", depth, -1, "0 or more, or -1 for no limit"),
+            ("rr_depth", rr_depth, 1, "1 or more"),
+        ):
+            if type(value) is not int or not least <= value < 1 << 31:
+                raise NgptError(f"{name} is {value!r}: give an integer of {meaning}")
+        return cls(UNLIMITED if depth < 0 else depth, rr_depth, props.get("hide_emitters", False))
+
+    @classmethod
+    def of(cls, path: mi.SamplingIntegrator) -> Limits:
+        """Those of Mitsuba's ``path``, or one like it. Raises NgptError where they cannot be read."""
+        depths = path_depths(path)
+        if not depths:
+            raise NgptError(
+                f"cannot read max_depth and rr_depth from the integrator, which describes itself as {str(path)!r}; "
+                "use --sampler gpt-basic"
+            )
+        depth = depths["max_depth"]
+        return cls(UNLIMITED if depth < 0 else depth, depths["rr_depth"], path.hide_emitters)
+
+    def parameters(self) -> dict[str, int | bool]:
+        """As those of a plugin."""
+        depth = self.max_depth if self.max_depth < UNLIMITED else -1
+        return {"max_depth": depth, "rr_depth": self.rr_depth, "hide_emitters": self.hide_emitters}
+
+    @property
+    def shows(self) -> bool:
+        """Whether emission that the camera sees directly is in the image."""
+        return not self.hide_emitters and self.max_depth > 0
+
+
+def roulette(throughput: mi.Float, plays: mi.Bool | bool, η: mi.Float | None = None) -> mi.Float:
+    """Russian roulette: the probability to survive, by which what survives is to be divided; 1 where none ``plays``.
+
+    Of a path from the camera, ``throughput`` is the largest channel of its weight behind the step, and ``η`` the
+    product of the relative indices of refraction up to there: η² undoes what refraction does to radiance, as in
+    Mitsuba's ``path``. Of a path from a light it is relative to the weight that the path began with. Paths that are
+    correlated survive together, by the ``brightest()``: so none of them is starved.
+    """
+    if η is not None:
+        throughput = throughput * dr.square(η)
+    return dr.select(plays, dr.fmin(throughput, _MOST), 1)
+
+
+def brightest(paths: Iterable[Any]) -> mi.Float:
+    """The largest throughput of all these paths, which have ``β``, and count where they are ``alive``."""
+    largest = mi.Float(0)
+    for path in paths:
+        largest = dr.fmax(largest, dr.select(path.alive, dr.max(path.β), 0))
+    return largest
+
+
+@dataclass
+class Sky:
+    """Whether a path that escapes sees the environment.
+
+    One that hides from the camera hides as well behind holes, where nothing has been scattered yet.
+    """
+
+    seen: mi.Bool
+
+    @classmethod
+    def from_camera(cls, hides: bool, lanes: int = 1) -> Sky:
+        """At the first vertex; ``hides``: emitters hide from the camera."""
+        return cls(dr.full(mi.Bool, not hides, lanes))
+
+    def behind(self, kind: mi.UInt32, found: mi.Bool | bool = True) -> Sky:
+        """Behind an event of this ``kind`` (``vertex.event_kind``), where one was ``found``."""
+        return Sky(self.seen | (found & (kind != NULL)))
+
+    def meets(self, x: mi.SurfaceInteraction3f) -> mi.Bool:
+        """Whether there is something that may emit light at the next vertex ``x``: a surface, or the environment."""
+        return x.is_valid() | self.seen
