@@ -2,7 +2,7 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow reliability check bench setup-demo setup-dev setup-quick
+.PHONY: demo quick test test-slow reliability check docs bench setup-demo setup-dev setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
@@ -23,12 +23,17 @@ test-slow: setup-dev
 reliability: setup-dev
 	$(PY) scripts/reliability.py
 
-check: setup-dev
+check: setup-dev docs
 	$(PY) -m ruff check .
 	$(PY) -m ruff format --check .
 	$(PY) -m mypy
 	$(PY) -m pytest -q tests/test_rooms.py
 	$(PY) scripts/supply.py check
+
+# The pages as a site, with search and a reference of the Python interface: out/site/index.html. Strict: a link that
+# leads nowhere fails.
+docs: setup-docs
+	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --config-file scripts/site/mkdocs.yml
 
 bench: setup-dev
 	$(PY) -m bench.sampler -o bench/results/sampler.json
@@ -42,3 +47,6 @@ setup-dev:
 
 setup-quick:
 	@scripts/setup dev
+
+setup-docs:
+	@scripts/setup docs

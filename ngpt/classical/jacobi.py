@@ -1,6 +1,6 @@
 """The sweeps of ``ngpt.classical.controlvariates`` on NumPy arrays, arranged for the caches of a processor.
 
-NumPy alone, and faster than its expressions over bands of an image (docs/lab/LOG.md), by these means:
+NumPy alone, and faster than its expressions over bands of an image (docs/lab/log), by these means:
 
 - The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` rows more on both sides, copies of
   its neighbours', so that so many sweeps need no word from them: what is wrong at its ends moves in by a row a sweep.

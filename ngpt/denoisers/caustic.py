@@ -9,7 +9,7 @@ travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering
 
 OIDN's image of this light alone has less error where it has edges, but no eye for fireflies: all light is rare here.
 What OIDN's image of all light has beyond its image of the rest has: there a firefly stands out. The mean of both is as
-good as the better one, or better (docs/lab/LOG.md). It has less light than there was where OIDN takes light for noise.
+good as the better one, or better (docs/lab/log). It has less light than there was where OIDN takes light for noise.
 Methods that call OIDN anyway take that; all others must not depend on a package.
 """
 

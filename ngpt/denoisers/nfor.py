@@ -34,7 +34,7 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     ``image`` is (H, W, 3), finite, ``variance`` that of its pixels as means, NaN where it is not known, ``features`` a
     list of (H, W, C). Memory is about 100 floats a pixel.
     """
-    # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/lab/LOG.md).
+    # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/lab/log).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
     design = _design(features, image.shape[:2])
     trust = _trust(image, variance)

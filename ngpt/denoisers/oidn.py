@@ -52,7 +52,7 @@ def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, n
     """Albedo and normal (H, W, 3) denoised by OIDN's own models for them.
 
     With ``quality`` "high" this takes longer than the image itself, with "balanced" less than half of that, and images
-    denoised with their help are as good (docs/lab/LOG.md). Whether features are noisy is not asked: no cheap answer was
+    denoised with their help are as good (docs/lab/log). Whether features are noisy is not asked: no cheap answer was
     right. Who knows says "clean".
     """
     require_oidn()

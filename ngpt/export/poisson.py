@@ -2,7 +2,7 @@
 
 The cosine transforms are matrix products with matrices made inside the graph from the size of its input, so one file
 serves every size. That costs O(H W (H + W)) instead of the O(H W log(H W)) of a fast transform, but matrix products run
-so near the peak of a machine that up to 1920x1080 the two are equally fast on two CPU cores (docs/lab/LOG.md).
+so near the peak of a machine that up to 1920x1080 the two are equally fast on two CPU cores (docs/lab/log).
 """
 
 import math

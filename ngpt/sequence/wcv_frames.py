@@ -14,7 +14,7 @@ pixel. A pixel that comes into sight needs no test: dt holds the difference to w
 As in ``controlvariates``, weights are relative: a = f var I / (f var I + var dt), with f the factor by which n
 iterations have lowered the variance of a pixel, and smoothed variances (``ngpt.classical.variances``).
 
-In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/sequences.md.
+In bytes per pixel and frame, beyond the input: 190 in single precision. Time: see docs/use/shots.md.
 """
 
 from __future__ import annotations

@@ -1,0 +1,95 @@
+"""What the site adds to docs/: a menu, a reference made of docstrings, and the files outside docs/ that pages link to.
+
+The pages are written for the forge, where a link leads to any file of the repository. The site gets a copy of each such
+file under ``repository/``, Markdown as a page, so that one link works in both places.
+"""
+
+import ast
+import posixpath
+import re
+from pathlib import Path
+
+from mkdocs.structure.files import File
+
+ROOT = Path(__file__).parents[2]
+DOCS = ROOT / "docs"
+# Folder -> title in the menu
+FOLDERS = {
+    "start": "Start",
+    "use": "Use",
+    "methods": "Methods",
+    "samplers": "Samplers",
+    "train": "Train",
+    "embed": "Embed",
+    "api": "Python reference",
+    "lab": "Lab",
+}
+LINK = re.compile(r"(\]\()(?![a-z]+:|#)([^)\s#]+)")
+CSS = ".md-typeset table:not([class]) { font-size: .68rem } .md-grid { max-width: 70rem }"
+
+
+def linked(page: Path) -> list[Path]:
+    """Files and folders of the repository that a page links to."""
+    return [(page.parent / target).resolve() for _, target in LINK.findall(page.read_text())]
+
+
+def outside() -> set[Path]:
+    """The files outside docs/ that a reader of docs/ can come to by links."""
+    found: set[Path] = set()
+    todo = list(DOCS.rglob("*.md"))
+    while todo:
+        for file in linked(todo.pop()):
+            if file.is_file() and not file.is_relative_to(DOCS) and file not in found:
+                found.add(file)
+                todo += [file] if file.suffix == ".md" else []
+    return found
+
+
+def address(file: Path) -> str:
+    """Where a file of the repository lies in the site's sources."""
+    return str(file.relative_to(DOCS)) if file.is_relative_to(DOCS) else f"repository/{file.relative_to(ROOT)}"
+
+
+def reference() -> dict[str, str]:
+    """Pages of the Python reference: what `ngpt` offers, and what `data_gen` does to who renders."""
+    homes = {}
+    for node in ast.walk(ast.parse((ROOT / "ngpt" / "__init__.py").read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("ngpt."):
+            homes |= {alias.name: f"{node.module}.{alias.name}" for alias in node.names if alias.name != "__version__"}
+    pages = {"ngpt": "# ngpt\n\n" + "\n\n".join(f"::: {homes[name]}" for name in sorted(homes, key=str.lower))}
+    modules = ("session", "render", "adaptive")
+    rendering = [f"::: data_gen.{name}" for name in modules if (ROOT / "data_gen" / f"{name}.py").exists()]
+    return pages | {"data_gen": "# data_gen\n\nRendering with Mitsuba 3.\n\n" + "\n\n".join(rendering)}
+
+
+def on_files(files, config):
+    for file in sorted(outside()):
+        files.append(File.generated(config, address(file), abs_src_path=str(file)))
+    for name, text in reference().items():
+        files.append(File.generated(config, f"api/{name}.md", content=text))
+    files.append(File.generated(config, "site.css", content=CSS))
+    config.nav = menu([file.src_uri for file in files.documentation_pages()])
+    return files
+
+
+def menu(pages: list[str]) -> list:
+    """Pages by folder, in the order in which the front page names them."""
+    front = [address((DOCS / target).resolve()) for _, target in LINK.findall((DOCS / "index.md").read_text())]
+    order = {page: place for place, page in reversed(list(enumerate(front)))}
+    of = {folder: [page for page in pages if page.startswith(folder + "/")] for folder in FOLDERS}
+    for chosen in of.values():
+        chosen.sort(key=lambda page: (order.get(page, len(front)), page))
+    return ["index.md", *({FOLDERS[folder]: chosen} for folder, chosen in of.items() if chosen)]
+
+
+def on_page_markdown(markdown, page, config, files):
+    """Links of the forge become the site's; what is a folder there is no link here."""
+    here = Path(page.file.abs_src_path).parent if page.file.abs_src_path else DOCS / "api"
+
+    def mended(match: re.Match) -> str:
+        file = (here / match[2]).resolve()
+        return match[1] + posixpath.relpath(address(file), posixpath.dirname(page.file.src_uri) or ".")
+
+    folders = re.compile(r"(?<!!)\[([^\]]+)\]\(((?!#|[a-z]+:)[^)\s#]+)\)")
+    markdown = folders.sub(lambda match: match[1] if (here / match[2]).is_dir() else match[0], markdown)
+    return LINK.sub(mended, markdown)
