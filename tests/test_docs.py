@@ -2,7 +2,9 @@
 
 import json
 import re
+import shlex
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,67 @@ def test_commands_exist(page, capsys):
     verbs = set(re.findall(r"^ {2,4}([a-z]+)(?: {2}|$)", capsys.readouterr().out, re.M))
     for verb in re.findall(r"(?:`|^ {4})ngpt ([a-z]+)", text, re.M):
         assert verb in verbs, f"ngpt {verb}"
+
+
+def parser_of(verb):
+    """The real parser of a verb, which refuses a line by leaving with status 2."""
+    from ngpt.cli import VERBS, _filled, _Parser
+
+    assert verb in VERBS, f"ngpt {verb}"
+    return _filled(_Parser(prog=f"ngpt {verb}"), verb)
+
+
+def unknown_options(line):
+    """Options in a piece of a command line that its verb does not have."""
+    _, verb, *words = shlex.split(line, comments=True)
+    known = {"-h", "--help", *parser_of(verb)._option_string_actions}
+    given = [word.partition("=")[0] for word in words if re.match(r"--?[a-zA-Z]", word)]
+    for flag, setting in pairwise(words):
+        assert flag != "-O" or setting.partition("=")[0] in settings_of(verb), line
+    return [word for word in given if word not in known]
+
+
+@pytest.mark.parametrize("page", TODAY, ids=name)
+def test_command_lines_are_accepted(page):
+    text = page.read_text().replace("\\\n", " ")
+    for line in re.findall(r"^ *(ngpt [a-z]+ .*)$", "\n".join(code_of(text)), re.M):
+        words = shlex.split(line, comments=True)[1:]
+        if "..." in line or "[" in line.partition("#")[0]:
+            assert unknown_options(re.sub(r"[\[\]]|\.\.\.", " ", line)) == [], line
+            continue
+        if "--method median" in line:  # of the page on adding a method
+            continue
+        try:
+            parser_of(words[0]).parse_args(words[1:])
+        except SystemExit as left:
+            assert left.code == 0, line
+        assert unknown_options(line) == [], line
+    for line in re.findall(r"`(ngpt [a-z]+ [^`]*)`", text):
+        assert unknown_options(re.sub(r"[\[\]]|\.\.\.", " ", line)) == [], line
+
+
+def settings_of(verb):
+    """Names that -O may set: options of samplers where something is rendered, else of methods."""
+    from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+    from ngpt.methods import METHODS
+
+    entries = {**SAMPLERS, **FRAME_SAMPLERS} if verb == "render" else METHODS
+    return {name for entry in entries.values() for name in entry.options} | {"NAME", "name"}
+
+
+def code_of(text):
+    """Blocks of a page: fenced, and lines that are indented."""
+    return [*re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S), *re.findall(r"^ {4}(.*)$", text, re.M)]
+
+
+def test_command_lines_of_messages_are_accepted():
+    """What an error or a help text tells to type: each `ngpt ...` between backquotes in the code."""
+    found = 0
+    for file in [*ROOT.glob("ngpt/**/*.py"), *ROOT.glob("data_gen/**/*.py")]:
+        for line in re.findall(r"`(ngpt [a-z]+[^`\n]*)`", re.sub(r'" *\n\s*f?"', "", file.read_text())):
+            assert unknown_options(line.replace("'", "")) == [], (file, line)
+            found += 1
+    assert found > 20
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name)
