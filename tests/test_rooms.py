@@ -49,7 +49,7 @@ data_gen.render data_gen.inspect
 data_gen.frames
 data_gen.choosing.costs data_gen.choosing.trials
 data_gen.choosing.pipelines
-data_gen.choosing.pilot
+data_gen.choosing.plans
 data_gen.choosing
 data_gen.dataset
 ngpt.evaluation

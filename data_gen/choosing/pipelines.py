@@ -1,4 +1,4 @@
-"""The whole way to an image, a sampler and a method, chosen by the error that it is expected to leave in the end.
+"""The whole way to an image: a sampler and a method, and the error that they are expected to leave in the end.
 
 Each sampler that could render the scene renders four small stacks. Every method that can use them reconstructs each of
 the four, and both halves of them merged. The error of such an image is that against primals of the other half and of
@@ -22,21 +22,14 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
-import mitsuba as mi
-
 from data_gen.adaptive import LEAST, Adaptive, assess, gain
-from data_gen.choosing.trials import PIXELS, Trial, Witnesses, at_most, candidates, try_all
-from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.choosing.trials import Trial, Witnesses
 from data_gen.samplers import SAMPLERS
 from ngpt.errors import NgptError
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
-# Of the time that there is, after which no further sampler is tried, and what each may take
-SHARE, DEAREST = 0.1, 0.2
-# Seconds from which on the pilot's images are as large as they ever are, and the least share of that
-LONG, LEAST_PIXELS = 200.0, 1 / 16
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
 WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
 WITHOUT = ("primal", "oidn", "ngpt-primal")
@@ -207,82 +200,3 @@ def choose(pipelines: Sequence[Pipeline], seconds: float) -> list[Pipeline]:
     """Those of which at least a sample fits into the time, the one to take first."""
     fit = [p for p in pipelines if p.samples(seconds) >= 1 and math.isfinite(p.expected(p.samples(seconds)))]
     return sorted(fit, key=lambda p: p.expected(p.samples(seconds)))
-
-
-def explore(
-    scene: mi.Scene,
-    seconds: float = LONG,
-    method: str = "auto",
-    memory: int = DEFAULT_MEMORY,
-    clock: Callable[[], float] = time.perf_counter,
-) -> list[Pipeline]:
-    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them."""
-    start = clock()
-    names = candidates(scene)
-    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
-    if not able:
-        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
-    entry = SAMPLERS[able[0]]
-    film_within(memory, scene.sensors()[0], 1 << 31, entry.lane_bytes, entry.batch)
-    with at_most(scene, round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))) as scale:
-        trials = try_all(scene, able[:2], clock=clock)
-        trials |= try_all(scene, able[2:], lambda: clock() - start < SHARE * seconds, DEAREST * seconds, clock)
-        if not trials:
-            raise NgptError(f"none of the samplers {', '.join(able)} can render the scene")
-        found = measure(trials, clock, lambda sampler: methods_for(sampler, method))
-    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
-
-
-@dataclass(frozen=True)
-class Plan:
-    """What to do with the seconds that are left, why, and the seconds that it took to know.
-
-    ``sampler``, ``method``  of the image
-    ``shared``               whether samples are to be shared out
-    ``render``               seconds for the render, those of the method taken off
-    """
-
-    sampler: str
-    method: str
-    shared: bool
-    render: float
-    reason: str
-
-
-def plan(
-    scene: mi.Scene,
-    seconds: float,
-    method: str = "auto",
-    memory: int = DEFAULT_MEMORY,
-    clock: Callable[[], float] = time.perf_counter,
-) -> Plan:
-    """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
-
-    Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
-    then ``primal``, then all unbiased others that ``--sampler auto`` compares, and begins none after a tenth of the
-    time. The less time, the smaller are its images. What it measures changes from run to run. Raises NgptError for a
-    method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
-    """
-    start = clock()
-    whole = explore(scene, seconds, method, memory, clock)
-    left = seconds - (clock() - start)
-    ranked = choose(whole, left)
-    if not ranked:
-        raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
-    first = ranked[0]
-    return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
-
-
-def _turn(first: str) -> Callable[[str], int]:
-    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
-
-
-def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
-    """A line: what is expected of the first, and of the best by each other sampler."""
-    errors: dict[str, tuple[float, Pipeline]] = {}
-    for p in ranked:
-        errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
-    (least, first), *others = errors.values()
-    what = f"expected to leave an error of {math.sqrt(least):.2g} by '{first.method}'"
-    rivals = [f"{math.sqrt(e):.2g} by '{p.sampler}' and '{p.method}'" for e, p in others]
-    return ", ".join([what, *rivals])

@@ -18,7 +18,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
     parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
-    parser.add_argument("--advice", type=Path, metavar="FILE", help="also write the table that `ngpt advise` reads")
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -26,10 +25,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Here and not above: a mistyped option is said at once.
     from ngpt.evaluation.config import read_config
     from ngpt.evaluation.run import evaluate
-    from ngpt.measure.advice import make_table
     from ngpt.report.evaluation import write_evaluation_report
     from ngpt.report.page import oversize
-    from ngpt.system.writing import write_json
 
     config = read_config(path)
     config = replace(config, scenes=(*config.scenes, *args.scenes))
@@ -37,8 +34,6 @@ def run(args: argparse.Namespace, console: Console) -> int:
     page = write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
     if large := oversize(page):
         console.say(large)
-    if args.advice:
-        write_json(args.advice, make_table(results))
     absent = [name for name, entry in results["scenes"].items() if entry.get("absent")]
     if absent:
         console.error(f"{len(absent)} of {len(results['scenes'])} scenes are absent: {', '.join(absent)}")

@@ -17,7 +17,6 @@ from ngpt.evaluation.renders import Render
 from ngpt.evaluation.results import write_results
 from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
 from ngpt.io.exr import write
-from ngpt.measure.advice import describe
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.report.display import auto_exposure
@@ -125,7 +124,6 @@ def _scene(
         reference.check(first)
     entry: dict[str, Any] = {"file": stacks.source, "size": [first.width, first.height], "cost": costs}
     entry["exposure"] = auto_exposure(reference.mean)
-    entry["pilot"] = describe(first) if "primal_var" in first else None
     entry["reference"] = _reference_entry(reference, scorer, name, out)
     entry["absent"] = None
     cells: list[dict[str, Any]] = []

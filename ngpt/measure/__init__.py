@@ -1,1 +1,1 @@
-"""How good an image is: metrics, perceptual distances, and the advice that is made of measurements."""
+"""How good an image is: metrics, perceptual distances, and what one more layer would buy."""

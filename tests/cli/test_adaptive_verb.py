@@ -43,15 +43,15 @@ def test_refusals(renderer, tmp_path, capsys, options, message):
 
 def test_a_pilot_chooses_for_a_method(renderer, tmp_path, capsys, monkeypatch):
     """What it chose is rendered, in the time that is left, and written down."""
-    from data_gen.choosing import pipelines
+    from data_gen.choosing import plans
 
     asked = []
 
     def plan(scene, seconds, method, memory):
         asked.append((seconds, method))
-        return pipelines.Plan("primal", "oidn", True, 1.5, "for a test")
+        return plans.Plan("primal", "oidn", True, 1.5, "for a test")
 
-    monkeypatch.setattr(pipelines, "plan", plan)
+    monkeypatch.setattr(plans, "plan", plan)
     target = str(tmp_path / "stack.exr")
     assert main(["render", "diffuse", "-o", target, "--size", "24x16", "--time", "60", "--for", "auto"]) == 0
     said, stack = capsys.readouterr().err, ngpt.read(target)

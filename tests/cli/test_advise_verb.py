@@ -1,4 +1,4 @@
-"""``ngpt advise`` without a table: by a pilot of this scene, for a time or an error."""
+"""``ngpt advise``: by a pilot of this scene, for a time or an error."""
 
 import json
 import shlex
@@ -12,17 +12,17 @@ from ngpt.cli import main
 @pytest.fixture
 def seen(renderer, monkeypatch):
     """A scene in which samples of two samplers leave known errors."""
-    from data_gen.choosing import pipelines
-    from data_gen.choosing.pipelines import Pipeline
+    from data_gen.choosing import plans
+    from data_gen.choosing.pipelines import Pipeline, usual_fall
 
-    usual = {m: pipelines.usual_fall("gpt", m) for m in ("wcv", "primal", "l1")}
+    usual = {m: usual_fall("gpt", m) for m in ("wcv", "primal", "l1")}
     found = [
         Pipeline("primal", "primal", 16, 0.02, usual["primal"], 0.001, 0.0),
         Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01),
         Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01, adaptive=0.5, choosing=0.001),
         Pipeline("gpt", "l1", 16, 0.05, usual["l1"], 0.002, 0.01),
     ]
-    monkeypatch.setattr(pipelines, "explore", lambda scene, seconds: found)
+    monkeypatch.setattr(plans, "explore", lambda scene, seconds: found)
     return found
 
 
@@ -56,23 +56,37 @@ def test_the_least_time_to_an_error(seen, capsys):
 
 def test_the_commands_of_a_pilot_run_as_printed(seen, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert main(["advise", "diffuse", "--size", "16x12", "--seconds", "0.4", "-q"]) == 0
+    (tmp_path / "my scene").mkdir()
+    scene = tmp_path / "my scene" / "a box.xml"
+    scene.write_text(BOX)
+    assert main(["advise", str(scene), "--size", "16x12", "--seconds", "0.4", "-D", "light=3", "-q"]) == 0
     render, denoise = (line for line in capsys.readouterr().out.splitlines() if line.startswith("ngpt "))
     for line in (render, denoise):
         assert main(shlex.split(line)[1:]) == 0
-    (stack,) = tmp_path.glob("diffuse-*spp.exr")
+    (stack,) = tmp_path.glob("a box-*spp.exr")
     assert "samples" in ngpt.read(stack) and "--adaptive" in render
-    (result,) = tmp_path.glob("diffuse-*-wcv.exr")
+    (result,) = tmp_path.glob("a box-*-wcv.exr")
     assert ngpt.read(result).attributes["ngpt:method"] == "wcv"
 
 
 def test_a_pilot_advises(renderer, capsys, monkeypatch):
     """Whatever it may be: a row for each method of each sampler that was tried."""
-    from data_gen.choosing import pipelines
+    from data_gen.choosing import pipelines, plans
 
-    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
+    monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt"])
     monkeypatch.setattr(pipelines, "WITH_GRADIENTS", ("wcv", "l1"))
     monkeypatch.setattr(pipelines, "WITHOUT", ("primal",))
     rows = advice(capsys, "--seconds", "100")  # of no more samples than a render may have
     assert {(row["sampler"], row["method"]) for row in rows} == {("gpt", "wcv"), ("gpt", "l1"), ("primal", "primal")}
     assert all(row["error"] > 0 and row["spp"] > 100 for row in rows)
+
+
+BOX = """
+<scene version="3.0.0">
+    <default name="light" value="1"/>
+    <integrator type="path"/>
+    <sensor type="perspective"><film type="hdrfilm"/></sensor>
+    <shape type="sphere"><point name="center" x="0" y="0" z="4"/></shape>
+    <emitter type="constant"><spectrum name="radiance" value="$light"/></emitter>
+</scene>
+"""

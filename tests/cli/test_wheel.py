@@ -50,7 +50,7 @@ def test_it_holds_the_two_packages_and_the_configurations(held):
     packages = {path.relative_to(ROOT).as_posix() for path in files if path.parent.name != "__pycache__"}
     configs = {f"ngpt/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
     assert {name for name in held if "dist-info" not in name} == packages | configs
-    assert {"ngpt/py.typed", "ngpt/report/report.html", "ngpt/measure/advice.json"} <= packages
+    assert {"ngpt/py.typed", "ngpt/report/report.html", "ngpt/measure/layers.json"} <= packages
     assert "ngpt/configs/tiny.toml" in configs
 
 

@@ -21,7 +21,7 @@ def witnesses(rng, **noise):
 
 def seen(sampler, error, seconds, step=None, **more):
     """What a pilot says of a sampler and its simple method, at 16 samples."""
-    from data_gen.choosing.pilot import simple
+    from data_gen.choosing.plans import simple
     from data_gen.choosing.pipelines import Pipeline, usual_fall
 
     method = simple(sampler)
@@ -30,7 +30,7 @@ def seen(sampler, error, seconds, step=None, **more):
 
 
 def test_the_least_time_to_the_end_is_chosen(renderer):
-    from data_gen.choosing.pilot import best_of, times_to_the_end
+    from data_gen.choosing.plans import best_of, times_to_the_end
 
     pipelines = [seen("gpt", 0.01, 2.0), seen("bdpt", 0.1, 4.0), seen("primal", 0.2, 1.0)]
     times = times_to_the_end(pipelines, 32.0)
@@ -42,7 +42,7 @@ def test_the_least_time_to_the_end_is_chosen(renderer):
 
 def test_errors_that_fall_slowly_lose_in_long_renders(renderer):
     """With the power that a pilot saw, as in scenes whose light paths from the camera hardly find."""
-    from data_gen.choosing.pilot import best_of
+    from data_gen.choosing.plans import best_of
 
     slow, usual = seen("gpt", 0.07, 1.0, step=-0.55), seen("gpt", 0.07, 1.0)
     rival = seen("gbdpt", 0.01, 8.0)
@@ -76,7 +76,7 @@ def test_no_photons_are_witnesses(rng):
 
 def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
     """Their errors fall slower than noise, and where others hardly find the light nobody is sure of them."""
-    from data_gen.choosing.pilot import best_of, times_to_the_end
+    from data_gen.choosing.plans import best_of, times_to_the_end
 
     pipelines = [seen("gpt", 0.5, 1.0), seen("primal", 1.0, 1.0), seen("ppm", 0.01, 1.0, doubt=0.002)]
     assert best_of(pipelines, 100.0)[0] == "ppm" and best_of(pipelines, 1e7)[0] == "gpt"
@@ -91,7 +91,7 @@ def test_photons_are_judged_by_others_and_by_the_time_there_is(renderer, rng):
 
 
 def test_a_choice_needs_a_margin():
-    from data_gen.choosing.pilot import judge
+    from data_gen.choosing.plans import judge
 
     assert judge("gpt", {"gpt": 1.0, "bdpt": 0.95})[0] == "gpt"
     assert judge("gpt", {"gpt": 1.0, "bdpt": 0.7})[0] == "bdpt"
@@ -111,23 +111,23 @@ def test_candidates_are_those_of_the_registry(renderer):
 
 
 def test_short_renders_are_not_measured(renderer, monkeypatch):
-    from data_gen.choosing import pilot
+    from data_gen.choosing import plans
 
     scene = load(renderer, "diffuse", (48, 32))
-    monkeypatch.setattr(pilot, "try_all", None)
+    monkeypatch.setattr(plans, "try_all", None)
     for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
-        choice = pilot.choose_by_pilot(scene, spp, seconds)
-        assert choice.sampler == "gpt" and "too short" in choice.reason and choice.seconds == 0
+        choice = plans.plan_sampler(scene, spp, seconds)
+        assert choice.sampler == "gpt" and "too short" in choice.reason and choice.render == seconds
 
 
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen.choosing import pilot, trials
+    from data_gen.choosing import plans, trials
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (48, 32))
     before = render_stack(scene, 2, 0, "gpt")
-    monkeypatch.setattr(pilot, "PIXELS", 24 * 16)
-    monkeypatch.setattr(pilot, "candidates", lambda scene, biased: ["gpt", "primal"])
+    monkeypatch.setattr(plans, "PIXELS", 24 * 16)
+    monkeypatch.setattr(plans, "candidates", lambda scene, biased: ["gpt", "primal"])
     sizes = []
     tried = trials.try_out
 
@@ -136,7 +136,7 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
         return tried(scene, *args)
 
     monkeypatch.setattr(trials, "try_out", try_out)
-    choice = pilot.choose_by_pilot(scene, 1 << 30, 1e6)
+    choice = plans.plan_sampler(scene, 1 << 30, 1e6)
     assert choice.sampler in ("gpt", "primal") and choice.reason.startswith("chosen by a pilot: to a given error")
     assert len(sizes) == 2 and {tuple(map(int, size)) for size in sizes} == {(24, 16)}
     after = render_stack(scene, 2, 0, "gpt")

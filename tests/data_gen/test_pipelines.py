@@ -119,28 +119,28 @@ def ticking(tick):
 
 
 def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monkeypatch):
-    from data_gen.choosing import pipelines
+    from data_gen.choosing import plans
 
     scene = load(renderer, "diffuse", (48, 32))
-    monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
-    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt"])
-    found = pipelines.plan(scene, 200.0, clock=ticking(0.01))
-    assert found.sampler in ("gpt", "primal") and found.method in pipelines.methods_for(found.sampler)
+    monkeypatch.setattr(plans, "PIXELS", 24 * 16)
+    monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt"])
+    found = plans.plan(scene, 200.0, clock=ticking(0.01))
+    assert found.sampler in ("gpt", "primal") and found.method in plans.methods_for(found.sampler)
     assert 0 < found.render < 200 and "expected to leave an error of" in found.reason
     assert tuple(scene.sensors()[0].film().size()) == (48, 32)
     with pytest.raises(NgptError, match="there is no method 'none'"):
-        pipelines.plan(scene, 200.0, "none")
+        plans.plan(scene, 200.0, "none")
     with pytest.raises(NgptError, match="nothing fits into"):
-        pipelines.plan(scene, 1.0, "wcv", clock=ticking(0.1))
+        plans.plan(scene, 1.0, "wcv", clock=ticking(0.1))
 
 
 def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     """The first two always; and the less time there is, the smaller the images."""
-    from data_gen.choosing import pipelines, trials
+    from data_gen.choosing import plans, trials
 
     scene = load(renderer, "diffuse", (48, 32))
-    monkeypatch.setattr(pipelines, "PIXELS", 24 * 16)
-    monkeypatch.setattr(pipelines, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
+    monkeypatch.setattr(plans, "PIXELS", 24 * 16)
+    monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
     tried, sizes = [], []
 
     def try_out(scene, name, clock, limit):
@@ -154,7 +154,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     for seconds, names, size in ((20.0, 2, (8, 5)), (250.0, 3, (24, 16)), (300.0, 4, (24, 16))):
         tried.clear()
         with pytest.raises(NgptError, match="none of the samplers"):
-            pipelines.plan(scene, seconds, clock=ticking(1.0))
+            plans.plan(scene, seconds, clock=ticking(1.0))
         assert tried == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
 
 

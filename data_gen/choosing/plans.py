@@ -1,0 +1,216 @@
+"""Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
+
+``plan`` is for a time and an image that a method makes: the least error wins. ``plan_sampler`` is for ``--sampler auto``
+where nothing says which method will run: a case of the same with one simple method for each sampler, ``wcv`` where there
+are gradients, else none, and even samples. What it compares is the time to the error that the scene's own sampler is
+expected to have at the end. It chooses photons where they are better beyond doubt, and not in scenes whose light they
+alone can find. What no pilot can see is light that none of the samplers has found.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import mitsuba as mi
+
+from data_gen import samplers
+from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
+from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
+from data_gen.passes import DEFAULT_MEMORY, film_within
+from data_gen.samplers import SAMPLERS
+from data_gen.scenes.facts import scene_facts
+from ngpt.errors import NgptError
+
+# Of the time that there is, after which no further sampler is tried, and what each may take: of an image and of a
+# render, whose seconds are not all there are
+SHARE, DEAREST = 0.1, 0.2
+_SHARE_OF_RENDER, _DEAREST_OF_RENDER = 0.05, 0.15
+# Seconds from which on the pilot's images are as large as they ever are, and the least share of that
+LONG, LEAST_PIXELS = 200.0, 1 / 16
+# Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
+# paths, of which a core or two make a million a second
+_LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
+# A rival must need this much less time: a choice is not worth changing for what chance could have made.
+_MARGIN = 1.1
+
+
+@dataclass(frozen=True)
+class Plan:
+    """How a scene is rendered, and why.
+
+    ``sampler``  its name
+    ``method``   for whose result it was chosen; "" where nothing says which one will run
+    ``shared``   whether samples are shared out
+    ``render``   seconds for the render, those of the pilot and of the method taken off; None: as long as it takes
+    ``reason``   a line for the user
+    """
+
+    sampler: str
+    method: str
+    shared: bool
+    render: float | None
+    reason: str
+
+
+def explore(
+    scene: mi.Scene,
+    seconds: float = LONG,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[Pipeline]:
+    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them."""
+    names = candidates(scene)
+    able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
+    if not able:
+        raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
+    _check_memory(scene, able[0], None, memory)
+    pixels = round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))
+    trials, scale = _tried(scene, able, 2, pixels, lambda *_: (SHARE * seconds, DEAREST * seconds), clock)
+    if not trials:
+        raise NgptError(f"none of the samplers {', '.join(able)} can render the scene")
+    found = measure(trials, clock, lambda sampler: methods_for(sampler, method))
+    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+
+
+def plan(
+    scene: mi.Scene,
+    seconds: float,
+    method: str = "auto",
+    memory: int = DEFAULT_MEMORY,
+    clock: Callable[[], float] = time.perf_counter,
+) -> Plan:
+    """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
+
+    Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
+    then ``primal``, then all unbiased others that ``--sampler auto`` compares, and begins none after a tenth of the
+    time. The less time, the smaller are its images. What it measures changes from run to run. Raises NgptError for a
+    method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
+    """
+    start = clock()
+    whole = explore(scene, seconds, method, memory, clock)
+    left = seconds - (clock() - start)
+    ranked = choose(whole, left)
+    if not ranked:
+        raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
+    first = ranked[0]
+    return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+
+
+def plan_sampler(scene: mi.Scene, spp: int | None, seconds: float | None, memory: int = DEFAULT_MEMORY) -> Plan:
+    """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
+
+    The description alone decides, at no cost, where one sampler alone can render the scene, and where the render is too
+    short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has the bits
+    of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene, and before anything is
+    tried where the image does not fit into ``memory`` (MiB).
+    """
+    start = time.perf_counter()
+    sampler, reason = samplers.choose(scene_facts(scene))
+    described = Plan(sampler, "", False, seconds, reason)
+    names = candidates(scene, biased=True)
+    if len(names) == 1:
+        return described
+    pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+    if (spp is not None and spp * pixels < _LEAST_PATHS) or (seconds is not None and seconds < _LEAST_SECONDS):
+        return replace(described, reason=f"{reason}; the render is too short to try others")
+    _check_memory(scene, sampler, spp, memory)
+
+    def whole(trials: dict[str, Trial], scale: float) -> float:
+        """Seconds of the render, should the scene's own sampler do it; 0 where it cannot."""
+        if sampler not in trials:
+            return 0.0
+        by_samples = math.inf if spp is None else trials[sampler].seconds * spp * scale
+        return min(by_samples, math.inf if seconds is None else seconds)
+
+    def limits(trials: dict[str, Trial], scale: float) -> tuple[float, float]:
+        return _SHARE_OF_RENDER * whole(trials, scale), _DEAREST_OF_RENDER * whole(trials, scale)
+
+    trials, scale = _tried(scene, names, 1, PIXELS, limits)
+    found = (sampler, reason)
+    if trials:
+        found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials, scale) / scale)
+    # However long the pilot took, the render is begun.
+    left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
+    return replace(described, sampler=found[0], reason=found[1], render=left)
+
+
+def _tried(
+    scene: mi.Scene,
+    names: Sequence[str],
+    always: int,
+    pixels: int,
+    limits: Callable[[dict[str, Trial], float], tuple[float, float]],
+    clock: Callable[[], float] = time.perf_counter,
+) -> tuple[dict[str, Trial], float]:
+    """Trials of samplers by name in images of at most so many ``pixels``, and how many times more the scene's own has.
+
+    The first few, ``always``, are tried in any case. ``limits``, asked with their trials and that factor, are the
+    seconds after which no other is begun, and what each of the others may take.
+    """
+    start = clock()
+    with at_most(scene, pixels) as scale:
+        trials = try_all(scene, names[:always], clock=clock)
+        end, dearest = limits(trials, scale)
+        trials |= try_all(scene, names[always:], lambda: clock() - start < end, dearest, clock)
+    return trials, scale
+
+
+def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -> None:
+    """Raises NgptError where the image itself, not the pilot's, does not fit into ``memory`` (MiB)."""
+    entry = SAMPLERS[sampler]
+    film_within(memory, scene.sensors()[0], spp or 1 << 31, entry.lane_bytes, entry.batch)
+
+
+def simple(sampler: str) -> str:
+    """The method by which samplers are compared where nothing says which one will run."""
+    return "wcv" if SAMPLERS[sampler].gradients else "primal"
+
+
+def best_of(pipelines: Sequence[Pipeline], seconds: float) -> tuple[str, str]:
+    """The sampler to take for a render of so many ``seconds``, of the pilot's size, and why; the first is the scene's
+    own."""
+    times, unsure = times_to_the_end(pipelines, seconds), [p.sampler for p in pipelines if p.doubtful]
+    best, why = judge(pipelines[0].sampler, times)
+    if best not in unsure:
+        best, why = judge(pipelines[0].sampler, {name: t for name, t in times.items() if name not in unsure})
+        if unsure:
+            names = " and ".join(f"'{name}'" for name in unsure)
+            why += f"; the others find too little of the light to judge {names}"
+    return best, why
+
+
+def times_to_the_end(pipelines: Sequence[Pipeline], seconds: float) -> dict[str, float]:
+    """Seconds that each sampler takes to the error that the first has after so many of them."""
+    first = pipelines[0]
+    # Of methods as quick as these, what they take is no part.
+    error = first.expected(max(first.least, seconds / first.seconds))
+    return {p.sampler: p.needed(error) * p.seconds for p in pipelines}
+
+
+def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
+    """The sampler of the least of the ``times``, but the ``default`` unless that is clearly worse; and why."""
+    best = min(times, key=lambda name: times[name])
+    if times[best] * _MARGIN > times[default]:
+        best = default
+    others = [f"{times[name] / times[best]:.2g} times as long by '{name}'" for name in times if name != best]
+    found = f"to a given error it takes {', '.join(others)}" if others else "there was time for no other"
+    return best, f"chosen by a pilot: {found}"
+
+
+def _turn(first: str) -> Callable[[str], int]:
+    return lambda name: (first, "primal").index(name) if name in (first, "primal") else 2
+
+
+def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
+    """A line: what is expected of the first, and of the best by each other sampler."""
+    errors: dict[str, tuple[float, Pipeline]] = {}
+    for p in ranked:
+        errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
+    (least, first), *others = errors.values()
+    what = f"expected to leave an error of {math.sqrt(least):.2g} by '{first.method}'"
+    rivals = [f"{math.sqrt(e):.2g} by '{p.sampler}' and '{p.method}'" for e, p in others]
+    return ", ".join([what, *rivals])

@@ -1,0 +1,259 @@
+"""What ``ngpt render`` does, for programs: a scene's stack, and the stacks of a shot's frames.
+
+    stack, plan = data_gen.render_scene("scene.xml", spp=64)
+    stack, plan = data_gen.render_scene(scene, seconds=60, method="auto")  # the method to denoise with: plan.method
+    for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16, camera="path.json"): ...
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from data_gen.backend import DEFAULT_VARIANT, use_variant
+from data_gen.frames.pattern import filled
+from data_gen.samplers import FRAME_SAMPLERS
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+    from data_gen.adaptive import Adaptive
+    from data_gen.choosing.plans import Plan
+    from data_gen.frames.camera_path import CameraPath
+
+DEFAULT_SPP = 32
+
+
+class Rendered(NamedTuple):
+    """A stack, and the plan that it was rendered by."""
+
+    stack: GradientStack
+    plan: Plan
+
+
+def render_scene(
+    scene: mi.Scene | str | Path,
+    spp: int | None = None,
+    seed: int = 0,
+    sampler: str = "auto",
+    *,
+    size: tuple[int, int] | None = None,
+    parameters: Mapping[str, str] | None = None,
+    seconds: float | None = None,
+    adaptive: bool = False,
+    error: float | None = None,
+    method: str | None = None,
+    memory: int | None = None,
+    diagnostics: bool = False,
+    variant: str | None = None,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+    stop: Callable[[], bool] = lambda: False,
+    chosen: Callable[[Plan], None] = lambda plan: None,
+    **options: Any,
+) -> Rendered:
+    """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
+
+    ``size``        (width, height) in pixels, and ``parameters``, the ``<default>`` values: of a file or built-in scene
+    ``spp``         base paths per pixel (32 where nothing else ends the render); with ``adaptive`` their mean
+    ``seconds``     of wall-clock time, compilation included; with ``method`` those of pilot, render and method
+    ``adaptive``    more samples where the error of the result is large
+    ``error``       the same, until the result is expected to have this relative error (0.05: 5 %)
+    ``method``      that will denoise the stack: samples go by its error. With ``seconds`` alone, a pilot chooses the
+                    sampler for it; "auto": the method too
+    ``sampler``     "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own
+    ``memory``      MiB for paths and film, beside the scene (6144)
+    ``diagnostics`` adds rates of failed shifts and discarded values as channels
+    ``variant``     of Mitsuba; by default the current one, or llvm_ad_rgb where none is set
+    ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
+    ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
+                    ``stop_on_ctrl_c``
+    ``chosen``      called before the render with what a pilot or the scene's description has chosen
+
+    The same seed and number of samples give the same bits. Raises NgptError for options that do not exist or make no
+    sense, and for scenes that cannot be loaded or that the sampler cannot render.
+    """
+    _start(variant)
+    from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.render import check_options, render_stack
+
+    memory = DEFAULT_MEMORY if memory is None else memory
+    if spp is None and seconds is None and error is None:
+        spp = DEFAULT_SPP
+    by_itself = sampler == "auto" and seconds is not None and spp is None and not options
+    sharing = _sharing(adaptive, error, method, by_itself)
+    # Before the scene is loaded, which may take long.
+    check_options(spp, seed, sampler, seconds, memory, error is not None)
+    scene = _loaded(scene, size, parameters)
+    pilot = sharing is None and not options and sampler == "auto"
+    plan = _plan(scene, spp, seconds, method if pilot else None, memory) if pilot else None
+    if plan is not None:
+        chosen(plan)
+        sampler, seconds = plan.sampler, plan.render
+        sharing = _adaptive(None, "auto") if plan.shared else None
+    stack = render_stack(
+        scene,
+        spp,
+        seed,
+        sampler,
+        progress,
+        seconds=seconds,
+        memory=memory,
+        stop=stop,
+        diagnostics=diagnostics,
+        adaptive=sharing,
+        **options,
+    )
+    if plan is None:
+        from data_gen.choosing.plans import Plan
+
+        plan = Plan(stack.attributes["ngpt:sampler"], method or "", sharing is not None, seconds, "as it was asked for")
+    elif plan.method:
+        stack.attributes["ngpt:for"] = plan.method
+    return Rendered(stack, plan)
+
+
+def render_frames(
+    scene: str,
+    frames: Sequence[int],
+    spp: int | None = None,
+    seed: int = 0,
+    sampler: str = "auto",
+    *,
+    size: tuple[int, int] | None = None,
+    parameters: Mapping[str, str] | None = None,
+    camera: CameraPath | str | Path | None = None,
+    fps: float = 24.0,
+    dt: int = 0,
+    seconds: float | None = None,
+    memory: int | None = None,
+    diagnostics: bool = False,
+    variant: str | None = None,
+    skip: Callable[[int], bool] = lambda frame: False,
+    stop: Callable[[], bool] = lambda: False,
+    **options: Any,
+) -> Iterator[tuple[int, GradientStack]]:
+    """(frame, its stack with motion vectors) of each of the ``frames`` of a shot, one after the other.
+
+    ``scene``    file or built-in scene; it and the values of ``parameters`` may hold {frame}, {frame:04d}, {frame * 3}
+    ``camera``   its path: key frames (.json), or a file with an animated camera (.glb, .gltf) at so many ``fps``
+    ``dt``       pairs of paths a pixel, 2 or more, for differences to the frame before; 0: none
+    ``seconds``  for each frame
+    ``sampler``  may be one of ``data_gen.samplers.FRAME_SAMPLERS`` too, which reuse the frames before
+    ``skip``     asked when a frame's turn has come whether to leave it out
+    ``stop``     asked after each pass: a frame that is broken off is not given, nor any after it
+
+    All else as of ``render_scene``; ``data_gen.frames.shot`` says more of seeds and motion. A shot that changes by
+    other means than a file's parameters: ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene``, and for
+    cameras without a projection.
+    """
+    if dt == 1:
+        raise NgptError("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
+    parameters = dict(parameters or {})
+
+    def describe(frame: int) -> tuple[str, dict[str, str]]:
+        return filled(scene, frame), {name: filled(text, frame) for name, text in parameters.items()}
+
+    describe(frames[0])
+    _start(variant)
+    from data_gen.frames.camera_path import read_camera_path
+    from data_gen.frames.gltf import read_gltf_camera
+    from data_gen.frames.shot import Shot, render_shot
+    from data_gen.passes import DEFAULT_MEMORY
+    from data_gen.render import check_options
+
+    memory = DEFAULT_MEMORY if memory is None else memory
+    remembers = FRAME_SAMPLERS.get(sampler)
+    if spp is None and (seconds is None or remembers):
+        spp = remembers.spp if remembers else DEFAULT_SPP
+    check_options(spp, seed, "auto" if remembers else sampler, seconds, memory)
+    if isinstance(camera, str | Path):
+        animated = Path(camera).suffix.lower() in (".glb", ".gltf")
+        camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
+    options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics}
+    found = render_shot(Shot(describe, size, camera), frames, spp, seed, dt, skip, sampler=sampler, **options)
+
+    def whole() -> Iterator[tuple[int, GradientStack]]:
+        for frame, stack in found:
+            if stop():
+                return
+            yield frame, stack
+
+    return whole()
+
+
+@contextmanager
+def stop_on_ctrl_c(noted: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
+    """Yields a function that says whether Ctrl-C was pressed, for ``stop``; pressed again, it interrupts as usual.
+
+    ``noted`` is called at once when it is pressed.
+    """
+    pressed = False
+
+    def note(number, frame):
+        nonlocal pressed
+        pressed = True
+        signal.signal(signal.SIGINT, before)
+        noted()
+
+    before = signal.getsignal(signal.SIGINT)
+    if before is signal.SIG_IGN:  # in the background of a script, whose Ctrl-C is not for us
+        yield lambda: False
+        return
+    try:
+        signal.signal(signal.SIGINT, note)
+    except ValueError:  # not in the main thread, where alone signals arrive
+        yield lambda: False
+        return
+    try:
+        yield lambda: pressed
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _start(variant: str | None) -> None:
+    """Has a variant of Mitsuba ready: the one that is asked for, else the current one, else ours."""
+    mitsuba = sys.modules.get("mitsuba")
+    use_variant(variant or (mitsuba.variant() if mitsuba else None) or DEFAULT_VARIANT)
+
+
+def _loaded(scene: mi.Scene | str | Path, size: tuple[int, int] | None, parameters: Mapping[str, str] | None):
+    from data_gen.scenes.load import load_scene
+
+    if isinstance(scene, str | Path):
+        return load_scene(str(scene), size, dict(parameters or {}))
+    if size is not None or parameters:
+        raise NgptError("a scene that is loaded has its size and parameters; load it with them: data_gen.load_scene")
+    return scene
+
+
+def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself: bool) -> Adaptive | None:
+    """How samples are shared out; None: evenly. ``by_itself``: a time is all that is said of samples and sampler."""
+    if adaptive or error is not None:
+        return _adaptive(error, method or "auto")
+    if method is not None and not by_itself:
+        raise NgptError(
+            "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
+            "with --time, and without --sampler, its options and --spp"
+        )
+    return None
+
+
+def _adaptive(error: float | None, method: str) -> Adaptive:
+    from data_gen.adaptive import Adaptive
+
+    return Adaptive(error, method)
+
+
+def _plan(scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int) -> Plan:
+    """By a pilot: of the sampler and the method for so many ``seconds``, or, without a ``method``, of the sampler."""
+    from data_gen.choosing.plans import plan, plan_sampler
+
+    if method is None or seconds is None:
+        return plan_sampler(scene, spp, seconds, memory)
+    return plan(scene, seconds, method, memory)
