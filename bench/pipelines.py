@@ -225,8 +225,8 @@ def true_error(errors: dict[str, float], spp: float) -> float:
 def cells(entry: dict) -> list[dict]:
     """For each time of ``LADDER`` samples of the first sampler: name -> error, the pilot's choice, and the error by the
     sampler that `--sampler auto` chooses over that by the best, both by a simple method."""
-    from data_gen.choosing.plans import best_of, simple
     from data_gen.choosing.pipelines import Pipeline, choose
+    from data_gen.choosing.plans import best_of, simple
 
     pipelines = [Pipeline(**row["pilot"]) for row in entry["rows"]]
     unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])

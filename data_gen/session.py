@@ -1,8 +1,8 @@
 """What ``ngpt render`` does, for programs: a scene's stack, and the stacks of a shot's frames.
 
-    stack, plan = data_gen.render_scene("scene.xml", spp=64)
-    stack, plan = data_gen.render_scene(scene, seconds=60, method="auto")  # the method to denoise with: plan.method
-    for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16, camera="path.json"): ...
+stack, plan = data_gen.render_scene("scene.xml", spp=64)
+stack, plan = data_gen.render_scene(scene, seconds=60, method="auto")  # the method to denoise with: plan.method
+for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16, camera="path.json"): ...
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from data_gen.backend import DEFAULT_VARIANT, use_variant
 from data_gen.frames.pattern import filled
-from data_gen.samplers import FRAME_SAMPLERS
+from data_gen.samplers import FRAME_SAMPLERS, check_options
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 
@@ -80,17 +80,18 @@ def render_scene(
     """
     _start(variant)
     from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_options, render_stack
+    from data_gen.render import check_limits, render_stack
 
     memory = DEFAULT_MEMORY if memory is None else memory
     if spp is None and seconds is None and error is None:
         spp = DEFAULT_SPP
-    by_itself = sampler == "auto" and seconds is not None and spp is None and not options
+    by_itself = sampler == "auto" and seconds is not None and spp is None
     sharing = _sharing(adaptive, error, method, by_itself)
     # Before the scene is loaded, which may take long.
-    check_options(spp, seed, sampler, seconds, memory, error is not None)
+    check_limits(spp, seed, sampler, seconds, memory, error is not None)
+    check_options(sampler, options)
     scene = _loaded(scene, size, parameters)
-    pilot = sharing is None and not options and sampler == "auto"
+    pilot = sharing is None and sampler == "auto"
     plan = _plan(scene, spp, seconds, method if pilot else None, memory) if pilot else None
     if plan is not None:
         chosen(plan)
@@ -165,13 +166,14 @@ def render_frames(
     from data_gen.frames.gltf import read_gltf_camera
     from data_gen.frames.shot import Shot, render_shot
     from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_options
+    from data_gen.render import check_limits
 
     memory = DEFAULT_MEMORY if memory is None else memory
     remembers = FRAME_SAMPLERS.get(sampler)
     if spp is None and (seconds is None or remembers):
         spp = remembers.spp if remembers else DEFAULT_SPP
-    check_options(spp, seed, "auto" if remembers else sampler, seconds, memory)
+    check_limits(spp, seed, "auto" if remembers else sampler, seconds, memory)
+    check_options(sampler, options)
     if isinstance(camera, str | Path):
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
@@ -239,7 +241,7 @@ def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself:
     if method is not None and not by_itself:
         raise NgptError(
             "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
-            "with --time, and without --sampler, its options and --spp"
+            "with --time, and without --sampler and --spp"
         )
     return None
 

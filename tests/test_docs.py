@@ -199,6 +199,14 @@ def test_the_examples_of_python_run(tmp_path, monkeypatch):
     assert made["stack"]["primal"].shape == made["noisy"].shape
 
 
+def test_the_example_of_rendering_runs(renderer, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "use" / "python.md").read_text(), re.S)
+    made: dict = {}
+    exec(blocks[4], made)
+    assert made["image"].shape == (48, 64, 3) and len(list(tmp_path.iterdir())) == 4
+
+
 def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
     import ngpt
     from ngpt.methods import METHODS, Method

@@ -37,7 +37,7 @@ ngpt.training
 ngpt.sequence.train
 ngpt.export
 ngpt.sequence.export
-data_gen data_gen.llvm data_gen.scenes.grids
+data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths data_gen.samplers.registry
 data_gen.passes
@@ -52,9 +52,11 @@ data_gen.choosing.pipelines
 data_gen.choosing.plans
 data_gen.choosing
 data_gen.dataset
+data_gen.session
+data_gen.shot_files
 ngpt.evaluation
 ngpt.cli
-ngpt
+ngpt data_gen
 ngpt.__main__ data_gen.__main__ train eval export
 bench
 scripts
@@ -90,10 +92,10 @@ def floor_of(name: str) -> tuple[int, str]:
     """The floor and the room of a module."""
     rooms = {room: floor for floor, line in enumerate(FLOORS.strip().splitlines()) for room in line.split()}
     parts = name.split(".")
-    # The face of the package is a room of its own: it hands on what all others have.
+    # The face of a package is a room of its own: it hands on what all others have.
     for end in range(len(parts), 0, -1):
         room = ".".join(parts[:end])
-        if room in rooms and (room != "ngpt" or name == "ngpt"):
+        if room in rooms and (room not in ("ngpt", "data_gen") or name == room):
             return rooms[room], room
     raise AssertionError(f"{name} stands in no room: give it one in FLOORS")
 

@@ -1,10 +1,10 @@
 """Which sampler, how many samples and which method: chosen by a pilot, small renders by each sampler that could do it.
 
-``plan`` is for a time and an image that a method makes: the least error wins. ``plan_sampler`` is for ``--sampler auto``
-where nothing says which method will run: a case of the same with one simple method for each sampler, ``wcv`` where there
-are gradients, else none, and even samples. What it compares is the time to the error that the scene's own sampler is
-expected to have at the end. It chooses photons where they are better beyond doubt, and not in scenes whose light they
-alone can find. What no pilot can see is light that none of the samplers has found.
+``plan`` is for a time and an image that a method makes: the least error wins. ``plan_sampler`` is for ``--sampler
+auto`` where nothing says which method will run: a case of the same with one simple method for each sampler, ``wcv``
+where there are gradients, else none, and even samples. What it compares is the time to the error that the scene's own
+sampler is expected to have at the end. It chooses photons where they are better beyond doubt, and not in scenes whose
+light they alone can find. What no pilot can see is light that none of the samplers has found.
 """
 
 from __future__ import annotations
@@ -132,7 +132,9 @@ def plan_sampler(scene: mi.Scene, spp: int | None, seconds: float | None, memory
     trials, scale = _tried(scene, names, 1, PIXELS, limits)
     found = (sampler, reason)
     if trials:
-        found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials, scale) / scale)
+        found = best_of(
+            measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials, scale) / scale
+        )
     # However long the pilot took, the render is begun.
     left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
     return replace(described, sampler=found[0], reason=found[1], render=left)

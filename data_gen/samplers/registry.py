@@ -93,7 +93,7 @@ class Sampler(Entry):
     ``gradients``   whether it renders dx and dy
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
     ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene: those that were
-                    seen to be chosen where they are best (``data_gen.choosing.pilot``)
+                    seen to be chosen where they are best (``data_gen.choosing.plans``)
     ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
     ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass

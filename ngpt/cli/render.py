@@ -2,23 +2,19 @@
 
 import argparse
 import shlex
-import signal
-from collections.abc import Callable, Iterator
-from concurrent.futures import as_completed
-from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
-from data_gen.samplers import FRAME_SAMPLERS, by_standing, check_options
+from data_gen.frames.pattern import filled, varies
+from data_gen.samplers import by_standing
+from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
+from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
-from ngpt.cli.frame_patterns import filled, frames, targets, varies
+from ngpt.cli.frame_patterns import frames, targets
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
-
-DEFAULT_SPP = 32
-# Of a cluster: frames that a worker renders with one scene in memory, and kernels compiled once.
-FRAMES_OF_A_PART = 8
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -121,11 +117,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    if args.frames:
-        report = on_cluster(args, console) if args.cluster else render_frames(args, console)
-        if report is not None and args.json:
-            print_json(report)
-        return 0 if report is not None else 130
+    return shot(args, console) if args.frames else image(args, console)
+
+
+def asked(args: argparse.Namespace) -> dict[str, Any]:
+    """What ``render_scene`` and ``render_frames`` both take, by their names."""
+    given = {
+        name: getattr(args, name) for name in ("spp", "seed", "sampler", "size", "memory", "diagnostics", "variant")
+    }
+    return given | {"seconds": args.time, "parameters": dict(args.define), **dict(args.option)}
+
+
+def image(args: argparse.Namespace, console: Console) -> int:
+    """One stack."""
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
@@ -136,227 +140,75 @@ def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force)
     if target.suffix.lower() != ".exr":
         raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
-    # Only the verbs that render import the renderer.
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
 
-    use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.adaptive import Adaptive
-    from data_gen.choosing.pilot import choose_by_pilot
-    from data_gen.choosing.pipelines import plan
-    from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_limits, render_stack
-    from data_gen.scenes.load import load_scene
+    def chosen(plan) -> None:
+        how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
+        console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
 
-    spp = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
-    memory = args.memory or DEFAULT_MEMORY
-    adaptive = sharing(args)
-    # Before the scene is loaded, which may take long.
-    check_limits(spp, args.seed, args.sampler, args.time, memory, args.error is not None)
-    check_options(args.sampler, dict(args.option))
-    scene = load_scene(args.scene, args.size, dict(args.define))
-    sampler, seconds, planned = args.sampler, args.time, None
-    # A pilot compares samplers at even samples, and may choose one that renders no others.
-    if args.method is not None and adaptive is None:
-        planned = plan(scene, args.time, args.method, memory)
-        sampler, seconds, adaptive = planned.sampler, planned.render, Adaptive() if planned.shared else None
-        shared = ", samples shared out" if planned.shared else ""
-        console.say(f"{args.scene}: sampler '{sampler}'{shared}, method '{planned.method}': {planned.reason}")
-    elif sampler == "auto" and adaptive is None:
-        choice = choose_by_pilot(scene, spp, seconds, memory)
-        sampler = choice.sampler
-        console.say(f"{args.scene}: sampler '{sampler}': {choice.reason}")
-        seconds = seconds and max(seconds - choice.seconds, 1e-3)
-    with console.progress(f"render {args.scene}", "s" if args.time else "spp") as progress, stop_on_ctrl_c() as stop:
-        stack = render_stack(
-            scene,
-            spp,
-            args.seed,
-            sampler,
-            progress,
-            seconds=seconds,
-            memory=memory,
+    unit = "s" if args.time else "spp"
+    with console.progress(f"render {args.scene}", unit) as progress, stop_on_ctrl_c(ending) as stop:
+        stack, plan = render_scene(
+            args.scene,
+            adaptive=args.adaptive,
+            error=args.error,
+            method=args.method,
+            progress=progress,
             stop=stop,
-            diagnostics=args.diagnostics,
-            adaptive=adaptive,
-            **dict(args.option),
+            chosen=chosen,
+            **asked(args),
         )
-    if planned:
-        stack.attributes["ngpt:for"] = planned.method
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     write(target, stack, overwrite=args.force)
     done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
-    interrupted = stop() and done != spp
     if args.error is not None and "ngpt:error" in stack.attributes:
         expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
         short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
-    if interrupted:
+    if interrupted := stop() and done != args.spp:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
-    if planned:
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {planned.method}")
+    if "ngpt:for" in stack.attributes:
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {plan.method}")
     if args.json:
-        ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
-        print_json({"output": str(target), "width": stack.width, "height": stack.height, "layers": stack.names} | ours)
+        print_json(report_of(stack, target) | {"layers": stack.names})
     return 130 if interrupted else 0
 
 
-def sharing(args: argparse.Namespace):
-    """How samples are shared out; None: evenly."""
-    if args.error is None and not args.adaptive:
-        if args.method is not None and (args.sampler != "auto" or args.time is None or args.spp is not None):
-            raise NgptError(
-                "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
-                "with --time, and without --sampler and --spp"
-            )
-        return None
-    from data_gen.adaptive import Adaptive
-
-    return Adaptive(args.error, args.method or "auto")
-
-
-def on_cluster(args: argparse.Namespace, console: Console) -> dict:
-    """``render_frames`` in parts, each on a worker of a Dask cluster; what is there already is not made again."""
-    if args.shard:
-        raise NgptError("--cluster shares the frames out by itself; leave --shard out")
-    for target in targets(args.output, args.scene, args.frames).values():
-        check_output(target, args.force or args.skip_existing)
-    from data_gen.dataset.jobs import cluster
-
-    parts = -(-len(args.frames) // FRAMES_OF_A_PART)
-    # A part that is tried again, since its worker died, goes on.
-    each = vars(args) | {"cluster": None, "skip_existing": args.skip_existing or not args.force}
-    reports: dict = {"frames": [], "skipped": 0}
-    with cluster(args.cluster) as workers, console.progress(f"render {args.scene}", "frames") as progress:
-        progress(0, len(args.frames))
-        futures = [workers.submit(_render_part, each | {"shard": (i, parts)}) for i in range(parts)]
-        for future in as_completed(futures):
-            report = future.result()
-            reports = {name: reports[name] + report[name] for name in reports}
-            progress(len(reports["frames"]) + reports["skipped"], len(args.frames))
-    reports["frames"].sort(key=lambda report: args.frames.index(report["frame"]))
-    return reports
-
-
-def _render_part(args: dict) -> dict:
-    report = render_frames(argparse.Namespace(**args), Console(quiet=True))
-    if report is None:
-        raise NgptError("a worker was interrupted; run the same command with --skip-existing to continue")
-    return report
-
-
-def render_frames(args: argparse.Namespace, console: Console) -> dict | None:
-    """A stack for each frame of ``--frames``, or of the part of them in ``--shard``: what ``--json`` prints of them.
-
-    None where it was interrupted.
-    """
+def shot(args: argparse.Namespace, console: Console) -> int:
+    """A stack for each frame."""
     if args.adaptive or args.error is not None or args.method is not None:
         raise NgptError("--adaptive, --error and --for are for single images; leave them out with --frames")
-    places = targets(args.output, args.scene, args.frames)
-    number, parts = args.shard or (0, 1)
-    # Of frames side by side, each needs the scene of the one before.
-    part_of = {frame: i * parts // len(places) for i, frame in enumerate(places)}
-    ours = [frame for frame in places if part_of[frame] == number]
-    for frame in ours:
-        check_output(places[frame], args.force or args.skip_existing)
-    define = dict(args.define)
+    files = targets(args.output, args.scene, args.frames)
+    more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
+    more |= {"overwrite": args.force, "skip_existing": args.skip_existing, **asked(args)}
+    with console.progress(f"render {args.scene}", "frames") as progress, stop_on_ctrl_c(ending) as stop:
+        said = 0
 
-    def describe(frame: int) -> tuple[str, dict[str, str]]:
-        return filled(args.scene, frame), {name: filled(text, frame) for name, text in define.items()}
+        def made(written: Written, total: int) -> None:
+            nonlocal said
+            for report in written.frames[said:]:
+                frame, what = report["frame"], "{width}x{height}, {spp} spp, {seconds:.2f} s".format(**report)
+                if report["discarded"]:
+                    console.say(f"frame {frame}: {report['discarded']} non-finite values were left out")
+                console.say(f"{filled(args.scene, frame)} frame {frame} -> {report['output']}: {what}")
+            said = len(written.frames)
+            progress(written.done, total)
 
-    if args.dt == 1:
-        raise NgptError("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
-    describe(args.frames[0])
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.frames.camera_path import read_camera_path
-    from data_gen.frames.gltf import read_gltf_camera
-    from data_gen.frames.sequence import Shot, render_sequence
-    from data_gen.passes import DEFAULT_MEMORY
-    from data_gen.render import check_limits
-
-    spp = args.spp or (DEFAULT_SPP if args.time is None else None)
-    memory = args.memory or DEFAULT_MEMORY
-    sampler = args.sampler
-    if args.sampler in FRAME_SAMPLERS:
-        spp, sampler = args.spp or FRAME_SAMPLERS[args.sampler].spp, "auto"
-    check_limits(spp, args.seed, sampler, args.time, memory)
-    check_options(args.sampler, dict(args.option))
-    camera = None
-    if args.camera:
-        animated = Path(args.camera).suffix.lower() in (".glb", ".gltf")
-        camera = read_gltf_camera(args.camera, args.fps) if animated else read_camera_path(args.camera)
-    shot = Shot(describe, args.size, camera)
-    reports, skipped = [], 0
-
-    def skip(frame: int) -> bool:
-        # Only when its turn has come, for several machines may be at work on one sequence.
-        nonlocal skipped
-        if part_of[frame] != number:
-            return True
-        there = args.skip_existing and places[frame].exists()
-        skipped += there
-        return there
-
-    with console.progress(f"render {args.scene}", "frames") as progress, stop_on_ctrl_c() as stop:
-        progress(0, len(ours))
-        for frame, stack in render_sequence(
-            shot,
-            args.frames,
-            spp,
-            args.seed,
-            args.dt,
-            skip,
-            sampler=args.sampler,
-            seconds=args.time,
-            memory=memory,
-            stop=stop,
-            diagnostics=args.diagnostics,
-            **dict(args.option),
-        ):
-            done, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
-            if stop():
-                console.error(f"interrupted: frame {frame} is left out; --skip-existing goes on with it")
-                return None
-            if stack.attributes["ngpt:discarded"]:
-                console.say(f"frame {frame}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
-            target = places[frame]
-            # Another machine may have been faster.
-            if not (args.skip_existing and target.exists()):
-                write(target, stack, overwrite=args.force)
-            size = f"{stack.width}x{stack.height}"
-            console.say(f"{describe(frame)[0]} frame {frame} -> {target}: {size}, {done} spp, {seconds:.2f} s")
-            made = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
-            reports.append({"output": str(target), "width": stack.width, "height": stack.height} | made)
-            progress(len(reports) + skipped, len(ours))
-    if skipped:
-        console.say(f"{skipped} of {len(ours)} frames were skipped: their stacks are there")
-    return {"frames": reports, "skipped": skipped}
+        if args.cluster:
+            written = write_frames_on_cluster(args.cluster, args.scene, files, shard=args.shard, made=made, **more)
+        else:
+            shard = args.shard or (0, 1)
+            written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
+    if written.interrupted is not None:
+        console.error(f"interrupted: frame {written.interrupted} is left out; --skip-existing goes on with it")
+        return 130
+    if written.skipped:
+        console.say(f"{written.skipped} of {written.done} frames were skipped: their stacks are there")
+    if args.json:
+        print_json({"frames": written.frames, "skipped": written.skipped})
+    return 0
 
 
-@contextmanager
-def stop_on_ctrl_c() -> Iterator[Callable[[], bool]]:
-    """Yields a function that says whether Ctrl-C was pressed; pressed again, it interrupts as usual."""
-    pressed = False
-
-    def note(number, frame):
-        nonlocal pressed
-        pressed = True
-        signal.signal(signal.SIGINT, before)
-        Console().say("interrupted: ending with this pass; press Ctrl-C again to discard it all")
-
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN:  # in the background of a script, whose Ctrl-C is not for us
-        yield lambda: False
-        return
-    try:
-        signal.signal(signal.SIGINT, note)
-    except ValueError:  # not in the main thread, where alone signals arrive
-        yield lambda: False
-        return
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
+def ending() -> None:
+    Console().say("interrupted: ending with this pass; press Ctrl-C again to discard it all")

@@ -331,7 +331,7 @@ def test_ctrl_c_keeps_what_was_rendered_and_twice_discards_it(renderer, tmp_path
 
 
 def test_ctrl_c_is_ignored_where_whoever_started_it_said_so():
-    from ngpt.cli.render import stop_on_ctrl_c
+    from data_gen.session import stop_on_ctrl_c
 
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 import ngpt
+from data_gen.frames.pattern import filled
 from ngpt.cli import main
-from ngpt.cli.frame_patterns import filled, frames, targets
+from ngpt.cli.frame_patterns import frames, targets
 from ngpt.errors import NgptError
 
 
@@ -113,11 +114,11 @@ def test_parts_of_a_sequence_are_its_frames(renderer, tmp_path, monkeypatch, cap
 
 
 def test_a_cluster_renders_the_parts_that_are_missing(renderer, tmp_path, monkeypatch, capsys):
+    from data_gen import shot_files
     from data_gen.dataset import jobs
-    from ngpt.cli import render
 
     monkeypatch.setattr(jobs, "cluster", lambda address: jobs.Serial())
-    monkeypatch.setattr(render, "FRAMES_OF_A_PART", 2)
+    monkeypatch.setattr(shot_files, "FRAMES_OF_A_PART", 2)
     whole = parts(renderer, tmp_path, "whole", monkeypatch)
     cluster = ["--cluster", "tcp://nowhere:1", "--json"]
     assert list(parts(renderer, tmp_path, "farm", monkeypatch, *cluster)) == list(whole)

@@ -109,7 +109,7 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     assert list(results["methods"]) == names
     cells = {(cell["method"], cell["seed"]): cell for cell in results["cells"]}
     # What cannot be compared is a row that says why.
-    assert "unknown sampler 'ppn'; choose one of: auto, gpt" in cells["primal (ppn)", 0]["absent"]
+    assert "unknown sampler 'ppn'; did you mean 'ppm'? choose one of: auto, gpt" in cells["primal (ppn)", 0]["absent"]
     # Equal time: a sample of gpt-basic costs more, so there are fewer of them; those of gpt, which "auto" is, count.
     costs = results["scenes"]["diffuse"]["cost"]
     assert costs["gradients"]["sampler"] == "gpt" and costs["gradients gpt-basic"]["sampler"] == "gpt-basic"

@@ -1,0 +1,67 @@
+"""Text that changes from frame to frame: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``."""
+
+import ast
+import math
+import operator
+import re
+from collections.abc import Callable
+
+from ngpt.errors import NgptError
+
+# {frame}, {frame:04d}, {10 + frame * 3:.2f}
+_FIELD = re.compile(r"\{([^{}:]+)(?::([^{}]*))?\}")
+_OPERATORS: dict[type, Callable] = {
+    ast.Add: operator.add,
+    ast.Sub: operator.sub,
+    ast.Mult: operator.mul,
+    ast.Div: operator.truediv,
+    ast.FloorDiv: operator.floordiv,
+    ast.Mod: operator.mod,
+    ast.USub: operator.neg,
+    ast.UAdd: operator.pos,
+}
+_FUNCTIONS: dict[str, Callable] = {"sin": math.sin, "cos": math.cos, "min": min, "max": max}
+
+
+def varies(text: str) -> bool:
+    """Whether a text is another one in another frame."""
+    return any("frame" in field for field, _ in _FIELD.findall(text))
+
+
+def filled(text: str, frame: int) -> str:
+    """The text with its fields replaced: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``.
+
+    A field is a number, ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min, max, and how to write it, as in
+    Python. Raises NgptError for anything else.
+    """
+
+    def value(match: re.Match) -> str:
+        field, form = match.groups()
+        try:
+            number = _value(ast.parse(field.strip(), mode="eval").body, frame)
+            if form and form[-1] in "dxX" and number == int(number):
+                number = int(number)
+            return format(number, form or "")
+        except NgptError as error:
+            raise NgptError(f"'{text}': {error}") from error
+        except (SyntaxError, ValueError, ArithmeticError, TypeError) as error:
+            raise NgptError(f"'{text}': {match[0]} cannot be computed for frame {frame}: {error}") from error
+
+    return _FIELD.sub(value, text)
+
+
+def _value(node: ast.expr, frame: int):
+    if isinstance(node, ast.Constant) and isinstance(node.value, int | float) and not isinstance(node.value, bool):
+        return node.value
+    if isinstance(node, ast.Name) and node.id in ("frame", "pi"):
+        return frame if node.id == "frame" else math.pi
+    if isinstance(node, ast.BinOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)](_value(node.left, frame), _value(node.right, frame))
+    if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
+        return _OPERATORS[type(node.op)](_value(node.operand, frame))
+    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS:
+        return _FUNCTIONS[node.func.id](*(_value(argument, frame) for argument in node.args))
+    raise NgptError(
+        f"'{ast.unparse(node)}' is not known in {{}}; known are numbers, frame, pi, + - * / // %, brackets, "
+        f"{', '.join(_FUNCTIONS)}"
+    )
