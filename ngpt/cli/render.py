@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.frames.pattern import filled, varies
-from data_gen.samplers import by_standing
+from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
@@ -122,10 +122,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    given = {
-        name: getattr(args, name) for name in ("spp", "seed", "sampler", "size", "memory", "diagnostics", "variant")
-    }
-    return given | {"seconds": args.time, "parameters": dict(args.define), **dict(args.option)}
+    names = ("spp", "seed", "sampler", "size", "memory", "diagnostics", "variant")
+    options = dict(args.option)
+    check_options(args.sampler, options)  # so that none of them goes by another's name
+    given = {name: getattr(args, name) for name in names}
+    return given | {"seconds": args.time, "parameters": dict(args.define)} | options
 
 
 def image(args: argparse.Namespace, console: Console) -> int:
