@@ -5,7 +5,7 @@
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
 docs/lab/RESULTS.md, docs/use/evaluation.md, docs/methods/methods.md and the model cards. Without a folder it writes
-them anew from that file, all but the list of every cell.
+them anew from that file.
 """
 
 import argparse
@@ -47,7 +47,6 @@ def main() -> None:
     args = parser.parse_args()
     if args.folder:
         save(RESULT, kept(json.loads((args.folder / "results.json").read_text())))
-        write_page(ROOT / "docs" / "lab" / "RESULTS.md", every_cell(args.folder / "results.md"), marks("every cell"))
     for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
         write_page(ROOT / page, text, marks(name))
 
@@ -63,11 +62,6 @@ def kept(results: dict) -> dict:
     table = worth_tables(results | {"worth": worth})
     facts = {name: results[name] for name in ("command", "date", "metadata")}
     return {"benchmark": "main", **facts, "cells": cells_of(results), "worth": list(table.values())}
-
-
-def every_cell(page: Path) -> str:
-    """All of results.md but its title."""
-    return page.read_text().partition("\n\n")[2].rstrip()
 
 
 def blocks(result: dict) -> dict[tuple[str, str], str]:
