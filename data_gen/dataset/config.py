@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, field
 from glob import glob
 from pathlib import Path
+from typing import Any
 
-from data_gen.samplers import find
+from data_gen.samplers import check_options, find
 from data_gen.scenes.procedural.variety import SHARES
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
@@ -33,6 +34,7 @@ class Config:
     frames: int = 1
     spp: tuple[int, int] = (2, 64)
     sampler: str = "gpt"
+    samplers: dict[str, dict[str, Any]] = field(default_factory=dict)
     roll: float = 20.0
     lens: float = 0.005
     crops_per_shard: int = 4
@@ -67,6 +69,10 @@ class Config:
         ):
             if bad:
                 raise NgptError(f"data configuration: {text}")
+        for name, options in self.samplers.items():
+            if name != self.sampler:
+                raise NgptError(f"data configuration: samplers.{name}: this set is rendered by '{self.sampler}'")
+            check_options(name, options)
         if self.adaptive:
             self._check_adaptive()
         if self.sampler == "auto":
@@ -76,6 +82,11 @@ class Config:
                 f"data configuration: reference_method '{self.reference_method}' needs gradients, and sampler "
                 f"'{self.sampler}' renders none; use 'oidn', or 'primal' with many samples"
             )
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """Those of the sampler."""
+        return self.samplers.get(self.sampler, {})
 
     def _check_adaptive(self) -> None:
         from data_gen.adaptive import LEAST  # It needs the renderer.

@@ -107,7 +107,8 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool) -> Gr
     from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
-    stack = render_stack(scene, spp, seed, config.sampler, adaptive=Adaptive() if uneven else None)
+    adaptive = Adaptive() if uneven else None
+    stack = render_stack(scene, spp, seed, config.sampler, adaptive=adaptive, **config.options)
     if config.adaptive and "samples" not in stack:
         stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
     return stack
@@ -178,7 +179,7 @@ def _crop(
     seconds = {"inputs": time.perf_counter() - clock}
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
-    halves = [render_stack(scene, spp, seed, config.sampler) for seed in seeds[-HALVES:]]
+    halves = [render_stack(scene, spp, seed, config.sampler, **config.options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]

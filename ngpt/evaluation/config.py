@@ -7,11 +7,12 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
+from data_gen.samplers import SAMPLERS, find
 from ngpt.errors import NgptError
 from ngpt.evaluation.renders import KINDS, Render
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
-from ngpt.system.records import from_table, read_toml
+from ngpt.system.records import check, from_table, read_toml
 
 # Of which seeds pictures are kept.
 IMAGES = ("first", "all", "none")
@@ -26,6 +27,7 @@ class Column:
     ``name``     in tables: the family, and the sampler in brackets where several are compared
     ``family``   what the configuration calls it: a method or a variant
     ``method``   in ``ngpt.methods.METHODS``; another name makes a row that says so
+    ``sampler``  what the configuration calls the one of ``render``
     ``render``   what it is given
     ``options``  of the method
     """
@@ -33,6 +35,7 @@ class Column:
     name: str
     family: str
     method: str
+    sampler: str
     render: Render
     options: dict[str, Any] = field(default_factory=dict)
 
@@ -63,6 +66,7 @@ class Config:
     references: dict[str, Any] = field(default_factory=dict)
     groups: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
+    sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         low = min((*self.spp, self.seeds, *self.size, self.timing_spp, self.timing_repeats), default=0)
@@ -87,6 +91,8 @@ class Config:
                 raise NgptError(f"evaluation: variants.{name}: stack must be one of {', '.join(KINDS)}")
             if "method" not in table:
                 raise NgptError(f"evaluation: variants.{name}: method is missing: which one it is a variant of")
+        for name in self.sampler_options:
+            self.sampler(name)
         for name, files in self.references.items():
             if not isinstance(files, str) and (not isinstance(files, list) or [type(f) for f in files] != [str, str]):
                 raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two halves")
@@ -109,7 +115,27 @@ class Config:
         kind = kind or ("gradients" if "dx" in layers else "features" if len(layers) > 1 else "path")
         samplers = (sampler,) if sampler else self.samplers if kind == "gradients" else self.rivals
         names = [f"{name} ({sampler})" if len(samplers) > 1 else name for sampler in samplers]
-        return [Column(n, name, method, _render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
+        return [Column(n, name, method, s, self.render(kind, s), table) for n, s in zip(names, samplers, strict=True)]
+
+    def render(self, kind: str, sampler: str) -> Render:
+        """A kind of stack by one of the samplers; features are left out where they can be, by that of the image alone.
+
+        Raises NgptError for a sampler's options that it does not take.
+        """
+        name, given = self.sampler(sampler)
+        return Render("features" if kind == "path" and name != KINDS["path"] else kind, name, given)
+
+    def sampler(self, name: str) -> tuple[str, str]:
+        """What the registry calls the sampler that is called ``name`` here, and its options that are not defaults."""
+        table = dict(self.sampler_options.get(name, {}))
+        if not table:
+            return name, ""
+        own = table.pop("sampler", name)
+        try:
+            entry = find(own)
+            return own, entry.unusual(entry.settings(table))
+        except NgptError as error:
+            raise NgptError(f"evaluation: samplers.{name}: {error}") from None
 
     def scene_files(self) -> dict[str, str]:
         """Name -> built-in scene, scene file or folder of stacks; patterns are resolved."""
@@ -129,9 +155,8 @@ class Config:
         return asdict(self)
 
 
-def _render(kind: str, sampler: str) -> Render:
-    """Features are left out where they can be: by the sampler that the image alone is usually rendered by."""
-    return Render("features" if kind == "path" and sampler != KINDS["path"] else kind, sampler)
+def _has_gradients(sampler: str) -> bool:
+    return sampler not in SAMPLERS or SAMPLERS[sampler].gradients
 
 
 def file_part(column: str) -> str:
@@ -146,5 +171,13 @@ def scene_name(scene: str) -> str:
 
 
 def read_config(path: str | Path) -> Config:
-    """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type."""
-    return from_table(Config, read_toml(path), str(path))
+    """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
+
+    ``samplers`` may be tables of options: those of samplers with gradients are compared, others are for ``rivals``.
+    """
+    values = read_toml(path)
+    if isinstance(tables := values.get("samplers"), dict):
+        check(tables, {str: dict}, f"{path}: samplers")
+        with_gradients = [name for name, table in tables.items() if _has_gradients(table.get("sampler", name))]
+        values |= {"samplers": with_gradients or [KINDS["gradients"]], "sampler_options": tables}
+    return from_table(Config, values, str(path))

@@ -14,19 +14,30 @@ KINDS = {"gradients": "auto", "features": "primal", "path": "primal"}
 
 @dataclass(frozen=True)
 class Render:
-    """A kind of stack by a sampler; ``name`` is what files, costs and results call it."""
+    """A kind of stack by a sampler, with options of it that are not its defaults: "radius=1, photons=2".
+
+    ``name`` is what files, costs and results call it.
+    """
 
     kind: str
     sampler: str
+    given: str = ""
 
     @property
     def name(self) -> str:
-        return self.kind if self.sampler == KINDS[self.kind] else f"{self.kind} {self.sampler}"
+        return f"{self.kind} {self.by}".strip()
+
+    @property
+    def by(self) -> str:
+        """Sampler and options where they are not the usual ones of the kind, else ""."""
+        usual = self.sampler == KINDS[self.kind] and not self.given
+        return "" if usual else " ".join([self.sampler, *filter(None, self.given.split(", "))])
 
     @property
     def options(self) -> dict[str, Any]:
         """Arguments of ``data_gen.render.render_stack``."""
-        return {"sampler": self.sampler} | ({"with_features": False} if self.kind == "path" else {})
+        given: dict[str, Any] = dict(option.split("=") for option in self.given.split(", ") if option)
+        return {"sampler": self.sampler} | given | ({"with_features": False} if self.kind == "path" else {})
 
 
 # What every scene is measured with, so that tables say what gradients cost.

@@ -62,7 +62,7 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
                 "method": column.method,
                 "family": column.family,
                 "stack": column.render.kind,
-                "sampler": column.render.sampler,
+                "sampler": column.sampler,
                 "render": column.render.name,
                 "options": column.options,
                 "absent": lacks[column.name] or None,

@@ -2,9 +2,10 @@
 
 The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
 files, the size, the code that renders, and Mitsuba's version. In it are RENDER-SPP-SEED.exr, where RENDER is a kind of
-stack ("gradients"), followed by the sampler where it is not the usual one ("gradients-gpt-basic"), and SPP the number
-of samples that were rendered; the two halves of references, reference-*-a.exr and -b.exr; and cost-*.json. A folder of
-stacks of one's own looks the same, without the costs; its reference may be one image.
+stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are some
+("gradients-gpt-shift=manifold"), and SPP the number of samples that were rendered; the two halves of references,
+reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
+reference may be one image.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
 from ngpt.evaluation.keys import renderer_hash, scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
-from ngpt.evaluation.renders import DEFAULTS, KINDS, Render
+from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
 from ngpt.stack import GradientStack
 from ngpt.system.machine import version
@@ -68,8 +69,9 @@ class SceneStacks:
         if self.given:
             return find_reference(self.folder)
         limit = f"{config.reference_spp}spp" if config.reference_spp else f"{config.reference_seconds:g}s"
-        by = "" if config.reference_sampler == KINDS["path"] else f"{config.reference_sampler}-"
-        paths = [self.folder / f"reference-{by}{limit}{half}.exr" for half in HALVES]
+        render = config.render("features", config.reference_sampler)
+        name = "-".join(["reference", *render.by.split(), limit])
+        paths = [self.folder / f"{name}{half}.exr" for half in HALVES]
         for i, path in enumerate(paths):
             if not path.exists():
                 self.say(f"{self.name}: rendering the reference, half {i + 1} of {limit}")
@@ -78,8 +80,7 @@ class SceneStacks:
 
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
-                sampler = config.reference_sampler
-                write(path, render_stack(scene, spp, REFERENCE_SEED + i, sampler, seconds=seconds))
+                write(path, render_stack(scene, spp, REFERENCE_SEED + i, seconds=seconds, **render.options))
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
@@ -121,11 +122,11 @@ class SceneStacks:
     @property
     def clock(self) -> Render:
         """The render whose samples the nominal numbers count."""
-        return self.resolve(Render(USUAL.kind, self.config.clock))
+        return self.resolve(self.config.render(USUAL.kind, self.config.clock))
 
     def resolve(self, render: Render) -> Render:
         """``render``, or the usual one where "auto" stands for its sampler on this scene; after ``costs``."""
-        return USUAL if (render.kind, render.sampler) == (USUAL.kind, self._auto) else render
+        return USUAL if render == Render(USUAL.kind, self._auto) else render
 
     def samples(self, render: Render, spp: int, costs: Costs) -> int:
         """How many samples the time of ``spp`` of the clock's buys; two at least, or two batches, for a variance."""

@@ -67,6 +67,11 @@ def test_configurations_can_be_read():
         ("scenes = 1\nadaptive = 1\nspp = [2, 16]", "fewer than 32 samples cannot be shared out; spp goes up to 16"),
         ("scenes = 1\nadaptive = 1\nframes = 2", "frames of shots have even samples"),
         ("scenes = 1\nadaptive = 1\nsampler = 'gbdpt'", "the samples of 'gbdpt' depend on each other; use 'gpt'"),
+        (
+            "scenes = 1\n[samplers.gpt]\nshift = 'x'",
+            "sampler 'gpt', option 'shift': 'x' is not allowed",
+        ),
+        ("scenes = 1\n[samplers.ppm]\nradius = 1", r"samplers\.ppm: this set is rendered by 'gpt'"),
         ("spp = 3", r"spp = 3: must be a list of 2 whole numbers, like \[2, 64\]"),
         ("[[files]]\npattern = 3\ncrops = 1", r"\[files\]\[0\]: pattern = 3: must be a string"),
         ("[[files]]\ncrops = 1", r"\[files\]\[0\]: lacks 'pattern'"),

@@ -262,6 +262,8 @@ def test_memory_stays_within_its_budget(renderer, name):
 
 def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     import ngpt
+    from data_gen.dataset.config import read_config
+    from data_gen.dataset.crops import render_input
     from data_gen.inspect import inspect_scene
     from data_gen.render import render_stack
     from data_gen.scenes.facts import Facts
@@ -298,6 +300,10 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
     assert by_command.attributes["ngpt:sampler"] == "toy"
     assert by_command.attributes["ngpt:samplerOptions"] == by_python.attributes["ngpt:samplerOptions"] == "share=0.25"
     same(by_command, by_python)
+    (tmp_path / "data.toml").write_text("scenes = 1\nsampler = 'toy'\n[samplers.toy]\nshare = 0.25\n")
+    by_config = render_input(read_config(tmp_path / "data.toml"), scene, 4, 0, False)
+    assert by_config.attributes["ngpt:samplerOptions"] == "share=0.25"
+    same(by_config, by_python)
 
 
 def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):

@@ -9,7 +9,7 @@ from folders import read, write_scene
 
 import ngpt
 from ngpt.errors import NgptError
-from ngpt.evaluation.config import Config
+from ngpt.evaluation.config import Config, read_config
 from ngpt.evaluation.renders import Render
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.stacks import SceneStacks
@@ -41,6 +41,61 @@ def test_methods_appear_once_for_each_sampler_of_their_kind_of_stack():
         "oidn (primal)": ("oidn", "features"),
         "oidn (ppm)": ("oidn", "features ppm"),
     }
+
+
+def test_tables_of_samplers_are_their_options(tmp_path):
+    """Under names of their own where two are of one sampler; options are part of what stacks are cached as."""
+    text = """
+        scenes = ["diffuse"]
+        methods = ["primal", "wcv"]
+        rivals = ["primal", "ppm"]
+        clock = "gpt"
+        [samplers.gpt]
+        caustic = true
+        [samplers.gpt-followed]
+        sampler = "gpt"
+        shift = "manifold"
+        [samplers.ppm]
+        radius = 1
+        photons = 2
+    """
+    (tmp_path / "eval.toml").write_text(text)
+    config = read_config(tmp_path / "eval.toml")
+    assert {column.name: (column.render.name, column.sampler) for column in config.columns()} == {
+        "primal (primal)": ("path", "primal"),
+        "primal (ppm)": ("features ppm radius=1 photons=2", "ppm"),
+        "wcv (gpt)": ("gradients gpt", "gpt"),
+        "wcv (gpt-followed)": ("gradients gpt shift=manifold", "gpt-followed"),
+    }
+    assert config.render("path", "ppm").options == {"sampler": "ppm", "radius": "1", "photons": "2"}
+    (tmp_path / "eval.toml").write_text(text.replace("radius = 1", "radius = -1"))
+    with pytest.raises(NgptError, match=r"samplers\.ppm: sampler 'ppm', option 'radius': '-1' is not allowed"):
+        read_config(tmp_path / "eval.toml")
+    (tmp_path / "eval.toml").write_text(text.replace('sampler = "gpt"', 'sampler = "gtp"'))
+    with pytest.raises(NgptError, match=r"samplers\.gpt-followed: unknown sampler 'gtp'; did you mean 'gpt'"):
+        read_config(tmp_path / "eval.toml")
+
+
+def test_options_of_samplers_reach_the_stacks(renderer, tmp_path):
+    config = Config(
+        scenes=("diffuse",),
+        size=(16, 12),
+        spp=(4,),
+        seeds=1,
+        methods=("wcv",),
+        metrics=("relMSE",),
+        primary="relMSE",
+        samplers=("gpt", "joined"),
+        clock="gpt",
+        reference_spp=16,
+        timing_spp=4,
+        timing_repeats=1,
+        sampler_options={"joined": {"sampler": "gpt", "reuse": True}},
+    )
+    cells = evaluate(config, tmp_path, QUIET, "")["cells"]
+    assert {cell["method"] for cell in cells} == {"wcv (gpt)", "wcv (joined)"} and not any(c["absent"] for c in cells)
+    stacks = sorted((tmp_path / "cache").rglob("gradients-*reuse*.exr"))
+    assert stacks and all(ngpt.read(file).attributes["ngpt:samplerOptions"] == "reuse=true" for file in stacks)
 
 
 def test_a_variant_names_its_own_sampler():
