@@ -26,8 +26,8 @@ class Ends:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.light_ends import LightEnds
         from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.lights import LightEnds
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, cosine
 
         self.mi, self.dr, self.scene, self.η, self.connectable = mi, dr, scene, η, connectable

@@ -66,8 +66,8 @@ def light_vertices(mi, scene, spp):
     """Camera samples of a 16x16 image with what is kept of their light paths: (camera, kept, count)."""
     from data_gen.film.splats import Splats
     from data_gen.paths.camera import CameraSamples
+    from data_gen.paths.light_ends import LightEnds
     from data_gen.samplers.bdpt.integrator import Splatter
-    from data_gen.samplers.bdpt.lights import LightEnds
     from data_gen.samplers.common import like_path
 
     camera = CameraSamples(scene.sensors()[0], 0, spp)

@@ -34,7 +34,7 @@ def long_passes(monkeypatch):
 def test_lights_seen_from_elsewhere_are_the_same_lights(renderer):
     """Mitsuba 3.9 forgets the emitter of a direction sample that is copied: then all weights are of the first one."""
     from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers.bdpt.lights import LightEnds
+    from data_gen.paths.light_ends import LightEnds
 
     mi, scene = renderer, load(renderer, SCENES["points"], (16, 16))
     lights, camera = LightEnds(scene), CameraSamples(scene.sensors()[0], 0, 16)
@@ -117,9 +117,9 @@ class Paths:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.light_ends import LightEnds
         from data_gen.paths.vertex import Materials
         from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.lights import LightEnds
         from data_gen.samplers.bdpt.vertex import Vertex, cosine
         from data_gen.samplers.common import like_path
         from data_gen.samplers.gbdpt.base_path import Plan, base_step
@@ -582,8 +582,8 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
 
     from data_gen.film.splats import Splats
     from data_gen.paths.camera import CameraSamples
+    from data_gen.paths.light_ends import LightEnds
     from data_gen.samplers.bdpt.light_path import Seen, pixel_at
-    from data_gen.samplers.bdpt.lights import LightEnds
     from data_gen.samplers.bdpt.strategies import to_camera
     from data_gen.samplers.common import like_path
     from data_gen.samplers.gbdpt.light_again import Marker, light_again, marked

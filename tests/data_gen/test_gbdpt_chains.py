@@ -38,8 +38,8 @@ class Bent:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.light_ends import LightEnds
         from data_gen.paths.vertex import Materials
-        from data_gen.samplers.bdpt.lights import LightEnds
         from data_gen.samplers.bdpt.vertex import Vertex
         from data_gen.samplers.gbdpt.base_path import Plan, base_step
         from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight

@@ -47,9 +47,9 @@ class Caustics:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.light_ends import LightEnds
         from data_gen.paths.vertex import Materials
         from data_gen.samplers.bdpt import mis
-        from data_gen.samplers.bdpt.lights import LightEnds
         from data_gen.samplers.bdpt.strategies import to_camera
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves, scatters_smoothly
         from data_gen.samplers.common import like_path

@@ -132,9 +132,9 @@ def assert_copies_are_light_paths(mi, name, receivers):
     import drjit as dr
 
     from data_gen.paths import media
+    from data_gen.paths.light_ends import LightEnds, LightRay
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
-    from data_gen.samplers.bdpt.lights import LightEnds, LightRay
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
     from data_gen.samplers.photons.gradients.copies import Photon, photon_of, start_of
     from data_gen.samplers.photons.map.fog import Fog

@@ -51,9 +51,9 @@ def maps_of(mi, scene, paths=4096, max_depth=6):
     """The maps of so many light paths, and the light's end of them."""
     import drjit as dr
 
+    from data_gen.paths.light_ends import LightEnds
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
-    from data_gen.samplers.bdpt.lights import LightEnds
     from data_gen.samplers.photons.map.trace import trace
 
     random = sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0))

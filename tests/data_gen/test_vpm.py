@@ -128,7 +128,7 @@ def test_the_medium_around_a_lamp_is_found(renderer):
     """Behind walls too, and on either side of a boundary."""
     import drjit as dr
 
-    from data_gen.samplers.bdpt.lights import LightEnds
+    from data_gen.paths.light_ends import LightEnds
     from data_gen.samplers.photons.map.fog import Fog
 
     mi = renderer

@@ -31,12 +31,12 @@ from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import NULL, event_kind
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.light_path import Seen, Visitor, light_path
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connected, emission_at, to_light
 from data_gen.samplers.bdpt.vertex import (
     RADIANCE,

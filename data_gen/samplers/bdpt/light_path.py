@@ -10,8 +10,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import (

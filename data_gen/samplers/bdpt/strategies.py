@@ -13,8 +13,8 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate
 
 

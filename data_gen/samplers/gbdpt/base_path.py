@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.manifold import event
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly

@@ -36,13 +36,13 @@ from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples, in_packets
 from data_gen.paths.features import features
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.choice import choose
 from data_gen.samplers.bdpt.integrator import BDPT, refuse
 from data_gen.samplers.bdpt.light_path import Visitor
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.bdpt.strategies import connection
 from data_gen.samplers.bdpt.vertex import (
     Vertex,

@@ -14,11 +14,11 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film.splats import Splats
+from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.paths.manifold import event, prepend_event
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
 from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on, unmerged
-from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import record, record_class
 from data_gen.samplers.gbdpt.pairs import weighted

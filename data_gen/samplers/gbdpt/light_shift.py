@@ -15,11 +15,11 @@ import mitsuba as mi
 from data_gen.film import SHIFTS
 from data_gen.film.splats import Splats
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightRay
 from data_gen.paths.manifold import Target, follow, walk
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.light_path import pixel_at
-from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, scatters_smoothly

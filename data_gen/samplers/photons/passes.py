@@ -5,13 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-import mitsuba as mi
-
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.frozen import Frozen
-from data_gen.paths.vertex import Materials
-from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.paths.world import World
 
 
 @dataclass
@@ -23,14 +20,12 @@ class Passes:
     """
 
     integrator: Any
-    scene: mi.Scene
-    lights: LightEnds
-    materials: Materials
+    world: World
     width: float  # of a pixel
     frozen: Frozen = field(init=False)
 
     def __post_init__(self) -> None:
-        self.frozen = Frozen(self.scene, self.lights, self.materials, self.integrator)
+        self.frozen = Frozen(self.world.scene, self.world, self.integrator)
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
         self.integrator.sample_pass(self, camera, film)

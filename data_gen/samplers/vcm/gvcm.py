@@ -57,15 +57,15 @@ class GVCM(VCM):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One light path, one camera path, and all their shifts for each camera sample, of which a pixel has one."""
-        scene, frozen = passes.scene, passes.frozen
+        scene, frozen = passes.world.scene, passes.frozen
         rays = [camera.rays(shift) for shift in ((0, 0), *SHIFTS.values())]
         random = camera.random.clone()
         dr.eval(rays)
         (ray, importance, _), *shifted = rays
         values = frozen(features, scene, camera.sensor, camera.random.clone(), ray, fixed=True)
-        ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        ends = scene, passes.world.lights, passes.world.materials, camera.sensor, camera.lens
         photons = None
-        if self.vertices and passes.lights.emitters is not None:
+        if self.vertices and passes.world.lights.emitters is not None:
             random, photons, marks = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
             self.shift_splats(passes, camera, film, marks, photons.η)
         L, Le, Δ = frozen(self.seen_shifted, *ends, random, rays, photons, fixed=True)
@@ -79,7 +79,7 @@ class GVCM(VCM):
     def shift_splats(self, passes: Passes, camera: CameraSamples, film: GradientFilm, marks: mi.UInt64, η) -> None:
         """Splats the differences of light paths that end at ``marked`` vertices, as ``gbdpt`` does."""
         lanes, depths = marked(marks, self.longest)
-        ends = passes.scene, passes.lights, passes.materials, camera.sensor
+        ends = passes.world.scene, passes.world.lights, passes.world.materials, camera.sensor
         splats = [film.splats(name) for name in SHIFTS]
         for shift in (self.straight_splats, self.bent_splats):
             if not dr.width(lanes):
@@ -91,7 +91,7 @@ class GVCM(VCM):
             dr.eval(sums, is_bent)
             for one, added in zip(splats, sums, strict=True):
                 one.take(added)
-            if passes.materials.all_connectable:
+            if passes.world.materials.all_connectable:
                 return
             few = dr.compress(is_bent)
             lanes, depths = dr.gather(mi.UInt32, lanes, few), dr.gather(mi.UInt32, depths, few)

@@ -35,11 +35,12 @@ from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
+from data_gen.paths.world import World
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
-from data_gen.samplers.bdpt.lights import LightEnds
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes
@@ -102,17 +103,18 @@ class VCM(BDPT):
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)
         refuse_camera(scene, self.name)
-        return Passes(self, scene, LightEnds(scene, self.name), Materials(scene, self.threshold), pixel_width(scene))
+        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
+        return Passes(self, world, pixel_width(scene))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One light path and one camera path for each camera sample, of which a pixel has one."""
-        scene, frozen = passes.scene, passes.frozen
+        scene, frozen = passes.world.scene, passes.frozen
         (ray, importance, _), random = camera.rays(), camera.random.clone()
         dr.eval(ray, importance)
         values = frozen(features, scene, camera.sensor, camera.random, ray, fixed=True)
-        ends = scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        ends = scene, passes.world.lights, passes.world.materials, camera.sensor, camera.lens
         photons = None
-        if self.vertices and passes.lights.emitters is not None:
+        if self.vertices and passes.world.lights.emitters is not None:
             random, photons, _ = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
         L, Le = frozen(self.seen, *ends, random, ray, importance, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
@@ -123,7 +125,7 @@ class VCM(BDPT):
         """Traces and splats them: random numbers to go on by, the photons, and the splatter's state."""
         n, radius = dr.width(camera.pixel), self.radius * passes.width * shrunk(camera.first)
         kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
-        ends = passes.scene, passes.lights, passes.materials, camera.sensor, camera.lens
+        ends = passes.world.scene, passes.world.lights, passes.world.materials, camera.sensor, camera.lens
         path = random, ray, importance, kept, η
         numbers, sums, kept, state = passes.frozen(self.lit, *ends, *path, fixed=True, sums=splats.zeros)
         dr.eval(numbers, sums, kept, state)

@@ -22,7 +22,7 @@ import mitsuba as mi
 
 from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
-from data_gen.samplers.bdpt.lights import LightEnds, LightRay
+from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, context, evaluate
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.map.trace import vertex_in_media_of, vertex_of

@@ -16,9 +16,9 @@ import numpy as np
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightRay
 from data_gen.paths.shift import gradient_weight
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.photons.gradients.camera import Level, Path
 from data_gen.samplers.photons.gradients.copies import copy, is_near, light, photon_of
 from data_gen.samplers.photons.gradients.pairs import Pairs, Points, pieces
@@ -164,7 +164,7 @@ def entered(all_of_it: list, values: list, low: mi.UInt32) -> list:
 
 def maps_of(integrator, passes: Passes, keys, number: int) -> Iterator:
     """What is near in the photon maps of pass ``number``."""
-    if passes.lights.emitters is not None and integrator.max_depth > 1:
+    if passes.world.lights.emitters is not None and integrator.max_depth > 1:
         starts, maps = integrator.photon_maps(passes, keys)
         for photons in maps:
             yield from integrator.gathered(passes, starts, photons, number, integrator.photons * dr.width(keys[0]))
@@ -175,11 +175,11 @@ def differences(passes, near, base, offsets: list, longest: mi.UInt32, most: int
 
     ``longest``: edges that the light path of a photon may have, of each base path.
     """
-    frozen, kind, ends = passes.frozen, type(near), (passes.scene, passes.lights, passes.materials)
-    points, receives = frozen(kind.where, near, passes.materials, base)
+    frozen, kind, ends = passes.frozen, type(near), (passes.world.scene, passes.world.lights, passes.world.materials)
+    points, receives = frozen(kind.where, near, passes.world.materials, base)
     dr.eval(points, receives)
     for pairs in pieces(near.grid, points, near.radius2, receives, most, frozen):
-        values, apart = frozen(kind.of_pairs, near, passes.materials, pairs, base, offsets, longest)
+        values, apart = frozen(kind.of_pairs, near, passes.world.materials, pairs, base, offsets, longest)
         dr.eval(values, apart)
         C, *Δ, counts = values
         places = [dr.compress(one) for one in apart]

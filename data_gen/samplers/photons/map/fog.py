@@ -7,8 +7,8 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths import segments
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.media import Media, extinction, pick, vertex
-from data_gen.samplers.bdpt.lights import LightEnds
 from ngpt.errors import NgptError
 
 

@@ -19,9 +19,9 @@ import mitsuba as mi
 
 from data_gen.paths import media
 from data_gen.paths.frozen import call
+from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.paths.segments import next_surface
 from data_gen.paths.vertex import SMOOTH, event_kind
-from data_gen.samplers.bdpt.lights import LightEnds, LightRay
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, context, light_sampled
 
 if TYPE_CHECKING:

@@ -223,7 +223,7 @@ class BEAMS(BRE):
     def gatherings(self, passes: Passes, keys, number: int):
         if self.fog is None:
             yield from super().gatherings(passes, keys, number)
-        elif passes.lights.emitters is not None and self.max_depth > 1:
+        elif passes.world.lights.emitters is not None and self.max_depth > 1:
             paths = self.photons * dr.width(keys[0])
             _, maps = self.photon_maps(passes, keys)
             for photons in maps:
@@ -242,7 +242,7 @@ class BEAMS(BRE):
 def parts_of(passes: Passes, fog: Fog, photons, radius: float, most: int) -> Iterator[Any]:
     """The beams of a map in parts, at most so many at a time, and some that are empty if there are none."""
     kind, rate = parts_class(mi.variant()), dr.opaque(mi.Float, 1 / (PART * radius))
-    count = passes.frozen(counted, passes.scene, fog, photons, rate)
+    count = passes.frozen(counted, passes.world.scene, fog, photons, rate)
     first = dr.prefix_sum(count)
     dr.eval(count, first)
     total = int(dr.sum(count)[0])
@@ -251,7 +251,7 @@ def parts_of(passes: Passes, fog: Fog, photons, radius: float, most: int) -> Ite
         parts = kind(*(dr.zeros(t, size) for t in get_type_hints(kind).values()))
         dr.make_opaque(parts)
         part = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
-        parts = passes.frozen(entered, passes.scene, fog, photons, rate, first, part, parts)
+        parts = passes.frozen(entered, passes.world.scene, fog, photons, rate, first, part, parts)
         dr.eval(parts)
         yield parts
 

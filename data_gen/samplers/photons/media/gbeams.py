@@ -24,7 +24,7 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS
 from data_gen.passes import SamplePass
-from data_gen.samplers.bdpt.lights import LightRay
+from data_gen.paths.light_ends import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import Piece

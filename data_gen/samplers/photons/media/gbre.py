@@ -30,7 +30,7 @@ import numpy as np
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
-from data_gen.samplers.bdpt.lights import LightRay
+from data_gen.paths.light_ends import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera import Level
@@ -213,15 +213,15 @@ class GBRE(BRE):
         yield Both(Near(*near), AlongPieces(*near))
 
     def levels(self, passes: Passes, random, rays: list) -> Iterator:
-        paths = passes.materials, random, rays, self.first_surface, self.hide_emitters
-        return levels_in_media(passes.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
+        paths = passes.world.materials, random, rays, self.first_surface, self.hide_emitters
+        return levels_in_media(passes.world.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
     def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
         if not level.first:
             pieces = level.depth, level.base, level.offsets
-            add_to(sums, level.lanes, passes.frozen(emitted_later, passes.scene, self.fog, *pieces))
+            add_to(sums, level.lanes, passes.frozen(emitted_later, passes.world.scene, self.fog, *pieces))
             return mi.Spectrum(0)
-        return passes.frozen(self.seen_directly, passes.scene, level.base, fixed=True)
+        return passes.frozen(self.seen_directly, passes.world.scene, level.base, fixed=True)
 
     def seen_directly(self, scene, base: Piece) -> mi.Spectrum:
         """Lamps as seen through media."""

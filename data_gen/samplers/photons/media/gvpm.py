@@ -28,8 +28,8 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightRay
 from data_gen.paths.shift import gradient_weight
-from data_gen.samplers.bdpt.lights import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera import Path
@@ -136,16 +136,16 @@ class GVPM(VPM):
         yield Both(on_surfaces, InBalls(self.fog, starts, photons, radius * shrunk(number, 3), paths))
 
     def levels(self, passes: Passes, random, rays: list) -> Iterator:
-        paths = passes.materials, random, rays, self.first_surface, self.behind_grids, self.hide_emitters
-        return levels_by_segments(passes.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
+        paths = passes.world.materials, random, rays, self.first_surface, self.behind_grids, self.hide_emitters
+        return levels_by_segments(passes.world.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
     def met(self, passes: Passes, level: FlightLevel, sums: list) -> mi.Spectrum:
         if not level.first:
-            add_to(sums, level.lanes, passes.frozen(emitted, passes.scene, level.base, level.offsets))
+            add_to(sums, level.lanes, passes.frozen(emitted, passes.world.scene, level.base, level.offsets))
             return mi.Spectrum(0)
         if level.behind:
             add_to(sums, level.lanes, passes.frozen(differences_behind, level.behind, level.offsets))
-        return passes.frozen(self.seen_directly, passes.scene, *level.camera, fixed=True)
+        return passes.frozen(self.seen_directly, passes.world.scene, *level.camera, fixed=True)
 
     def seen_directly(self, scene, ray: mi.Ray3f, importance) -> mi.Spectrum:
         """Lamps as seen through media."""

@@ -180,12 +180,12 @@ def planes_of(passes: Passes, photons, paths: int) -> AcrossPlanes:
     number = dr.width(edges)
     if number:
         weight = dr.opaque(mi.Float, lanes / (taken * paths))
-        planes = passes.frozen(swept, passes.scene, photons, edges, weight)
+        planes = passes.frozen(swept, passes.world.scene, photons, edges, weight)
     else:
         planes = kind(*(dr.zeros(t, 1) for t in get_type_hints(kind).values()))
     dr.eval(planes)
     counts = dr.opaque(mi.UInt32, number), dr.opaque(mi.UInt32, integrator.max_depth)
-    return AcrossPlanes(passes.scene, integrator.fog, planes, *counts)
+    return AcrossPlanes(passes.world.scene, integrator.fog, planes, *counts)
 
 
 def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):

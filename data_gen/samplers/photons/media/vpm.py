@@ -26,8 +26,9 @@ import numpy as np
 
 from data_gen.passes import SamplePass
 from data_gen.paths import media
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.vertex import Materials
-from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
@@ -111,7 +112,7 @@ class VPM(PPM):
             self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * (3 + 3 + 3) * 4
         passed = media.index_matched if self.fog else lambda shape: False
         materials = Materials(scene, self.threshold, passed, media=self.fog is not None)
-        return Passes(self, scene, lights, materials, pixel_width(scene))
+        return Passes(self, World(scene, lights, materials, self.fog), pixel_width(scene))
 
     def gathering(self, photons, width: float, number: int, paths: int):
         on_surfaces = super().gathering(photons, width, number, paths)

@@ -27,7 +27,7 @@ import mitsuba as mi
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
-from data_gen.samplers.bdpt.lights import LightRay
+from data_gen.paths.light_ends import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients.camera import Level, levels
 from data_gen.samplers.photons.gradients.camera import Path as CameraPath
@@ -72,15 +72,15 @@ class GPM(PPM):
 
     def levels(self, passes: Passes, random, rays: list) -> Iterator[Level]:
         """The camera paths that begin with ``rays``, level after level."""
-        paths = passes.materials, random, rays, self.first_hit, self.hide_emitters
-        return levels(passes.scene, *paths, self.max_depth, self.rr_depth, passes.frozen)
+        paths = passes.world.materials, random, rays, self.first_hit, self.hide_emitters
+        return levels(passes.world.scene, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
     def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
         """What is seen directly, at the first level; emission that paths meet at others is added to the ``sums``."""
         if not level.first:
-            add_to(sums, level.lanes, passes.frozen(emitted, passes.scene, level.base, level.offsets))
+            add_to(sums, level.lanes, passes.frozen(emitted, passes.world.scene, level.base, level.offsets))
         elif self.max_depth > 0:
-            return passes.frozen(CameraPath.emission, level.base, passes.scene, fixed=True)
+            return passes.frozen(CameraPath.emission, level.base, passes.world.scene, fixed=True)
         return mi.Spectrum(0)
 
     def parts(self, passes: Passes, near, level: Level, most: int) -> Iterator[list]:

@@ -31,11 +31,12 @@ from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
-from data_gen.samplers.bdpt.lights import LightEnds
+from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.photons.gradients.copies import faces, light, photon_of
@@ -128,15 +129,15 @@ class PPM(GradientIntegrator):
 
     def prepare(self, scene) -> SamplePass:
         refuse(scene, self.name)
-        lights, materials = LightEnds(scene, self.name), Materials(scene, self.threshold)
-        return Passes(self, scene, lights, materials, pixel_width(scene))
+        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
+        return Passes(self, world, pixel_width(scene))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One photon map, and one camera path for each camera sample, of which a pixel has one."""
         ray, importance, random, keys, values = begin(passes, camera)
         near = self.gatherings(passes, keys, camera.first)
         # Emission that camera paths meet is counted with the first map, or without any.
-        paths = passes.scene, passes.materials, random, ray, importance
+        paths = passes.world.scene, passes.world.materials, random, ray, importance
         L, Le = passes.frozen(self.light, *paths, next(near, None), True, fixed=True)
         values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         dr.eval(values)
@@ -148,7 +149,7 @@ class PPM(GradientIntegrator):
 
     def gatherings(self, passes: Passes, keys, number: int):
         """What light is gathered from in each of the photon maps of pass ``number``."""
-        if passes.lights.emitters is not None and self.max_depth > 1:
+        if passes.world.lights.emitters is not None and self.max_depth > 1:
             _, maps = self.photon_maps(passes, keys)
             for photons in maps:
                 yield self.gathering(photons, passes.width, number, self.photons * dr.width(keys[0]))
@@ -164,9 +165,9 @@ class PPM(GradientIntegrator):
         sample = lane // dr.opaque(mi.UInt32, self.photons)
         key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
         random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        receives, depths = passes.materials.connectable, (self.max_depth - 1, self.rr_depth)
+        receives, depths = passes.world.materials.connectable, (self.max_depth - 1, self.rr_depth)
         edges = self.edges and self.fog is not None
-        return trace(passes.scene, passes.lights, random, receives, *depths, self.fog, passes.frozen, edges)
+        return trace(passes.world.scene, passes.world.lights, random, receives, *depths, self.fog, passes.frozen, edges)
 
     def light(self, scene, materials, random, ray, importance, near, emission: bool):
         """L and Le of camera paths, with what is gathered from photons ``near``, and with ``emission`` or without."""
@@ -235,7 +236,7 @@ def begin(passes: Passes, camera: CameraSamples) -> tuple:
     keys = random.next_key(), random.next_key()
     random.schedule_state()
     dr.eval(ray, importance, keys)
-    values = passes.frozen(features, passes.scene, camera.sensor, camera.random, ray, fixed=True)
+    values = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
     return ray, importance, random, keys, values
 
 
