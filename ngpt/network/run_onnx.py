@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
-from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
+from ngpt.network import tiles
 from ngpt.network.exposure import statistics
 from ngpt.network.inputs import OPTIONAL, WITH_EMISSION
 from ngpt.system.limits import free_address_space, processors
@@ -129,8 +129,8 @@ class Network:
     def _less(self, size: tuple[int, int], memory: int, batch: int, error: NgptError) -> int:
         """Half of what the tiles took that were too large; raises ``error`` where they cannot be smaller."""
         _, (rows, columns) = self.plan(*size, memory, batch)
-        (*_, (_, low)), (*_, (_, narrow)) = (self._cuts(n) for n in size)
-        used, least = (area * self.bytes * batch / 2**20 for area in (rows * columns, low * narrow))
+        areas = rows * columns, tiles.smallest(size, self.alignment, self.overlap)
+        used, least = (area * self.bytes * batch / 2**20 for area in areas)
         less = max(int(used / 2), math.ceil(least))
         if less >= used:
             raise error
@@ -151,14 +151,14 @@ class Network:
         if missing:
             raise NgptError(f"network {self.path} needs layers {', '.join(missing)}, which are not given")
         height, width = layers["primal"].shape[:2]
-        tiles, (rows, columns) = self.plan(height, width, memory, batch)
+        pieces, (rows, columns) = self.plan(height, width, memory, batch)
         shared = statistics(layers)
         image = np.empty((height, width, 3), np.float32)
-        progress(0, len(tiles))
-        for first in range(0, len(tiles), batch):
+        progress(0, len(pieces))
+        for first in range(0, len(pieces), batch):
             if stop():
-                raise Cancelled(f"network {self.path}: stopped after {first} of {len(tiles)} tiles")
-            group = tiles[first : first + batch]
+                raise Cancelled(f"network {self.path}: stopped after {first} of {len(pieces)} tiles")
+            group = pieces[first : first + batch]
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
             if self.asks_for_direct:
@@ -167,45 +167,19 @@ class Network:
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]
                 image[inner_y, inner_x] = np.moveaxis(part, 0, -1)
-            progress(min(first + batch, len(tiles)), len(tiles))
+            progress(min(first + batch, len(pieces)), len(pieces))
         return image
 
     def plan(self, height: int, width: int, memory: int, batch: int = 1) -> tuple[list[tuple], tuple[int, int]]:
-        """Tiles (rows, columns, top, left) and their common size (height, width): the least work within ``memory``.
-
-        ``rows`` and ``columns`` are what a tile is for, ``top`` and ``left`` where it begins.
-        """
-        most = memory * 2**20 // (self.bytes * batch)
-        best: tuple | None = None
-        down, across = (self._cuts(n) for n in (height, width))
-        for ys, tall in down:
-            fitting = [(xs, wide) for xs, wide in across if tall * wide <= most]
-            if fitting:
-                xs, wide = fitting[0]
-                work = len(ys) * len(xs) * tall * wide
-                if best is None or work < best[0]:
-                    best = work, ys, xs, tall, wide
-        if best is None:
-            needed = -(-down[-1][1] * across[-1][1] * self.bytes * batch // 2**20)
-            raise NgptError(
-                f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed; "
-                "allow more (--memory, ulimit -v)"
-            )
-        _, ys, xs, tall, wide = best
-        return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
-
-    def _cuts(self, length: int) -> list[tuple[list[tuple[slice, int]], int]]:
-        """Ways to cut a side, coarsest first: what each piece is for and where it begins, and how long all are."""
-        cuts: list[tuple[list[tuple[slice, int]], int]] = []
-        for count in range(1, max(1, length // self.alignment) + 1):
-            step = -(-length // (count * self.alignment)) * self.alignment
-            # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment.
-            size = min(step + 2 * self.overlap + length % self.alignment, length)
-            starts = range(0, length, step)
-            pieces = [(slice(n, min(n + step, length)), min(max(n - self.overlap, 0), length - size)) for n in starts]
-            if not cuts or size < cuts[-1][1]:
-                cuts.append((pieces, size))
-        return cuts
+        """The tiles of ``ngpt.network.tiles.plan`` within ``memory`` MiB, and their common size (height, width)."""
+        size = height, width
+        if found := tiles.plan(size, self.alignment, self.overlap, memory * 2**20 // (self.bytes * batch)):
+            return found
+        needed = -(-tiles.smallest(size, self.alignment, self.overlap) * self.bytes * batch // 2**20)
+        raise NgptError(
+            f"network {self.path}: its smallest tile takes {needed} MiB, and {memory} MiB are allowed; "
+            "allow more (--memory, ulimit -v)"
+        )
 
     def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
         try:

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ngpt.errors import NgptError
-from ngpt.network import features, inputs, padding
+from ngpt.network import features, inputs, padding, tiles
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.network.weights import load_weights
@@ -63,7 +63,7 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
     spans = (_spans(length, tile, model.alignment, model.radius) for length in (rows, columns))
     for (y, y_around), (x, x_around) in product(*spans):
         part = {name: layer[..., y_around, x_around].to(device) for name, layer in padded.items()}
-        inner = np.s_[..., _within(y, y_around), _within(x, x_around)]
+        inner = np.s_[..., tiles.within(y, y_around), tiles.within(x, x_around)]
         logarithm[..., y, x] = model.predict(part)[inner].to(logarithm.device)
     image = padding.crop(logarithm, pads)
     return signed_exp(torch.minimum(torch.maximum(image, low), high)) * exposure
@@ -72,17 +72,8 @@ def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TIL
 def _spans(length: int, tile: int, alignment: int, radius: int) -> list[tuple[slice, slice]]:
     """What each tile is for, and what it needs to see for that; all divisible by ``alignment``."""
     margin = -(-radius // alignment) * alignment
-    if length <= tile:
-        return [(slice(0, length), slice(0, length))]
-    step = max(tile - 2 * margin, alignment) // alignment * alignment
-    return [
-        (slice(a, min(a + step, length)), slice(max(a - margin, 0), min(a + step + margin, length)))
-        for a in range(0, length, step)
-    ]
-
-
-def _within(inner: slice, outer: slice) -> slice:
-    return slice(inner.start - outer.start, inner.stop - outer.start)
+    step = max(tile - 2 * margin, alignment) // alignment * alignment if length > tile else length
+    return tiles.spans(length, step, margin)
 
 
 def _loaded(path: str | Path, device: str) -> Reconstructor:

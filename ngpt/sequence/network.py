@@ -23,7 +23,7 @@ import numpy as np
 from scipy.ndimage import gaussian_filter
 
 from ngpt.errors import NgptError
-from ngpt.network import run, run_onnx
+from ngpt.network import run, run_onnx, tiles
 from ngpt.network.describe import FRAMES
 from ngpt.network.exposure import statistics
 from ngpt.sequence.evidence import Evidence
@@ -146,11 +146,9 @@ class Network:
         padded = np.pad(inputs, [(0, -height % self.alignment), (0, -width % self.alignment), (0, 0)], mode="edge")
         rows = max(STRIP // padded.shape[1] // self.alignment, 1) * self.alignment
         result = np.empty((*padded.shape[:2], BANDS), np.float32)
-        for top in range(0, len(padded), rows):
-            first = max(top - self.overlap, 0)
-            part = run_onnx.planes(padded[first : top + rows + self.overlap])
-            (made,) = self._session.run(None, {"inputs": part[None]})
-            result[top : top + rows] = np.moveaxis(made[0, :, top - first : top - first + rows], 0, -1)
+        for strip, around in tiles.spans(len(padded), rows, self.overlap):
+            (made,) = self._session.run(None, {"inputs": run_onnx.planes(padded[around])[None]})
+            result[strip] = np.moveaxis(made[0, :, tiles.within(strip, around)], 0, -1)
         return result[:height, :width]
 
 

@@ -1,0 +1,68 @@
+"""Where images are cut for networks: tiles for ONNX Runtime, spans for PyTorch and for the network that blends frames.
+
+What a network says of a pixel depends on pixels as far as its reach. So a piece shows the network a margin around what
+it is for, and begins at multiples of the network's alignment: where an image is cut does not change the result.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+# Of a side: what each piece is for, and where it begins; and how long all of them are.
+Cuts = tuple[list[tuple[slice, int]], int]
+
+
+def spans(length: int, step: int, margin: int) -> list[tuple[slice, slice]]:
+    """Pieces of a side: what each is for, ``step`` long, and what it shows, ``margin`` more on both ends."""
+    return [
+        (slice(first, min(first + step, length)), slice(max(first - margin, 0), min(first + step + margin, length)))
+        for first in range(0, length, step)
+    ]
+
+
+def within(inner: slice, outer: slice) -> slice:
+    """Where the one lies in the other."""
+    return slice(inner.start - outer.start, inner.stop - outer.start)
+
+
+def plan(
+    size: tuple[int, int], alignment: int, overlap: int, most: int
+) -> tuple[list[tuple[slice, slice, int, int]], tuple[int, int]] | None:
+    """Tiles (rows, columns, top, left) and their common (height, width): the least work with ``most`` pixels a tile.
+
+    ``size`` is (height, width); ``rows`` and ``columns`` are what a tile is for, ``top`` and ``left`` where it begins.
+    None where the smallest tile has more pixels.
+    """
+    best: tuple | None = None
+    down, across = (_cuts(n, alignment, overlap) for n in size)
+    for ys, tall in down:
+        fitting = [(xs, wide) for xs, wide in across if tall * wide <= most]
+        if fitting:
+            xs, wide = fitting[0]
+            work = len(ys) * len(xs) * tall * wide
+            if best is None or work < best[0]:
+                best = work, ys, xs, tall, wide
+    if best is None:
+        return None
+    _, ys, xs, tall, wide = best
+    return [(y, x, top, left) for (y, top), (x, left) in product(ys, xs)], (tall, wide)
+
+
+def smallest(size: tuple[int, int], alignment: int, overlap: int) -> int:
+    """Pixels of the smallest tile."""
+    (*_, (_, low)), (*_, (_, narrow)) = (_cuts(n, alignment, overlap) for n in size)
+    return low * narrow
+
+
+def _cuts(length: int, alignment: int, overlap: int) -> list[Cuts]:
+    """Ways to cut a side, coarsest first."""
+    cuts: list[Cuts] = []
+    for count in range(1, max(1, length // alignment) + 1):
+        step = -(-length // (count * alignment)) * alignment
+        # All of one size, which is why the last ones begin earlier, and all at multiples of the alignment.
+        size = min(step + 2 * overlap + length % alignment, length)
+        starts = range(0, length, step)
+        pieces = [(slice(n, min(n + step, length)), min(max(n - overlap, 0), length - size)) for n in starts]
+        if not cuts or size < cuts[-1][1]:
+            cuts.append((pieces, size))
+    return cuts
