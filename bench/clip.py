@@ -3,7 +3,7 @@
     python -m bench.clip --scene glossy --cache out/clip --picture docs/images/shot.webp
 
 All three take about the same time: ``--spp`` samples with gradients, ``--plain`` without. The camera moves as in
-``bench.sequences``.
+``bench.shots``.
 """
 
 import argparse
@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 import ngpt
-from bench.sequences import SPEEDS, sideways
+from bench.shots import SPEEDS, sideways
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.sequence.history import Temporal
 

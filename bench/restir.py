@@ -2,7 +2,7 @@
 
     python -m bench.restir --folder SCENES --scenes diffuse glossy cornell-box --out OUT
 
-The camera goes sideways, or a shape or a lamp moves, as in ``bench.sequences``. Rivals:
+The camera goes sideways, or a shape or a lamp moves, as in ``bench.shots``. Rivals:
 
     restir       reservoirs of pixels and of pairs
     after        reservoirs of pixels, differences taken of what they have kept: the paper's baseline
@@ -14,7 +14,7 @@ The camera goes sideways, or a shape or a lamp moves, as in ``bench.sequences``.
 primal, dx and dy (without the worst 1 % of the pixels) in the last frame, for one chain or sample, and times the cost
 in processor time over that of ``gpt``: below 1 where a frame is worth more than it costs. Then all rivals render with
 the time of ``--chains`` chains of ``restir``, and their frames after ``--skip`` are reconstructed; + temporal: as
-`ngpt denoise --temporal`, from the first frame on. relMSE and flicker as in ``bench.sequences``.
+`ngpt denoise --temporal`, from the first frame on. relMSE and flicker as in ``bench.shots``.
 """
 
 import argparse
@@ -26,7 +26,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
-from bench.sequences import MOVES, SPEEDS, measured, mover, sideways
+from bench.shots import MOVES, SPEEDS, measured, mover, sideways
 from ngpt.sequence.history import Temporal
 
 RIVALS = {

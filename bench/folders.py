@@ -1,7 +1,7 @@
 """Folders of frames: how much of file access and computing is hidden behind the other.
 
-    python -m bench.frames
-    python -m bench.frames --sizes 1920x1080 --methods oidn --frames 12
+    python -m bench.folders
+    python -m bench.folders --sizes 1920x1080 --methods oidn --frames 12
 
 Per size and method, on folders of synthetic stacks with features and variances, all in this process, in turn and warm:
 
@@ -38,7 +38,7 @@ def main() -> None:
     parser.add_argument("--methods", nargs="*", default=NAMES, choices=METHODS)
     parser.add_argument("--frames", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/frames.json"))
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/folders.json"))
     args = parser.parse_args()
     result = {"benchmark": "frames", "frames": args.frames, "repeats": args.repeats, "sizes": {}}
     result["metadata"] = metadata("onnxruntime", "OpenEXR", "mitsuba-oidn")

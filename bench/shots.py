@@ -1,7 +1,7 @@
 """Frames of a moving camera: error and flicker of results made frame by frame, and over time.
 
-    python -m bench.sequences --folder SCENES --scenes diffuse glossy coffee --out OUT
-    python -m bench.sequences --folder SCENES --scenes diffuse glossy --shots slow fast object light --pairs 2 --out OUT
+    python -m bench.shots --folder SCENES --scenes diffuse glossy coffee --out OUT
+    python -m bench.shots --folder SCENES --scenes diffuse glossy --shots slow fast object light --pairs 2 --out OUT
 
 Three shots move a scene's own camera sideways: ``static``, ``slow`` (half a pixel a frame, at the distance of what it
 sees in the median) and ``fast`` (8 pixels a frame, to and fro). ``object`` and ``light`` move a shape, ``MOVES``, where
@@ -80,7 +80,7 @@ def main() -> None:
             for row in found:
                 rows.append({"scene": scene, "shot": shot} | row)
                 print(line(rows[-1]), flush=True)
-    save(args.out / "sequences.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
+    save(args.out / "shots.json", {"rows": rows, "metadata": metadata("mitsuba-oidn")})
 
 
 def judge(stacks: list, references: list, method: str) -> list[dict]:
