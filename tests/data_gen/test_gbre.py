@@ -136,8 +136,9 @@ def assert_copies_are_light_paths(mi, name, receivers):
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.gradients.copies import Photon, photon_of, start_of
+    from data_gen.samplers.photons.gradients.copies import start_of
     from data_gen.samplers.photons.map.fog import Fog
+    from data_gen.samplers.photons.map.photon import Photon, photon_of
     from data_gen.samplers.photons.map.trace import trace, vertex_in_media_of
     from data_gen.samplers.photons.media.gbre import copy_beside
 

@@ -122,7 +122,8 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     from data_gen.paths.light_ends import LightEnds, LightRay
     from data_gen.paths.vertex import Materials
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.gradients.copies import Photon, copy, is_near, photon_of, start_of
+    from data_gen.samplers.photons.gradients.copies import copy, start_of
+    from data_gen.samplers.photons.map.photon import Photon, is_near, photon_of
     from data_gen.samplers.photons.map.trace import vertex_of
 
     mi = renderer

@@ -33,7 +33,7 @@ def test_weights_of_merging_are_those_of_all_densities(ends):
 
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, cosine, evaluate, scatters_smoothly
-    from data_gen.samplers.photons.gradients.copies import Photon
+    from data_gen.samplers.photons.map.photon import Photon
     from data_gen.samplers.vcm.merging import Merging
 
     class Gathered:

@@ -5,10 +5,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
+import drjit as dr
+import mitsuba as mi
+
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.world import World
+from ngpt.errors import NgptError
 
 
 @dataclass
@@ -36,3 +41,27 @@ class Passes:
 
     def instead(self, lane_bytes: int) -> str:
         return self.integrator.instead(lane_bytes)
+
+
+def begin(passes: Passes, camera: CameraSamples) -> tuple:
+    """Rays and importance of camera samples, random numbers of their paths, two keys, and the layers of features."""
+    ray, importance, _ = camera.rays()
+    random = camera.random.clone()
+    keys = random.next_key(), random.next_key()
+    random.schedule_state()
+    dr.eval(ray, importance, keys)
+    values = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
+    return ray, importance, random, keys, values
+
+
+def refuse_variants(sampler: str) -> None:
+    """Raises NgptError, in the name of the ``sampler``, for variants in which photons cannot be shared."""
+    for refused, what in (
+        (mi.is_polarized, "polarised light"),
+        (mi.is_spectral, "spectra, since wavelengths of photons and camera paths differ"),
+    ):
+        if refused:
+            raise NgptError(
+                f"sampler '{sampler}' does not follow {what} (variant '{mi.variant()}'); "
+                f"use variant '{mi.variant().split('_')[0]}_ad_rgb', or sampler 'gpt-basic'"
+            )

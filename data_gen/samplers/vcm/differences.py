@@ -19,7 +19,7 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.vertex import Vertex
 from data_gen.samplers.gbdpt.offset_path import Offset, own_vertex
 from data_gen.samplers.gbdpt.pairs import difference, difference_of_one, weighted
-from data_gen.samplers.photons.gradients.copies import is_near
+from data_gen.samplers.photons.map.photon import is_near
 from data_gen.samplers.vcm.merging import Merging, brought
 
 

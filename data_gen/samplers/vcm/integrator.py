@@ -43,8 +43,7 @@ from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
-from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import refuse
+from data_gen.samplers.photons.passes import Passes, refuse_variants
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
 
 # Of a camera sample, its features and its light path, beside the map: what was seen, and some more
@@ -101,7 +100,7 @@ class VCM(BDPT):
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+        refuse_variants(self.name)
         refuse_camera(scene, self.name)
         world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
         return Passes(self, world, pixel_width(scene))

@@ -19,8 +19,8 @@ from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.light_path import Seen, Visitor
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
-from data_gen.samplers.photons.gradients.copies import Photon, faces
 from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import Photon, faces
 
 # Bytes of a vertex: 23 words of a record and whether it is a photon, and 12 words of a grid that is made.
 VERTEX_BYTES = (23 + 1 + 12) * 4

@@ -23,27 +23,10 @@ import mitsuba as mi
 from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
 from data_gen.paths.light_ends import LightEnds, LightRay
-from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, context, evaluate
+from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
 from data_gen.samplers.photons.gradients import shift
+from data_gen.samplers.photons.map.photon import Photon, is_near
 from data_gen.samplers.photons.map.trace import vertex_in_media_of, vertex_of
-
-# Photons on surfaces that face another way, by more than about 45 degrees, are those of another surface.
-NORMAL_COSINE = 0.7
-
-
-@dataclass
-class Photon:
-    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings.
-
-    ``medium`` is that around it, ``channel`` the colour of its light path; None in scenes without media.
-    """
-
-    p: mi.Point3f
-    n: mi.Normal3f
-    d: mi.Vector3f
-    Φ: mi.Spectrum
-    medium: mi.MediumPtr | None = None
-    channel: mi.UInt32 | None = None
 
 
 @dataclass
@@ -66,34 +49,6 @@ class Through:
     τ_c: mi.Float  # of the photon's way, in colour c
     channel: mi.UInt32  # c
     nulls: Collisions | None  # of the photon's way; None without grids
-
-
-def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi.Bool:
-    """Whether a photon is gathered at ``x``."""
-    return (dr.squared_norm(photon.p - x.p) < radius2) & faces(photon, x)
-
-
-def faces(photon: Photon, x: mi.SurfaceInteraction3f) -> mi.Bool:
-    """Whether a photon lies on a surface that faces the same way as that of ``x``."""
-    return dr.dot(photon.n, x.n) > NORMAL_COSINE
-
-
-def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) -> mi.Spectrum:
-    """f Φ, what a photon adds to radiance at ``x``, of material ``bsdf``; the kernel is not in it."""
-    f = bsdf.eval(context(RADIANCE), x, x.to_local(-photon.d), active)
-    # f has a cosine; the photons lie as densely as the geometric one is large.
-    L = f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d))
-    return dr.select(active & dr.isfinite(dr.sum(L)), L, 0)
-
-
-def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
-    """The photon of that place in the map."""
-    n, d = dr.gather(mi.Normal3f, photons.n, j, active), dr.gather(mi.Vector3f, photons.d, j, active)
-    found = Photon(dr.gather(mi.Point3f, photons.p, j, active), n, d, dr.gather(mi.Spectrum, photons.β, j, active))
-    if hasattr(photons, "medium"):
-        found.medium = dr.gather(mi.MediumPtr, photons.medium, j, active)
-        found.channel = dr.gather(mi.UInt32, photons.channel, j, active)
-    return found
 
 
 def copy(

@@ -20,11 +20,11 @@ from data_gen.paths.light_ends import LightRay
 from data_gen.paths.shift import gradient_weight
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.photons.gradients.camera import Level, Path
-from data_gen.samplers.photons.gradients.copies import copy, is_near, light, photon_of
+from data_gen.samplers.photons.gradients.copies import copy
 from data_gen.samplers.photons.gradients.pairs import Pairs, Points, pieces
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import begin
+from data_gen.samplers.photons.map.photon import is_near, light, photon_of
+from data_gen.samplers.photons.passes import Passes, begin
 
 # Levels are joined until they have so many paths for each camera sample.
 LEVELS = 3

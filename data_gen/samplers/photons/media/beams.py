@@ -40,7 +40,8 @@ from data_gen.samplers.photons.map.radius import shrunk
 from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH, put
 from data_gen.samplers.photons.media.bre import BALL, BRE, Both, scattering_along, seen_along
 from data_gen.samplers.photons.media.vpm import VPM
-from data_gen.samplers.photons.surfaces.ppm import Gathering, Passes
+from data_gen.samplers.photons.passes import Passes
+from data_gen.samplers.photons.surfaces.ppm import Gathering
 
 # Radii in the length of a part: shorter ones are more to enter, longer ones more that is near to no ray.
 PART = 6

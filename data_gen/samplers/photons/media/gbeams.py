@@ -28,10 +28,11 @@ from data_gen.paths.light_ends import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import Piece
-from data_gen.samplers.photons.gradients.copies import Photon, let_through, redirected
+from data_gen.samplers.photons.gradients.copies import let_through, redirected
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Near, difference
 from data_gen.samplers.photons.gradients.pairs import Pairs
 from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.radius import shrunk
 from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
 from data_gen.samplers.photons.media.gbre import GBRE, PATHS_BYTES, Beside, Both, beside_of

@@ -35,7 +35,7 @@ from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera import Level
 from data_gen.samplers.photons.gradients.camera_in_media import Piece, ends, levels_in_media
-from data_gen.samplers.photons.gradients.copies import Photon, copy_in_medium, photon_of
+from data_gen.samplers.photons.gradients.copies import copy_in_medium
 from data_gen.samplers.photons.gradients.differences import (
     PAIR_BYTES,
     PAIRS,
@@ -49,6 +49,7 @@ from data_gen.samplers.photons.gradients.differences import (
 )
 from data_gen.samplers.photons.gradients.pairs import Pairs, Rays
 from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import Photon, photon_of
 from data_gen.samplers.photons.map.radius import shrunk
 from data_gen.samplers.photons.media.bre import BALL, BRE, seen_along
 from data_gen.samplers.photons.passes import Passes

@@ -30,10 +30,10 @@ from data_gen.paths.light_ends import LightRay
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera_in_media import Piece
-from data_gen.samplers.photons.gradients.copies import Photon
 from data_gen.samplers.photons.gradients.differences import difference
 from data_gen.samplers.photons.gradients.pairs import Pairs
 from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbeams import GBEAMS

@@ -34,7 +34,6 @@ from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.gradients.camera import Path
 from data_gen.samplers.photons.gradients.camera_segments import Flight, FlightLevel, levels_by_segments
-from data_gen.samplers.photons.gradients.copies import Photon
 from data_gen.samplers.photons.gradients.differences import (
     PAIR_BYTES,
     PAIRS,
@@ -47,6 +46,7 @@ from data_gen.samplers.photons.gradients.differences import (
 )
 from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.radius import shrunk
 from data_gen.samplers.photons.media.bre import seen_along
 from data_gen.samplers.photons.media.gbre import PATHS_BYTES, AlongPieces, Both, with_media

@@ -34,7 +34,8 @@ from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH
-from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering, Passes, refuse
+from data_gen.samplers.photons.passes import Passes, refuse_variants
+from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
 from data_gen.scenes.facts import media_of
 
 
@@ -104,7 +105,7 @@ class VPM(PPM):
     map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+        refuse_variants(self.name)
         lights = LightEnds(scene, self.name)
         self.fog = Fog(scene, lights, self.name, self.grids) if media_of(scene) else None
         if self.fog and self.fog.media.grids:

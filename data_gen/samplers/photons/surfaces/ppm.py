@@ -30,7 +30,6 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.features import features
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
@@ -39,13 +38,12 @@ from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
 from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import GradientIntegrator, like_path
-from data_gen.samplers.photons.gradients.copies import faces, light, photon_of
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import faces, light, photon_of
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.map.trace import MAP_BYTES, trace
-from data_gen.samplers.photons.passes import Passes
-from ngpt.errors import NgptError
+from data_gen.samplers.photons.passes import Passes, begin, refuse_variants
 
 # Of a camera sample and its features, beside the maps
 CAMERA_BYTES = 256
@@ -128,7 +126,7 @@ class PPM(GradientIntegrator):
         return f", or no more than -O photons={fits}" if fits > 0 else ""
 
     def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+        refuse_variants(self.name)
         world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
         return Passes(self, world, pixel_width(scene))
 
@@ -227,30 +225,6 @@ class PPM(GradientIntegrator):
                 L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
             active &= si.is_valid() & (depth < self.max_depth)
         return L, Le
-
-
-def begin(passes: Passes, camera: CameraSamples) -> tuple:
-    """Rays and importance of camera samples, random numbers of their paths, two keys, and the layers of features."""
-    ray, importance, _ = camera.rays()
-    random = camera.random.clone()
-    keys = random.next_key(), random.next_key()
-    random.schedule_state()
-    dr.eval(ray, importance, keys)
-    values = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
-    return ray, importance, random, keys, values
-
-
-def refuse(scene, sampler: str) -> None:
-    """Raises NgptError, in the name of the ``sampler``, for variants in which photons cannot be shared."""
-    for refused, what in (
-        (mi.is_polarized, "polarised light"),
-        (mi.is_spectral, "spectra, since wavelengths of photons and camera paths differ"),
-    ):
-        if refused:
-            raise NgptError(
-                f"sampler '{sampler}' does not follow {what} (variant '{mi.variant()}'); "
-                f"use variant '{mi.variant().split('_')[0]}_ad_rgb', or sampler 'gpt-basic'"
-            )
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:
