@@ -4,7 +4,7 @@
     python -m bench.pages out/eval
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
-docs/lab/RESULTS.md, docs/use/evaluation.md, docs/methods/methods.md and the model cards. Without a folder it writes
+docs/lab/RESULTS.md, docs/methods/methods.md and the model cards. Without a folder it writes
 them anew from that file.
 """
 
@@ -77,7 +77,6 @@ def blocks(result: dict) -> dict[tuple[str, str], str]:
         ("README.md", "cells"): cells_of_readme(table),
         ("README.md", "worth"): worth_by_group(result["worth"][0], ("all", "rooms, watched")),
         ("docs/methods/methods.md", "errors"): errors_by_method(table),
-        ("docs/use/evaluation.md", "over primal"): over_primal(table),
         (card("combine"), "over primal"): over_primal(table),
         (card("combine"), "losses"): losses(table, "ngpt-combine"),
         (card("primal"), "losses"): losses(table, "ngpt-primal"),
@@ -111,36 +110,19 @@ class Cells:
 
 
 def by_group(table: Cells) -> str:
-    means, ratios, counts = groups(table.values("error")).split("\n\n")
-    between = "The same means, over those of another method:", "In how many cells one has less error than the other:"
-    return "\n\n".join((means, between[0], ratios, between[1], counts))
-
-
-def groups(errors: dict[tuple[str, int, str], float]) -> str:
-    """Three tables as Markdown: mean errors, their ratios, and counts of cells."""
-    counts = sorted({spp for _, spp, _ in errors})
-    groups = {**GROUPS, "all": tuple(scene for scenes in GROUPS.values() for scene in scenes)}
-
-    def mean(scenes: tuple[str, ...], spp: int, method: str) -> float:
-        return float(np.exp(np.mean([np.log(errors[scene, spp, method]) for scene in scenes])))
-
-    def below(scenes: tuple[str, ...], method: str, rival: str) -> int:
-        return sum(errors[s, n, method] < errors[s, n, rival] for s in scenes for n in counts)
-
+    """Mean errors of each group of scenes, and in how many cells one method has less error than another."""
+    groups = {**GROUPS, "all": EVERYONE}
     lines = heading("scenes", "spp", *(f"`{method}`" for method in COMPARED))
     for name, scenes in groups.items():
-        for spp in counts:
-            means = [mean(scenes, spp, method) for method in COMPARED]
+        for spp in table.counts:
+            means = [table.mean(scenes, spp, method) for method in COMPARED]
             texts = [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
-            lines.append(f"| {f'{name} ({len(scenes)})' if spp == counts[0] else ''} | {spp} | {' | '.join(texts)} |")
-    lines += ["", *heading("mean error over another's", *(f"{spp} spp" for spp in counts))]
+            first = f"{name} ({len(scenes)})" if spp == table.counts[0] else ""
+            lines.append(f"| {first} | {spp} | {' | '.join(texts)} |")
+    between = "In how many cells one has less error than the other:"
+    lines += ["", between, "", *heading("cells", *(f"{name} ({len(scenes)})" for name, scenes in groups.items()))]
     for method, rival in PAIRS:
-        for name, scenes in groups.items():
-            ratios = [f"{mean(scenes, spp, method) / mean(scenes, spp, rival):.2f}" for spp in counts]
-            lines.append(f"| `{method}` over `{rival}`, {name} | {' | '.join(ratios)} |")
-    lines += ["", *heading("cells with less error", *(f"{name} ({len(scenes)})" for name, scenes in groups.items()))]
-    for method, rival in PAIRS:
-        won = [f"{below(scenes, method, rival)} of {len(scenes) * len(counts)}" for scenes in groups.values()]
+        won = [table.below(scenes, method, rival) for scenes in groups.values()]
         lines.append(f"| `{method}` than `{rival}` | {' | '.join(won)} |")
     return "\n".join(lines)
 
@@ -173,7 +155,7 @@ def eye(table: Cells) -> str:
 
 
 def over_primal(table: Cells) -> str:
-    lines = heading("error of `ngpt-combine` over that of `ngpt-primal`", *(f"{n} spp" for n in table.counts))
+    lines = heading("error of `ngpt-combine` over `ngpt-primal`", *(f"{n} spp" for n in table.counts))
     for name, scenes in {**GROUPS, "all": EVERYONE}.items():
         ratios = [f"{table.over(scenes, n, 'ngpt-combine', 'ngpt-primal'):.2f}" for n in table.counts]
         lines.append(f"| {name} ({len(scenes)}) | {' | '.join(ratios)} |")
