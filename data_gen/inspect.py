@@ -7,7 +7,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.samplers import SAMPLERS, choose
+from data_gen.samplers import SAMPLERS, by_standing, choose
 from data_gen.scenes.builtin import SCENES
 from data_gen.scenes.facts import Facts, polarised
 from data_gen.scenes.load import complaint
@@ -18,10 +18,6 @@ _MIRRORS = ("conductor", "dielectric", "thindielectric")
 _POINTS = ("point", "spot", "directional", "projector")
 # What light goes through and is focussed by, so that no connection finds it behind
 _LENSES = ("dielectric", "roughdielectric")
-# Samplers by photons, first the ones without gradients
-_PHOTONS = ("ppm", "gpm", "bre", "gbre")
-# By photons and by paths from both ends
-_JOINED = ("vcm", "gvcm")
 
 
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
@@ -78,7 +74,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     """What materials, lights and media mean for a stack, whoever renders it, a line for each thing that matters."""
     lines = []
-    for name, sampler in SAMPLERS.items():
+    for name, sampler in by_standing("use").items():
         if reason := sampler.refuses(facts):
             lines.append(f"`--sampler {name}` refuses: {reason}")
     if facts.media and not facts.integrator.startswith("vol"):
@@ -89,17 +85,17 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
         lines.append("mirrors or clear glass: features are taken at the first surface behind them that scatters")
     points = any(name in _POINTS for name in plugins["Emitter"])
     if any(name in plugins["BSDF"] for name in _LENSES):
-        if able := _commands(_PHOTONS, facts):
+        if able := _finding(facts, "caustics"):
             lines.append(
                 "glass: the light behind it, where that is seen in mirrors or through glass, "
                 + ("is found by photons alone for lights without size: " if points else "is found best by photons: ")
                 + able
             )
-        if able := _commands(_JOINED, facts):
+        if able := _finding(facts, "caustics", and_hidden_lamps=True):
             lines.append(
                 f"glass where other light is hard to find, too: photons and paths from both ends in one: {able}"
             )
-    if facts.grids and (able := _commands(("vpm", "gvpm", "bre", "beams"), facts)):
+    if facts.grids and (able := _finding(facts, "grids")):
         lines.append(f"media whose density varies: photons are gathered in them by {able}")
     if facts.media and points and not SAMPLERS["gpt"].refuses(facts):
         lines.append("small lights in media: paths find their beams with less noise than photons: `--sampler gpt`")
@@ -114,9 +110,15 @@ def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     return lines
 
 
-def _commands(names: tuple[str, ...], facts: Facts) -> str:
-    """The options of those samplers that can render the scene."""
-    return ", ".join(f"`--sampler {name}`" for name in names if not SAMPLERS[name].refuses(facts))
+def _finding(facts: Facts, light: str, and_hidden_lamps: bool = False) -> str:
+    """The arguments that name samplers, studies left out, which can render the scene and find such light."""
+    found = [
+        name
+        for name, sampler in SAMPLERS.items()
+        if sampler.standing != "study" and not sampler.refuses(facts)
+        if light in sampler.finds and ("hidden lamps" in sampler.finds) == and_hidden_lamps
+    ]
+    return ", ".join(f"`--sampler {name}`" for name in found)
 
 
 def _camera(lens: bool, shutter: float) -> list[str]:

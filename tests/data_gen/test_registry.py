@@ -1,5 +1,7 @@
 """What entries say of samplers: typed options, one place for each default, names that are nearly right."""
 
+from pathlib import Path
+
 import pytest
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, Sampler, by_standing, check_options, find, register
@@ -97,3 +99,11 @@ def test_frames_take_options_from_the_command_line(renderer, tmp_path):
     stack = ngpt.read(tmp_path / "diffuse.0000.exr")
     assert stack.attributes["ngpt:samplerOptions"] == "caustic=false"
     assert main([*line, "--force", "--sampler", "gpt", "-O", "history=4"]) == 2
+
+
+def test_the_table_in_the_docs_is_what_entries_say():
+    from data_gen.samplers.__main__ import table
+
+    text = (Path(__file__).parents[2] / "docs" / "use" / "rendering.md").read_text()
+    _, _, rest = text.partition("<!-- python -m data_gen.samplers -->\n\n")
+    assert rest.split("\n\n<!-- end -->")[0] == table(), "python -m data_gen.samplers prints it anew"

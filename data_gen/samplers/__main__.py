@@ -1,0 +1,22 @@
+"""``python -m data_gen.samplers``: the table of samplers in docs/use/rendering.md."""
+
+from data_gen.samplers import by_standing
+from ngpt.options import written
+
+# Standing -> what the table calls it
+GROUPS = {"use": "", "niche": "for some scenes", "study": "measured, and better elsewhere: to compare with"}
+
+
+def table() -> str:
+    """All samplers in Markdown, by standing, with their options and defaults."""
+    lines = ["| sampler | what it is | options |", "|---|---|---|"]
+    for standing, title in GROUPS.items():
+        lines += [f"| | *{title}* | |"] if title else []
+        for name, entry in by_standing(standing).items():
+            options = ", ".join(f"`{option}={written(value.default)}`" for option, value in entry.options.items())
+            lines.append(f"| `{name}` | {entry.summary} | {options} |")
+    return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    print(table())
