@@ -157,9 +157,7 @@ def register(entry: Sampler | FrameSampler) -> None:
 def find(name: str, facts: Facts | None = None) -> Sampler:
     """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
     if name in FRAME_SAMPLERS:
-        raise NgptError(
-            f"sampler '{name}' is for sequences (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt"
-        )
+        raise NgptError(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
         near = get_close_matches(name, [*SAMPLERS, *FRAME_SAMPLERS], 1)
         meant = f"did you mean '{near[0]}'? " if near else ""

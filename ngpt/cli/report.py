@@ -30,7 +30,7 @@ CHANGE = "map of the root of d^2 / (m + 0.001), with the mean m of the squared p
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Folders are sequences: the page plays them, and with a folder of references there is a table of errors and "
+        "Folders are shots: the page plays them, and with a folder of references there is a table of errors and "
         "flicker."
     )
     parser.add_argument(
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
     names = labels(args.images)
     if any(os.path.isdir(path) for path in args.images):
-        return run_sequences(args, names, target, console)
+        return run_shots(args, names, target, console)
     images = [read_image(path) for path in args.images]
     reference = read_image(args.ref) if args.ref else None
     for path, image in zip([*args.images[1:], args.ref], [*images[1:], reference], strict=True):
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def run_sequences(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
+def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
     """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
     frames = frames_of(folders)
@@ -139,7 +139,7 @@ def run_sequences(args: argparse.Namespace, names: list[str], target: Path, cons
         footer=facts,
         overview=overview,
         overwrite=args.force,
-        sequence=True,
+        shot=True,
     )
     if large := oversize(target):
         console.say(large)

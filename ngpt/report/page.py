@@ -35,13 +35,13 @@ def write_report(
     footer: dict[str, str],
     overview: Overview | None = None,
     overwrite: bool = False,
-    sequence: bool = False,
+    shot: bool = False,
 ) -> Path:
     """Writes the page to ``path`` and returns it. The same arguments give the same bytes.
 
     ``command`` is the command line that made the pictures, ``footer`` further facts (versions, device, seed, date).
     Pictures are stored to 0.14 % of their value, or as much coarser as a page of PAGE_LIMIT bytes demands, those of
-    most noise first; the page states the worst error of each. The scenes of a ``sequence`` are its frames: they are
+    most noise first; the page states the worst error of each. The scenes of a ``shot`` are its frames: they are
     played, at one exposure.
     """
     path = Path(path)
@@ -53,7 +53,7 @@ def write_report(
         display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
         for scene in scenes
     ]
-    if sequence:
+    if shot:
         exposures = [float(np.median(exposures))] * len(scenes)
     sections = [section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
     after = overview_html(overview or Overview())
@@ -63,7 +63,7 @@ def write_report(
     table = base64.b64encode(display.heat_table().tobytes()).decode()
     page = {
         "scenes": facts,
-        "sequence": sequence,
+        "shot": shot,
         "heat": table,
         "signs": base64.b64encode(display.sign_table().tobytes()).decode(),
         "epsilon": display.ERROR_EPSILON,

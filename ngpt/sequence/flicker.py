@@ -1,4 +1,4 @@
-"""Flicker: how much the error of a sequence changes from frame to frame."""
+"""Flicker: how much the error of a shot changes from frame to frame."""
 
 from collections.abc import Sequence
 
@@ -63,7 +63,7 @@ def flicker(
 ) -> float:
     """The mean of ``flicker_maps`` over the pixels where it is known, in each frame without the worst 0.1 %.
 
-    0 for a sequence whose error moves with what is seen; twice the mean relMSE where errors of frames have nothing to
+    0 for a shot whose error moves with what is seen; twice the mean relMSE where errors of frames have nothing to
     do with each other. NaN where nothing is known.
     """
     values = []

@@ -3,7 +3,7 @@
     data = Dataset("DIR")
     crop = data[0]
     crop.stack(0), crop.reference        # a GradientStack, (H, W, 3)
-    for shot in data.shots:              # sets of sequences: the crops of each, frame by frame
+    for shot in data.shots:              # sets of shots: the crops of each, frame by frame
         frames = [data[i] for i in shot]
 
 ``python -m data_gen`` makes them, ``ngpt info DIR`` verifies them, and ``ngpt.training.shards`` describes the files.

@@ -107,7 +107,7 @@ def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
     assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err
 
 
-def test_folders_of_frames_are_sequences(tmp_path, rng, capsys):
+def test_folders_of_frames_are_shots(tmp_path, rng, capsys):
     image = rng.gamma(2.0, 0.5, (24, 32, 3)).astype(np.float32)
     still = np.zeros((24, 32, 2), np.float32)
     for folder in ("steady", "flickers", "truth"):
@@ -126,7 +126,7 @@ def test_folders_of_frames_are_sequences(tmp_path, rng, capsys):
     text = page.read_text()
     assert "Means over 3 frames" in text and "along motion" in text
     played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
-    assert played["sequence"] and all(scene["maps"][-2:] == ["change", "flicker"] for scene in played["scenes"])
+    assert played["shot"] and all(scene["maps"][-2:] == ["change", "flicker"] for scene in played["scenes"])
     assert len({scene["stops"] for scene in played["scenes"]}) == 1
     assert main([*words, "-o", str(tmp_path / "plain.html"), "-q"]) == 0
     assert facts(tmp_path / "plain.html")["maps"] == ["change"]

@@ -338,14 +338,14 @@ def where(shot: np.ndarray, colour: np.ndarray) -> np.ndarray:
     return np.abs(shot - colour.astype(int)).max(axis=2) <= 1
 
 
-def test_the_frames_of_a_sequence_are_played_at_one_exposure(tmp_path):
+def test_the_frames_of_a_shot_are_played_at_one_exposure(tmp_path):
     frames = [
         Scene(
             f"{i:04}", "", None, [Entry("shot", np.full((6, 8, 3), 0.1 * (i + 1)), maps={"change": np.zeros((6, 8))})]
         )
         for i in range(3)
     ]
-    page = write_report(tmp_path / "p.html", "t", frames, command="", footer={}, sequence=True)
+    page = write_report(tmp_path / "p.html", "t", frames, command="", footer={}, shot=True)
     session = Session(tmp_path / "profile", page.as_uri())
     try:
         assert session.ask("$('tabs').hidden") is True and session.ask("$('player').hidden") is False

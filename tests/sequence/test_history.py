@@ -1,16 +1,23 @@
-"""Reconstruction over time: laws that hold for any method."""
+"""Reconstruction over time: laws that hold for any method, by the rules and by the network that comes with ngpt."""
 
 import subprocess
 import sys
+from functools import partial
 
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from shots import SIZE, frame_of, mse, view
+from shots import SIZE, frame_of, mse, view, without
 
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import LONGEST, Temporal
 from ngpt.stack import GradientStack
+
+
+@pytest.fixture(params=[None, "shipped"], ids=["rules", "network"])
+def history(request):
+    """What begins a shot."""
+    return partial(Temporal, request.param)
 
 
 def smooth(stack):
@@ -22,9 +29,9 @@ def identity(stack):
 
 
 @pytest.mark.parametrize("method", [identity, smooth])
-def test_a_shot_at_rest_converges(rng, method):
+def test_a_shot_at_rest_converges(rng, history, method):
     image, features = view()
-    temporal, stacks = Temporal(), [frame_of(image, features, rng) for _ in range(LONGEST)]
+    temporal, stacks = history(), [frame_of(image, features, rng) for _ in range(LONGEST)]
     alone = [method(stack) for stack in stacks]
     over_time = [temporal.next(*pair) for pair in zip(stacks, alone, strict=True)]
     assert np.array_equal(over_time[0], alone[0])
@@ -36,13 +43,13 @@ def test_a_shot_at_rest_converges(rng, method):
     assert flicker(over_time[4:], truth[4:], motions[4:]) < 0.1 * flicker(alone[4:], truth[4:], motions[4:])
 
 
-def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng):
+def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng, history):
     """As if at rest: the frame before, moved by a pixel, with the same noise."""
     image, features = view()
     one, other = frame_of(image, features, rng), frame_of(image, features, rng)
     moved = GradientStack({name: np.roll(layer, -1, axis=1) for name, layer in other.layers.items()})
     moved = moved.replace(motion=np.broadcast_to([1.0, 0.0], (*SIZE, 2)))
-    rest, path = Temporal(), Temporal()
+    rest, path = history(), history()
     rest.next(one, smooth(one))
     path.next(one, smooth(one))
     at_rest, on_path = rest.next(other, smooth(other)), path.next(moved, np.roll(smooth(other), -1, axis=1))
@@ -54,7 +61,7 @@ def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng):
 
 
 @pytest.mark.parametrize("name", ["albedo", "normal", "depth"])
-def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
+def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, history, name):
     image, features = view()
     before = frame_of(3 * image, features, rng)
     now = frame_of(image, features, rng)
@@ -62,7 +69,7 @@ def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
     shown = np.s_[10:30, 5:25]
     changed[shown] = {"albedo": 0.1, "normal": [1, 0, 0], "depth": 9}[name]
     now = now.replace(**{name: changed})
-    temporal = Temporal()
+    temporal = history()
     temporal.next(before, smooth(before))
     result = temporal.next(now, smooth(now))
     within = np.s_[11:29, 6:24]
@@ -70,17 +77,17 @@ def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, name):
     assert np.allclose(result[within], smooth(now)[within], atol=1e-3)
 
 
-def test_a_cut_restarts(rng):
+def test_a_cut_restarts(rng, history):
     image, features = view()
     stacks = [frame_of(image, features, rng, **{"ngpt:frame": i, "ngpt:previousFrame": i - 1}) for i in range(5)]
     for second in (
         stacks[2],  # frame 1 is missing
-        GradientStack({k: v for k, v in stacks[1].layers.items() if k != "motion"}),
+        without(stacks[1], "motion"),
         stacks[1].replace(motion=np.full((*SIZE, 2), np.nan)),
         stacks[1].replace(motion=np.full((*SIZE, 2), 100.0)),
         GradientStack({k: v[:20] for k, v in stacks[1].layers.items()}),
     ):
-        temporal = Temporal()
+        temporal = history()
         temporal.next(stacks[0], smooth(stacks[0]))
         assert np.array_equal(temporal.next(second, smooth(second)), smooth(second))
         assert temporal.share == 0
@@ -89,9 +96,9 @@ def test_a_cut_restarts(rng):
     assert temporal.share > 0.3
 
 
-def test_history_of_another_light_is_left_alone(rng):
+def test_history_of_another_light_is_left_alone(rng, history):
     image, features = view()
-    temporal = Temporal()
+    temporal = history()
     for _ in range(LONGEST):
         stack = frame_of(image, features, rng)
         temporal.next(stack, smooth(stack))
@@ -101,10 +108,10 @@ def test_history_of_another_light_is_left_alone(rng):
     assert mse(result, 2 * image) < 1.2 * mse(smooth(stack), 2 * image)
 
 
-def test_no_step_of_slow_changes_costs_more_than_it_gains(rng):
+def test_no_step_of_slow_changes_costs_more_than_it_gains(rng, history):
     """Light that grows by 2 % a frame: history lags behind, and the evidence sees to it that it does not by much."""
     image, features = view()
-    temporal, alone, over_time = Temporal(), [], []
+    temporal, alone, over_time = history(), [], []
     for i in range(24):
         stack = frame_of(image * 1.02**i, features, rng)
         truth = image * 1.02**i
@@ -113,22 +120,33 @@ def test_no_step_of_slow_changes_costs_more_than_it_gains(rng):
     assert np.mean(over_time[4:]) < 1.1 * np.mean(alone[4:])
 
 
+@pytest.mark.parametrize("size", [(1, 1), (3, 2), (17, 5)])
+@pytest.mark.parametrize("scale", [0.0, 1e-8, 1e10])
+def test_sizes_and_extremes(rng, history, size, scale):
+    image, features = view(*size)
+    temporal = history()
+    for _ in range(3):
+        stack = frame_of(scale * image, features, rng, sigma=0.2 * scale)
+        result = temporal.next(stack, smooth(stack))
+        assert np.isfinite(result).all() and result.shape == image.shape
+
+
 @pytest.mark.parametrize("k", [2.0**-10, 2.0**10])
-def test_exposure_does_not_matter(rng, k):
+def test_exposure_does_not_matter(rng, history, k):
     image, features = view()
     stacks = [frame_of(image, features, rng) for _ in range(3)]
-    plain, scaled = Temporal(), Temporal()
+    plain, scaled = history(), history()
     for stack in stacks:
         result = plain.next(stack, smooth(stack))
         bright = stack.replace(primal=k * stack["primal"], primal_var=k**2 * stack["primal_var"])
         assert np.allclose(scaled.next(bright, k * smooth(stack)), k * result, rtol=1e-3, atol=1e-4 * k)
 
 
-def test_direct_emission_is_that_of_this_frame(rng):
+def test_direct_emission_is_that_of_this_frame(rng, history):
     image, features = view()
     emission = np.zeros_like(image)
     emission[5:9, 5:9] = 50
-    temporal = Temporal()
+    temporal = history()
     for i in range(3):
         stack = frame_of(image, features, rng)
         lamp = np.roll(emission, 2 * i, axis=1)
@@ -137,20 +155,19 @@ def test_direct_emission_is_that_of_this_frame(rng):
     assert np.abs(result - lamp - image).max() < 1
 
 
-@pytest.mark.parametrize("without", [("primal_var",), ("albedo", "normal", "depth"), ("primal_var", "depth")])
-def test_variances_and_features_are_not_needed(rng, without):
+@pytest.mark.parametrize("names", [("primal_var",), ("albedo", "normal", "depth"), ("primal_var", "depth")])
+def test_variances_and_features_are_not_needed(rng, history, names):
     image, features = view()
-    temporal, last = Temporal(), 0.0
+    temporal, last = history(), 0.0
     for _ in range(8):
-        stack = frame_of(image, features, rng)
-        stack = GradientStack({name: layer for name, layer in stack.layers.items() if name not in without})
+        stack = without(frame_of(image, features, rng), *names)
         last = mse(temporal.next(stack, smooth(stack)), image) / mse(smooth(stack), image)
     assert last < 0.9
 
 
-def test_pixels_that_are_not_finite_do_no_harm(rng):
+def test_pixels_that_are_not_finite_do_no_harm(rng, history):
     image, features = view()
-    temporal = Temporal()
+    temporal = history()
     for i in range(3):
         stack = frame_of(image, features, rng)
         primal, variance, depth = (stack[name].copy() for name in ("primal", "primal_var", "depth"))
@@ -166,6 +183,6 @@ def test_pixels_that_are_not_finite_do_no_harm(rng):
 
 def test_neither_torch_nor_mitsuba_is_imported():
     code = (
-        "import sys, ngpt.sequence.history, ngpt.cli.denoise; print({'torch', 'mitsuba', 'drjit'} & sys.modules.keys())"
+        "import sys, ngpt, ngpt.cli.denoise; ngpt.Temporal(); print({'torch', 'mitsuba', 'drjit'} & sys.modules.keys())"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"

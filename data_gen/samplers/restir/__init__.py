@@ -1,1 +1,1 @@
-"""Paths that are kept from frame to frame: the sampler ``restir``, for sequences."""
+"""Paths that are kept from frame to frame: the sampler ``restir``, for shots."""

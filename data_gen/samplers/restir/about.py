@@ -8,7 +8,7 @@ from data_gen.samplers.shared import CONNECTABLE, surfaces_alone
 register(
     FrameSampler(
         "restir",
-        "gradients of paths that are reused from frame to frame (sequences)",
+        "gradients of paths that are reused from frame to frame (shots)",
         "data_gen.samplers.restir.sampler",
         refuses=surfaces_alone("restir"),
         options={

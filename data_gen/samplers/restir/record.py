@@ -47,7 +47,7 @@ MOST_VERTICES = (1 << _COUNT_BITS) - 1
 class Record:
     """A path that lives in the pixel of its ``place``. 20 words of 4 bytes, RGB variants only."""
 
-    pixel: mi.UInt32  # whose numbers the path was sampled with; ``sample`` counts on over the frames of a sequence
+    pixel: mi.UInt32  # whose numbers the path was sampled with; ``sample`` counts on over the frames of a shot
     sample: mi.UInt32
     place: mi.Point2f  # on the film, in pixels: where the path lives now, at first where its camera sample fell
     word: mi.UInt32  # kind, ``sampled``, ``behind``, and how many vertices are left by replay
