@@ -51,15 +51,18 @@ def address(file: Path) -> str:
 
 
 def reference() -> dict[str, str]:
-    """Pages of the Python reference: what `ngpt` offers, and what `data_gen` does to who renders."""
-    homes = {}
-    for node in ast.walk(ast.parse((ROOT / "ngpt" / "__init__.py").read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("ngpt."):
-            homes |= {alias.name: f"{node.module}.{alias.name}" for alias in node.names if alias.name != "__version__"}
-    pages = {"ngpt": "# ngpt\n\n" + "\n\n".join(f"::: {homes[name]}" for name in sorted(homes, key=str.lower))}
-    modules = ("session", "render", "adaptive")
-    rendering = [f"::: data_gen.{name}" for name in modules if (ROOT / "data_gen" / f"{name}.py").exists()]
-    return pages | {"data_gen": "# data_gen\n\nRendering with Mitsuba 3.\n\n" + "\n\n".join(rendering)}
+    """Pages of the Python reference: the public names of both packages, where they are defined."""
+    pages = {}
+    for package in ("ngpt", "data_gen"):
+        homes = {}
+        for node in ast.walk(ast.parse((ROOT / package / "__init__.py").read_text())):
+            if isinstance(node, ast.ImportFrom) and node.module != f"{package}.version":
+                homes |= {
+                    alias.name: node.module for alias in node.names if f"{node.module}.".startswith(f"{package}.")
+                }
+        blocks = [f"::: {homes[name]}.{name}" for name in sorted(homes, key=str.lower)]
+        pages[package] = "\n\n".join([f"# {package}", *blocks])
+    return pages
 
 
 def on_files(files, config):
