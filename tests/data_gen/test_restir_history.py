@@ -5,7 +5,8 @@ from functools import cache
 import numpy as np
 import pytest
 
-from data_gen.samplers.restir.footprint import confidence_after, pair_motions
+from data_gen.samplers.restir.footprint import pair_motions
+from data_gen.samplers.restir.reservoir import confidence_after
 from ngpt.testing import z_test
 
 SIZE, CHAINS, FRAMES = 24, 48, 3

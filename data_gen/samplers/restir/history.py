@@ -39,12 +39,12 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.restir.carry import Carry, Stage
 from data_gen.samplers.restir.evaluate import Shifted, evaluate_record
 from data_gen.samplers.restir.events import check
-from data_gen.samplers.restir.footprint import CORNERS, confidence_after, pair_motions
+from data_gen.samplers.restir.footprint import CORNERS, pair_motions
 from data_gen.samplers.restir.layout import RESERVOIRS, STEPS, Layout, across, step
 from data_gen.samplers.restir.pose import Pose
 from data_gen.samplers.restir.record import Record, gather, select
 from data_gen.samplers.restir.requests import Request, Requests, evaluate_some
-from data_gen.samplers.restir.reservoir import Reservoir, choose, difference, part, weigh, weight_of
+from data_gen.samplers.restir.reservoir import Reservoir, choose, confidence_after, difference, part, weigh, weight_of
 from data_gen.samplers.restir.walk import Candidate, choices, walk
 
 

@@ -2,7 +2,8 @@ r"""Reservoirs: of many paths one, with a weight that makes up for the others. P
 
 A reservoir holds one path of its pixel, or of its pair of pixels. ``value`` · ``W`` is unbiased for the integral over
 all paths, for whatever path it holds: W is an estimate of 1 / density. M, the confidence, says how many candidates have
-been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget.
+been seen; it weighs reservoirs against each other and is held below a cap, so that a chain can forget: that is
+``confidence_after``.
 
 All values are light, or one sign of a difference: never negative. What paths are chosen by, p̂, is their luminance.
 
@@ -18,11 +19,14 @@ All values are light, or one sign of a difference: never negative. What paths ar
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
+from data_gen.samplers.restir.footprint import CORNERS
 from data_gen.samplers.restir.record import Record
 
 
@@ -88,3 +92,33 @@ def difference(first: mi.Spectrum, second: mi.Spectrum, side: mi.UInt32) -> mi.S
 def part(value: mi.Spectrum, sign: int) -> mi.Spectrum:
     """The positive or the negative part of a difference, each not negative: it is their difference."""
     return dr.maximum(sign * value, 0)
+
+
+def confidence_after(
+    before: np.ndarray, motions: np.ndarray, steps: Iterable[tuple[int, int]], cap: float
+) -> np.ndarray:
+    """(steps, H, W) float32: a frame's confidence, 1 and by areas that of the frame ``before``; at most ``cap``.
+
+    0 for pairs that reach over the edge of the film. By motion alone: what has no random numbers in it may decide what
+    counts.
+    """
+    count, height, width = before.shape
+    y, x = np.mgrid[:height, :width]
+    after = np.ones((count, height, width))
+    for domain, (right, down) in enumerate(steps):
+        known = np.isfinite(motions[domain]).all(axis=-1)
+        place = np.stack([x, y], axis=-1) + np.where(known[..., None], motions[domain], -2)
+        base = np.floor(place).astype(np.int64)
+        part = place - base
+        for corner in CORNERS:
+            at = base + corner
+            inside = ((at >= 0) & (at < (width, height))).all(axis=-1)
+            area = np.prod(np.where(corner, part, 1 - part), axis=-1)
+            column, row = np.where(inside[..., None], at, 0).transpose(2, 0, 1)
+            after[domain] += np.where(inside & known, area * before[domain, row, column], 0)
+        after[domain] = np.minimum(after[domain], cap)
+        if right:
+            after[domain, :, -right:] = 0
+        if down:
+            after[domain, -down:] = 0
+    return after.astype(np.float32)
