@@ -130,19 +130,3 @@ def test_batches_count_by_their_samples(rng):
     assert np.allclose(means, samples.mean(axis=1), atol=1e-5)
     assert variances.mean() == pytest.approx(4 / 5, rel=0.1) == pytest.approx(means.var(), rel=0.2)
     assert np.isnan(difference(zero[:1], zero[:1])[1]).all()
-
-
-def test_sequences_have_it_and_nothing_else_changes(renderer):
-    from data_gen.frames.shot import render_shot
-
-    def stacks(frames, **options):
-        shot = moving("diffuse", 0.05, lamp=(0.1, 0, 0))
-        return dict(render_shot(shot, frames, 2, 7, sampler="primal", **options))
-
-    plain, paired = stacks([0, 1, 2]), stacks([0, 1, 2], dt=3)
-    for frame, stack in plain.items():
-        assert all(np.array_equal(stack[name], paired[frame][name], equal_nan=True) for name in stack.names)
-        assert {"dt", "dt_var"} & set(stack.names) == set()
-    assert np.array_equal(stacks([2], dt=3)[2]["dt"], paired[2]["dt"], equal_nan=True)
-    assert paired[2].attributes["ngpt:pairs"] == 3
-    assert not np.array_equal(paired[1]["dt"], paired[2]["dt"]) and np.isfinite(paired[1]["dt"]).mean() > 0.8

@@ -28,6 +28,11 @@ def identity(stack):
     return stack["primal"]
 
 
+def played(temporal, stacks):
+    """The results over time."""
+    return [temporal.next(stack, smooth(stack)) for stack in stacks]
+
+
 @pytest.mark.parametrize("method", [identity, smooth])
 def test_a_shot_at_rest_converges(rng, history, method):
     image, features = view()
@@ -49,10 +54,9 @@ def test_a_camera_that_moves_by_one_pixel_finds_its_neighbour(rng, history):
     one, other = frame_of(image, features, rng), frame_of(image, features, rng)
     moved = GradientStack({name: np.roll(layer, -1, axis=1) for name, layer in other.layers.items()})
     moved = moved.replace(motion=np.broadcast_to([1.0, 0.0], (*SIZE, 2)))
-    rest, path = history(), history()
-    rest.next(one, smooth(one))
+    path = history()
     path.next(one, smooth(one))
-    at_rest, on_path = rest.next(other, smooth(other)), path.next(moved, np.roll(smooth(other), -1, axis=1))
+    at_rest, on_path = played(history(), [one, other])[1], path.next(moved, np.roll(smooth(other), -1, axis=1))
     # Windows see other things near the border, and some statistics are those of the whole image.
     inside = np.s_[14:-14, 14:-15]
     wrong, blended = (np.abs(on_path - np.roll(image, -1, axis=1))[inside] for image in (at_rest, smooth(other)))
@@ -70,8 +74,7 @@ def test_what_comes_into_sight_takes_nothing_from_what_hid_it(rng, history, name
     changed[shown] = {"albedo": 0.1, "normal": [1, 0, 0], "depth": 9}[name]
     now = now.replace(**{name: changed})
     temporal = history()
-    temporal.next(before, smooth(before))
-    result = temporal.next(now, smooth(now))
+    _, result = played(temporal, [before, now])
     within = np.s_[11:29, 6:24]
     assert np.allclose(temporal.weight[within], 0, atol=1e-4)
     assert np.allclose(result[within], smooth(now)[within], atol=1e-3)
@@ -88,22 +91,18 @@ def test_a_cut_restarts(rng, history):
         GradientStack({k: v[:20] for k, v in stacks[1].layers.items()}),
     ):
         temporal = history()
-        temporal.next(stacks[0], smooth(stacks[0]))
-        assert np.array_equal(temporal.next(second, smooth(second)), smooth(second))
+        assert np.array_equal(played(temporal, [stacks[0], second])[1], smooth(second))
         assert temporal.share == 0
-    temporal.next(stacks[1], smooth(stacks[1]))  # a cut, too, and a beginning
-    temporal.next(stacks[2], smooth(stacks[2]))
+    played(temporal, stacks[1:3])  # a cut, too, and a beginning
     assert temporal.share > 0.3
 
 
 def test_history_of_another_light_is_left_alone(rng, history):
     image, features = view()
     temporal = history()
-    for _ in range(LONGEST):
-        stack = frame_of(image, features, rng)
-        temporal.next(stack, smooth(stack))
+    played(temporal, [frame_of(image, features, rng) for _ in range(LONGEST)])
     stack = frame_of(2 * image, features, rng)
-    result = temporal.next(stack, smooth(stack))
+    (result,) = played(temporal, [stack])
     assert temporal.share < 0.05
     assert mse(result, 2 * image) < 1.2 * mse(smooth(stack), 2 * image)
 
@@ -124,10 +123,7 @@ def test_no_step_of_slow_changes_costs_more_than_it_gains(rng, history):
 @pytest.mark.parametrize("scale", [0.0, 1e-8, 1e10])
 def test_sizes_and_extremes(rng, history, size, scale):
     image, features = view(*size)
-    temporal = history()
-    for _ in range(3):
-        stack = frame_of(scale * image, features, rng, sigma=0.2 * scale)
-        result = temporal.next(stack, smooth(stack))
+    for result in played(history(), [frame_of(scale * image, features, rng, sigma=0.2 * scale) for _ in range(3)]):
         assert np.isfinite(result).all() and result.shape == image.shape
 
 
@@ -135,11 +131,8 @@ def test_sizes_and_extremes(rng, history, size, scale):
 def test_exposure_does_not_matter(rng, history, k):
     image, features = view()
     stacks = [frame_of(image, features, rng) for _ in range(3)]
-    plain, scaled = history(), history()
-    for stack in stacks:
-        result = plain.next(stack, smooth(stack))
-        bright = stack.replace(primal=k * stack["primal"], primal_var=k**2 * stack["primal_var"])
-        assert np.allclose(scaled.next(bright, k * smooth(stack)), k * result, rtol=1e-3, atol=1e-4 * k)
+    scaled = [stack.replace(primal=k * stack["primal"], primal_var=k**2 * stack["primal_var"]) for stack in stacks]
+    assert np.allclose(played(history(), scaled), k * np.array(played(history(), stacks)), rtol=1e-3, atol=1e-4 * k)
 
 
 def test_direct_emission_is_that_of_this_frame(rng, history):
@@ -158,11 +151,8 @@ def test_direct_emission_is_that_of_this_frame(rng, history):
 @pytest.mark.parametrize("names", [("primal_var",), ("albedo", "normal", "depth"), ("primal_var", "depth")])
 def test_variances_and_features_are_not_needed(rng, history, names):
     image, features = view()
-    temporal, last = history(), 0.0
-    for _ in range(8):
-        stack = without(frame_of(image, features, rng), *names)
-        last = mse(temporal.next(stack, smooth(stack)), image) / mse(smooth(stack), image)
-    assert last < 0.9
+    stacks = [without(frame_of(image, features, rng), *names) for _ in range(8)]
+    assert mse(played(history(), stacks)[-1], image) < 0.9 * mse(smooth(stacks[-1]), image)
 
 
 def test_pixels_that_are_not_finite_do_no_harm(rng, history):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from shots import frame_of
 
 pytest.importorskip("torch")
 
@@ -10,7 +11,6 @@ import torch
 from ngpt.sequence import train as training
 from ngpt.sequence.network import BANDS, INPUTS, Network
 from ngpt.sequence.train import Clip, as_corrections, errors, loss, network, play, scores, train
-from ngpt.stack import GradientStack
 
 SIZE = 16
 
@@ -28,10 +28,8 @@ def clip_of(seed, frames=5, flash=0.0):
     stacks, references, halves = [], [], []
     for i in range(frames):
         truth = image * np.float32(1 + flash * (i % 2))
-        layers = {"primal": truth + 0.2 * rng.normal(size=truth.shape), "primal_var": np.full(truth.shape, 0.04)}
-        layers |= {"direct": np.zeros_like(truth), "motion": np.zeros((SIZE, SIZE, 2))}
-        layers |= {"albedo": np.full(truth.shape, 0.5), "depth": np.full((SIZE, SIZE, 1), 3.0)}
-        stacks.append(GradientStack({name: np.float32(layer) for name, layer in layers.items()}))
+        beside = {"direct": 0 * truth, "albedo": np.full(truth.shape, 0.5), "depth": np.full((SIZE, SIZE, 1), 3.0)}
+        stacks.append(frame_of(truth, beside, rng))
         pair = tuple(truth + np.float32(0.05 * rng.normal(size=truth.shape)) for _ in range(2))
         halves.append(pair)
         references.append((pair[0] + pair[1]) / 2)
