@@ -1,4 +1,4 @@
-"""What gradients cost and what they are worth, scene by scene, in one run: the table of docs/lab/sampler-table.md.
+"""What gradients cost and what they are worth, scene by scene, in one run: bench/results/sampler.json.
 
     python -m bench.sampler --folder SCENES [--maps NAME ...]
 
@@ -13,8 +13,8 @@ Rendered are the built-in scenes and each FOLDER/*/scene.xml that `gpt` can rend
                more samples as it has time for; time to reconstruct is not counted, and listed in the results
 
 References are rendered for a fixed time, kept in CACHE, and taken from there the next time. A run that was broken off
-goes on where it ended if it is started with the same arguments. Written are bench/results/sampler.json, the table, and
-for each scene named by --maps docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
+goes on where it ended if it is started with the same arguments. Written are the results, and for each scene
+named by --maps docs/images/NAME-gradients.png, see ngpt/evaluation/gradientmap.py.
 """
 
 import argparse
@@ -35,7 +35,6 @@ from ngpt.evaluation.references import reference_noise
 from ngpt.measure.metrics import compare
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
-from ngpt.system.writing import write_text
 
 METHODS = ("l2", "l1", "wcv")
 METRIC = "relMSE trimmed"
@@ -91,7 +90,6 @@ def run(args: argparse.Namespace) -> None:
             result["scenes"][name] = row
             save(args.output, result)
             print(f"{line(name, row)} {time.perf_counter() - start:.0f} s", flush=True)
-    write_text(args.docs / "lab" / "sampler-table.md", table(result))
 
 
 def bench_scene(scene_file: str, name: str, args: argparse.Namespace) -> dict | None:
@@ -200,39 +198,6 @@ def line(name: str, row: dict) -> str:
         f"{name:16} cost {row['cost']['median']:.2f}  variance dx {row['variance']['dx']:.1f} "
         f"dy {row['variance']['dy']:.1f}  error over path: {errors}"
     )
-
-
-def table(result: dict) -> str:
-    """Markdown: a row for each scene, and what is in the middle and worst."""
-    rows = result["scenes"]
-    heads = ["scene", "ns / sample, `path`", "cost", "quartiles", "compile s, `path`", "`gpt`", "variance dx", "dy"]
-    heads += ["relMSE `path`", *(f"`{method}`" for method in METHODS), "reference noise"]
-    lines = [f"| {' | '.join(heads)} |", "|---" + "|--:" * (len(heads) - 1) + "|"]
-    for name, row in rows.items():
-        cost, compiled, errors = row["cost"], row["compile seconds"], relative_errors(row)
-        cells = [name, f"{row['seconds per sample']['path'] * 1e9:.0f}", f"{cost['median']:.2f}"]
-        cells += [f"{cost['low']:.2f} .. {cost['high']:.2f}", f"{compiled['path']:.1f}", f"{compiled['gpt']:.1f}"]
-        cells += [f"{row['variance']['dx']:.1f}", f"{row['variance']['dy']:.1f}"]
-        cells += [f"{row[METRIC]['path']['median']:.4f}"]
-        # Worse than plain path tracing: what must not be overlooked.
-        cells += [f"{ratio:.2f}" if ratio < 1 else f"**{ratio:.2f}**" for ratio in errors.values()]
-        lines.append(f"| {' | '.join(cells)} | {row['reference']['noise']:.5f} |")
-    picks = [lambda row: row["cost"]["median"], lambda row: row["variance"]["dx"], lambda row: row["variance"]["dy"]]
-    picks += [lambda row, method=method: relative_errors(row)[method] for method in METHODS]
-    middle = [statistics.median(pick(row) for row in rows.values()) for pick in picks]
-    worst = [(min if i in (1, 2) else max)(pick(row) for row in rows.values()) for i, pick in enumerate(picks)]
-    for label, (cost, dx, dy, *errors) in (("*median*", middle), ("*worst*", worst)):
-        cells = [label, "", f"{cost:.2f}", "", "", "", f"{dx:.1f}", f"{dy:.1f}", "", *(f"{e:.2f}" for e in errors), ""]
-        lines.append(f"| {' | '.join(cells)} |")
-    where, (width, height) = result["metadata"], result["size"]
-    versions = " ".join(f"{name} {where['versions'][name]}" for name in ("mitsuba", "drjit"))
-    note = (
-        f"{width}x{height}, {result['spp']} spp (times: {result['timing spp']}), {result['repeats']} renders of each. "
-        "Columns `l2`, `l1` and `wcv`: their relMSE over that of `path` at equal rendering time, below 1 where "
-        f"gradients pay; `path` has {result['spp']} spp times the cost. {versions}, {where['threads']} threads of "
-        f"{where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.sampler`, which explains it."
-    )
-    return "\n".join(lines) + f"\n\n{note}\n"
 
 
 if __name__ == "__main__":
