@@ -245,7 +245,7 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
-    write(target, result.image, like=stack, overwrite=overwrite, attributes=result.attributes | over_time)
+    write(target, result.image, like=stack, overwrite=overwrite, attributes={**result.attributes, **over_time})
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,

@@ -145,9 +145,8 @@ def test_code_written_for_mitsuba_runs(renderer, arrays):
     denoiser = ngpt.Denoiser([26, 18], True, True, False, False)
     for to_sensor in (world.inverse(), mi.Transform4f(world).inverse()):
         result = denoiser(noisy, albedo, normals, to_sensor, mi.TensorXf(), mi.TensorXf())
-        expected = ngpt.denoise(
-            full_stack(18, 26)["primal"], albedo=arrays["albedo"], normal=full_stack(18, 26)["normal"]
-        )
+        stack = full_stack(18, 26)
+        expected = ngpt.denoise(stack["primal"], albedo=stack["albedo"], normal=stack["normal"])
         assert np.allclose(result.numpy(), expected, rtol=1e-3, atol=1e-5)
 
 
