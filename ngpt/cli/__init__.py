@@ -1,5 +1,7 @@
 """The command ``ngpt``: one verb, one module, which is imported only when its verb is called.
 
+Verbs that render are in ``data_gen.cli``, and come by an entry point: nothing here imports the renderer.
+
 Exit status: 0 when everything asked for was done, 1 when some files failed or images differ, 2 for an error that
 stopped the command, 130 when interrupted.
 """
@@ -12,41 +14,49 @@ from typing import NamedTuple, NoReturn
 
 from ngpt.errors import NgptError
 from ngpt.system.console import Console, run_command
+from ngpt.system.parts import NO_RENDERER, brought
 from ngpt.version import __version__
 
 
 class Verb(NamedTuple):
-    """What a verb does, which extra of ngpt-recon brings what it needs, and what an interrupt means for its work."""
+    """What a verb does, the package whose module of the verb's name does it, which extra of ngpt-recon brings what it
+    needs, and what an interrupt means for its work."""
 
     summary: str
+    room: str = "ngpt.cli"
     extra: str = ""
     interrupted: str = "interrupted"
 
 
-_CONTINUES = "interrupted; run the same command to continue"
+CONTINUES = "interrupted; run the same command to continue"
+_GOES_ON = "interrupted; --skip-existing goes on with what is not done yet"
 
 VERBS = {
-    "demo": Verb("render built-in scenes, reconstruct with every method, and write a report to open in a browser"),
-    "render": Verb("render a scene to a gradient stack"),
-    "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
-    "denoise": Verb(
-        "reconstruct images from gradient stacks",
-        interrupted="interrupted; --skip-existing goes on with what is not done yet",
-    ),
+    "denoise": Verb("reconstruct images from gradient stacks", interrupted=_GOES_ON),
     "info": Verb("say what a file holds, or what a scene requires"),
+    "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
     "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
     "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
-    "advise": Verb("say which method and how many samples to use, for a time or an error"),
-    "dataset": Verb("make a training set, or continue one", "train", _CONTINUES),
-    "train": Verb("train a network, or continue a run", "train", _CONTINUES),
+    "train": Verb("train a network, or continue a run", extra="train", interrupted=CONTINUES),
     "evaluate": Verb(
         "compare methods on the same scenes with the same clock",
-        "train",
-        "interrupted; the same command goes on from here",
+        extra="train",
+        interrupted="interrupted; the same command goes on from here",
     ),
-    "export": Verb("write a reconstruction as an ONNX file", "export"),
+    "export": Verb("write a reconstruction as an ONNX file", extra="export"),
 }
+
+
+def all_verbs() -> dict[str, Verb]:
+    """Those of other packages, which render, and ours.
+
+    A package names its own, a dictionary like ``VERBS``, by an entry point of the group "ngpt.verbs".
+    """
+    found: dict[str, Verb] = {}
+    for verbs in brought("ngpt.verbs"):
+        found |= verbs
+    return found | VERBS
 
 
 class _Parser(argparse.ArgumentParser):
@@ -61,9 +71,11 @@ def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
     # The options of ngpt itself have no values: the first word that is none of them is the verb.
-    verb = next((word for word in words if not word.startswith("-")), "")
-    interrupted = VERBS[verb].interrupted if verb in VERBS else "interrupted"
-    return run_command(lambda: _work(_parser(verb), words, "ngpt"), interrupted=interrupted)
+    called = next((word for word in words if not word.startswith("-")), "")
+    # To look for those of others takes time.
+    verbs = VERBS if called in VERBS else all_verbs()
+    interrupted = verbs[called].interrupted if called in verbs else "interrupted"
+    return run_command(lambda: _work(_parser(called, verbs), verbs, words, "ngpt"), interrupted=interrupted)
 
 
 def door(verb: str, program: str, arguments: list[str] | None = None, name: str = "ngpt") -> int:
@@ -72,38 +84,43 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
     ``name`` is what its errors begin with.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    parser = argparse.ArgumentParser(program)
-    return run_command(lambda: _work(_filled(parser, verb), words, program), name, VERBS[verb].interrupted)
+    verbs, parser = all_verbs(), argparse.ArgumentParser(program)
+    return run_command(
+        lambda: _work(_filled(parser, verb, verbs[verb]), verbs, words, program), name, verbs[verb].interrupted
+    )
 
 
-def _parser(called: str) -> argparse.ArgumentParser:
-    """Of all verbs, with the arguments of the one that is called."""
+def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
+    """Of all ``verbs``, with the arguments of the one that is called."""
+    if called and called not in verbs and verbs.keys() == VERBS.keys():
+        raise NgptError(f"there is no verb '{called}' here; {NO_RENDERER}")
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
-    verbs = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
-    for verb, (summary, *_) in VERBS.items():
-        subparser = verbs.add_parser(verb, help=summary)
-        if verb == called:
-            _filled(subparser, verb)
+    subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
+    for name, verb in verbs.items():
+        subparser = subparsers.add_parser(name, help=verb.summary)
+        if name == called:
+            _filled(subparser, name, verb)
     return parser
 
 
-def _filled(parser: argparse.ArgumentParser, verb: str) -> argparse.ArgumentParser:
+def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.ArgumentParser:
     """The parser, with what its verb is and the arguments of it."""
-    summary = VERBS[verb].summary
-    parser.description = f"{summary[0].upper()}{summary[1:]}."
-    parser.set_defaults(verb=verb)
+    parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
+    parser.set_defaults(verb=name)
     parser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
-    import_module(f"ngpt.cli.{verb}").add_arguments(parser)
+    import_module(f"{verb.room}.{name}").add_arguments(parser)
     return parser
 
 
-def _work(parser: argparse.ArgumentParser, words: list[str], program: str) -> int:
+def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[str], program: str) -> int:
     args = parser.parse_args(words)
-    args.command = f"{program} {shlex.join(words)}"
+    args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
-        return import_module(f"ngpt.cli.{args.verb}").run(args, Console(args.quiet))
+        return import_module(f"{verb.room}.{args.verb}").run(args, Console(args.quiet))
     except ModuleNotFoundError as error:
-        if not (extra := VERBS[args.verb].extra):
+        if not verb.extra:
             raise
-        raise NgptError(f"{args.verb} needs the package '{error.name}'; `pip install 'ngpt-recon[{extra}]'`") from error
+        raise NgptError(
+            f"{args.verb} needs the package '{error.name}'; `pip install 'ngpt-recon[{verb.extra}]'`"
+        ) from error

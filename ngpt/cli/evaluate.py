@@ -27,10 +27,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.evaluation.run import evaluate
     from ngpt.report.evaluation import write_evaluation_report
     from ngpt.report.page import oversize
+    from ngpt.system.parts import find_renderer
 
     config = read_config(path)
     config = replace(config, scenes=(*config.scenes, *args.scenes))
-    results = evaluate(config, args.out, console, args.command, args.cache)
+    results = evaluate(config, args.out, console, args.command, find_renderer(), args.cache)
     page = write_evaluation_report(args.out, args.out / "report.html", overwrite=True)
     if large := oversize(page):
         console.say(large)

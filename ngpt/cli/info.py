@@ -17,6 +17,7 @@ from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
+from ngpt.system.parts import find_renderer
 from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
 from ngpt.training.run_summary import summary as run_summary
@@ -54,10 +55,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return 1 if report["problems"] else 0
     elif Path(args.file).suffix.lower() in NETWORKS and Path(args.file).exists():
         show(describe(args.file), args.json)
-    elif not Path(args.file).exists() and (found := sampler(args.file)):
-        show(found, args.json)
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
-        show(scene(args.file, dict(args.define)), args.json)
+        show(other(args.file, dict(args.define)), args.json)
     else:
         show(stack(read(args.file, dict(args.layer), args.untrusted)), args.json)
     return 0
@@ -70,46 +69,19 @@ def overview() -> dict:
         "methods": {name: method.missing() or method.summary for name, method in METHODS.items()},
     }
     try:
-        use_renderer()
+        return report | find_renderer().overview()
     except NgptError as error:
         return report | {"rendering": f"not available: {error}"}
-    from data_gen.samplers import by_standing
-    from data_gen.scenes.builtin import SCENES
-
-    titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
-    samplers = {
-        title: {name: entry.summary for name, entry in by_standing(standing).items()}
-        for title, standing in titles.items()
-    }
-    scenes = {name: (scene.__doc__ or "").split("\n")[0] for name, scene in SCENES.items()}
-    return report | samplers | {"built-in scenes": scenes}
 
 
-def sampler(name: str) -> dict:
-    """What the registry says of a sampler; nothing where there is none of that name."""
-    from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-
-    entry = SAMPLERS.get(name) or FRAME_SAMPLERS.get(name)
-    if entry is None:
-        return {}
-    options = {option: str(value) for option, value in entry.options.items()}
-    return {"sampler": name, "summary": entry.summary, "standing": entry.standing, "options": options}
-
-
-def scene(name: str, parameters: dict[str, str]) -> dict:
-    """What a scene is made of and how it would be rendered."""
+def other(name: str, parameters: dict[str, str]) -> dict:
+    """What a name is that is no file of ours: a sampler, or a scene and how it would be rendered."""
     if Path(name).suffix.lower() in (".exr", *NETWORKS):
         raise NgptError(f"{name}: not found; check the name")
-    use_renderer()
-    from data_gen.inspect import inspect_scene
-
-    return {"scene": name} | inspect_scene(name, parameters)
-
-
-def use_renderer() -> None:
-    from data_gen.backend import DEFAULT_VARIANT, use_variant
-
-    use_variant(DEFAULT_VARIANT)
+    renderer = find_renderer()
+    if not Path(name).exists() and (found := renderer.describe_sampler(name)):
+        return found
+    return {"scene": name} | renderer.inspect(name, parameters)
 
 
 def stack(stack: GradientStack) -> dict:

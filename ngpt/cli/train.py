@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     config = configs.find_config(args.config, configs.TRAINING)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
+    from ngpt.system.parts import find_renderer
     from ngpt.training.cost import cost
     from ngpt.training.distributed import Processes
     from ngpt.training.examples import Mixture, open_crops, split
@@ -54,7 +55,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             stack.enter_context(exclusive(out))
         on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
         crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
-        streams = [stack.enter_context(stream(f)) for f in settings.data.folders if f.endswith(".toml")]
+        made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
+        streams = [stack.enter_context(find_renderer().stream(config)) for config in made]
         training = Mixture(crops, *streams)
         # What is read from a stream is replaced: it must not be kept.
         trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams, say=say)
@@ -71,12 +73,3 @@ def run(args: argparse.Namespace, console: Console) -> int:
     processes.close()
     say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
     return 0 if finished or not trainer.signal else 128 + trainer.signal
-
-
-def stream(config: str):
-    """Crops of that dataset configuration, rendered in another process while they are trained on."""
-    from data_gen.dataset.config import read_config
-    from data_gen.dataset.jobs import processes
-    from data_gen.dataset.stream import Stream
-
-    return Stream(read_config(configs.find_config(config, configs.DATASET)), processes(1))

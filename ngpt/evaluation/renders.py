@@ -35,7 +35,7 @@ class Render:
 
     @property
     def options(self) -> dict[str, Any]:
-        """Arguments of ``data_gen.render.render_stack``."""
+        """What the renderer is told of it: ``ngpt.renderer.Options``."""
         given: dict[str, Any] = dict(option.split("=") for option in self.given.split(", ") if option)
         return {"sampler": self.sampler} | given | ({"with_features": False} if self.kind == "path" else {})
 

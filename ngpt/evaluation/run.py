@@ -19,6 +19,7 @@ from ngpt.evaluation.stacks import USUAL, Costs, SceneStacks
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
+from ngpt.renderer import Renderer
 from ngpt.report.display import auto_exposure
 from ngpt.report.evaluation import FORMAT
 from ngpt.stack import GradientStack
@@ -27,8 +28,10 @@ from ngpt.system.files import exclusive
 from ngpt.system.machine import metadata
 
 
-def evaluate(config: Config, out: Path, console: Console, command: str, cache: Path | None = None) -> dict[str, Any]:
-    """Fills the folder ``out`` and returns what its results.json holds.
+def evaluate(
+    config: Config, out: Path, console: Console, command: str, renderer: Renderer, cache: Path | None = None
+) -> dict[str, Any]:
+    """Fills the folder ``out`` and returns what its results.json holds; ``renderer`` renders what is not there yet.
 
     What is in the cache, ``out``/cache by default, is not computed again: an interrupted run goes on when it is started
     again. Whatever a scene or a method lacks becomes a row that says so.
@@ -85,7 +88,7 @@ def evaluate(config: Config, out: Path, console: Console, command: str, cache: P
                 progress(done + n, total)
 
             try:
-                stacks = SceneStacks(name, source, config, cache, console.say)
+                stacks = SceneStacks(name, source, config, cache, renderer, say=console.say)
                 _scene(stacks, columns, lacks, scorer, results, out, advance)
             except NgptError as error:
                 console.error(f"{name}: {error}")

@@ -1,11 +1,19 @@
 """Stacks, references and costs of one scene: rendered once, then taken from the cache.
 
+<<<<<<< HEAD
 The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
 files, the size, the code that renders, and Mitsuba's version. In it are RENDER-SPP-SEED.exr, where RENDER is a kind of
 stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are some
 ("gradients-gpt-shift=manifold"), and SPP the number of samples that were rendered; the two halves of references,
 reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
 reference may be one image.
+=======
+The cache has folders for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
+files, the size, Mitsuba's version, and the code that their sampler runs. In them are RENDER-SPP-SEED.exr, where RENDER
+is a kind of stack ("gradients"), followed by the sampler where it is not the usual one ("gradients-gpt-basic"), and SPP
+the number of samples that were rendered; the two halves of references, reference-*-a.exr and -b.exr; and cost-*.json. A
+folder of stacks of one's own looks the same, without the costs; its reference may be one image.
+>>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
 """
 
 from __future__ import annotations
@@ -20,10 +28,11 @@ from typing import Any
 from ngpt.errors import NgptError
 from ngpt.evaluation.averages import summary
 from ngpt.evaluation.config import Config
-from ngpt.evaluation.keys import renderer_hash, scene_hash
+from ngpt.evaluation.keys import scene_hash
 from ngpt.evaluation.references import HALVES, Reference, find_reference, read_reference
 from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
+from ngpt.renderer import Renderer
 from ngpt.stack import GradientStack
 from ngpt.system.machine import version
 from ngpt.system.writing import write_json
@@ -42,20 +51,43 @@ class SceneStacks:
     ``lacks``  why a render's columns are absent on this scene, by the render's name; filled by ``costs``
     """
 
-    def __init__(self, name: str, source: str, config: Config, cache: Path, say: Callable[[str], None]):
-        self.name, self.source, self.config, self.say = name, source, config, say
+    def __init__(
+        self,
+        name: str,
+        source: str,
+        config: Config,
+        cache: Path,
+        renderer: Renderer,
+        *,
+        say: Callable[[str], None] = lambda text: None,
+    ):
+        self.name, self.source, self.config, self.cache = name, source, config, cache
+        self.renderer, self.say = renderer, say
         self.given = Path(source).is_dir()
         self.lacks: dict[str, str] = {}
         self._auto = ""
         self._scene: Any = None
         self._warm: dict[str, GradientStack] = {}
+        self._parts: list[Any] = []
+        self._keys: dict[str, str] = {}
+        if not self.given:
+            scene = scene_hash(source) if Path(source).is_file() else renderer.scene_code(source)
+            self._parts = [scene, list(config.size), __version__, version("mitsuba")]
+
+    def key(self, sampler: str) -> str:
+        """What pictures by a sampler depend on."""
+        if sampler not in self._keys:
+            parts = json.dumps([*self._parts, self.renderer.code(sampler)])
+            self._keys[sampler] = hashlib.sha256(parts.encode()).hexdigest()
+        return self._keys[sampler]
+
+    def folder(self, sampler: str) -> Path:
+        """Where the pictures by a sampler are."""
         if self.given:
-            self.folder = Path(source)
-            return
-        parts = [scene_hash(source), list(config.size), renderer_hash(), __version__, version("mitsuba")]
-        self.key = hashlib.sha256(json.dumps(parts).encode()).hexdigest()
-        self.folder = cache / f"{name}-{self.key[:12]}"
-        self.folder.mkdir(parents=True, exist_ok=True)
+            return Path(self.source)
+        folder = self.cache / f"{self.name}-{self.key(sampler)[:12]}"
+        folder.mkdir(parents=True, exist_ok=True)
+        return folder
 
     def reference(self) -> Reference:
         """The reference that the configuration names, or the folder holds; else two halves, of half the budget each.
@@ -67,20 +99,29 @@ class SceneStacks:
             named = config.references[self.name]
             return read_reference([named] if isinstance(named, str) else named)
         if self.given:
-            return find_reference(self.folder)
+            return find_reference(Path(self.source))
         limit = f"{config.reference_spp}spp" if config.reference_spp else f"{config.reference_seconds:g}s"
+<<<<<<< HEAD
         render = config.render("features", config.reference_sampler)
         name = "-".join(["reference", *render.by.split(), limit])
         paths = [self.folder / f"{name}{half}.exr" for half in HALVES]
+=======
+        by = "" if config.reference_sampler == KINDS["path"] else f"{config.reference_sampler}-"
+        folder = self.folder(config.reference_sampler)
+        paths = [folder / f"reference-{by}{limit}{half}.exr" for half in HALVES]
+>>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
         for i, path in enumerate(paths):
             if not path.exists():
                 self.say(f"{self.name}: rendering the reference, half {i + 1} of {limit}")
                 scene = self.load()
-                from data_gen.render import render_stack
-
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
+<<<<<<< HEAD
                 write(path, render_stack(scene, spp, REFERENCE_SEED + i, seconds=seconds, **render.options))
+=======
+                sampler = config.reference_sampler
+                write(path, self.renderer.render(scene, spp, REFERENCE_SEED + i, sampler, seconds=seconds))
+>>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
@@ -92,32 +133,37 @@ class SceneStacks:
         """
         if self.given:
             return {}
-        spp, repeats = self.config.timing_spp, self.config.timing_repeats
-        clock = "" if self.config.time == "wall" else f"{self.config.time}-"
-        path = self.folder / f"cost-{clock}{spp}-{repeats}.json"
-        known: Costs = json.loads(path.read_text()) if path.exists() else {}
-        self._auto = known[USUAL.name]["sampler"] if known else _sampler(self._warm_up(USUAL))
+        usual = self._costs_in(USUAL)
+        self._auto = usual[USUAL.name]["sampler"] if USUAL.name in usual else _sampler(self._warm_up(USUAL))
         unit_of = self.clock
-        new = {r.name: r for r in map(self.resolve, (unit_of, *DEFAULTS, *renders)) if r.name not in known}
-        new = {name: render for name, render in new.items() if self._can(render)}
+        wanted = {render.name: render for render in map(self.resolve, (unit_of, *DEFAULTS, *renders))}
+        found = {name: self._costs_in(render).get(name) for name, render in wanted.items()}
+        known: Costs = {name: cost for name, cost in found.items() if cost is not None}
+        new = {name: render for name, render in wanted.items() if name not in known and self._can(render)}
         if unit_of.name in self.lacks:
             raise NgptError(f"the clock, sampler '{unit_of.sampler}', cannot be measured: {self.lacks[unit_of.name]}")
         if new:
             self.say(f"{self.name}: measuring what samples cost")
-            scene = self.load()
-            from data_gen.choosing.costs import measure
-
-            timed = {unit_of.name: unit_of} | new
-            seconds, _ = measure(
-                scene, {name: r.options for name, r in timed.items()}, spp, repeats, clock=self.config.time
-            )
-            found = {name: summary(values) for name, values in seconds.items()}
-            unit = known[unit_of.name]["median"] / found[unit_of.name]["median"] if unit_of.name in known else 1.0
-            for name in new:
-                known[name] = {key: value * unit for key, value in found[name].items()}
+            timed = {name: render.options for name, render in ({unit_of.name: unit_of} | new).items()}
+            spp, repeats = self.config.timing_spp, self.config.timing_repeats
+            seconds, _ = self.renderer.measure(self.load(), timed, spp, repeats, clock=self.config.time)
+            summaries = {name: summary(values) for name, values in seconds.items()}
+            unit = known[unit_of.name]["median"] / summaries[unit_of.name]["median"] if unit_of.name in known else 1.0
+            for name, render in new.items():
+                known[name] = {key: value * unit for key, value in summaries[name].items()}
                 known[name]["sampler"] = _sampler(self._warm[name])
-            write_json(path, known)
+                write_json(self._cost_file(render), self._costs_in(render) | {name: known[name]})
         return known
+
+    def _cost_file(self, render: Render) -> Path:
+        clock = "" if self.config.time == "wall" else f"{self.config.time}-"
+        name = f"cost-{clock}{self.config.timing_spp}-{self.config.timing_repeats}.json"
+        return self.folder(render.sampler) / name
+
+    def _costs_in(self, render: Render) -> Costs:
+        """What was measured with the code of the render's sampler."""
+        path = self._cost_file(render)
+        return json.loads(path.read_text()) if path.exists() else {}
 
     @property
     def clock(self) -> Render:
@@ -132,9 +178,7 @@ class SceneStacks:
         """How many samples the time of ``spp`` of the clock's buys; two at least, or two batches, for a variance."""
         if render == self.clock or not costs:
             return spp
-        from data_gen.samplers import SAMPLERS
-
-        least = 2 * max(1, SAMPLERS[costs[render.name]["sampler"]].batch)
+        least = 2 * max(1, self.renderer.batch(costs[render.name]["sampler"]))
         return max(least, round(spp * costs[self.clock.name]["median"] / costs[render.name]["median"]))
 
     def stack(self, render: Render, spp: int, seed: int) -> GradientStack:
@@ -143,11 +187,8 @@ class SceneStacks:
         if not path.exists():
             if self.given:
                 raise NgptError(f"{path}: no such stack")
-            scene = self.load()
-            from data_gen.choosing.costs import timed
-
             self._warm_up(render)
-            stack, seconds = timed(scene, render.options, spp, seed, self.config.time)
+            stack, seconds = self.renderer.timed(self.load(), render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
             write(path, stack)
         # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
@@ -156,30 +197,22 @@ class SceneStacks:
     def stack_key(self, render: Render, spp: int, seed: int) -> list:
         """What the stack depends on, without rendering it."""
         if not self.given:
-            return [self.key, render.name, spp, seed]
+            return [self.key(render.sampler), render.name, spp, seed]
         path = self._path(render, spp, seed)
         return [str(path), path.stat().st_mtime_ns if path.exists() else 0]
 
     def load(self) -> Any:
         if self._scene is None:
-            from data_gen.backend import use_variant
-
-            use_variant()
-            from data_gen.scenes.load import load_scene
-
-            self._scene = load_scene(self.source, self.config.size)
+            self._scene = self.renderer.load(self.source, self.config.size)
         return self._scene
 
     def _path(self, render: Render, spp: int, seed: int) -> Path:
-        return self.folder / f"{render.name.replace(' ', '-')}-{spp}-{seed}.exr"
+        return self.folder(render.sampler) / f"{render.name.replace(' ', '-')}-{spp}-{seed}.exr"
 
     def _warm_up(self, render: Render) -> GradientStack:
         """Has the kernels compiled, and returns the stack of one sample."""
-        scene = self.load()
-        from data_gen.choosing.costs import warm_up
-
         if render.name not in self._warm:
-            self._warm[render.name] = warm_up(scene, render.options)
+            self._warm[render.name] = self.renderer.warm_up(self.load(), render.options)
         return self._warm[render.name]
 
     def _can(self, render: Render) -> bool:

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import ngpt
+from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled
 from ngpt.cli import main
-from ngpt.cli.frame_patterns import frames, targets
 from ngpt.errors import NgptError
 
 

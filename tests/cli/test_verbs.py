@@ -8,7 +8,9 @@ import sys
 
 import pytest
 
-from ngpt.cli import VERBS, main
+from ngpt.cli import all_verbs, main
+
+VERBS = all_verbs()
 
 DOORS = {"dataset": "data_gen/__main__.py", "train": "train.py", "evaluate": "eval.py", "export": "export/__main__.py"}
 
@@ -81,7 +83,7 @@ def test_ctrl_c_says_what_becomes_of_the_work(verb, arguments, message, capfd, m
     def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(importlib.import_module(f"ngpt.cli.{verb}"), "run", interrupt)
+    monkeypatch.setattr(importlib.import_module(f"{VERBS[verb].room}.{verb}"), "run", interrupt)
     assert main([verb, *arguments]) == 130
     assert capfd.readouterr().err == f"ngpt: error: {message}\n"
     assert runpy.run_path(DOORS[verb])["main"](arguments) == 130

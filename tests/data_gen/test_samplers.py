@@ -307,6 +307,7 @@ def test_a_toy_is_found_by_all_that_ask(renderer, capsys, tmp_path):
 
 
 def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
+    from data_gen import service
     from data_gen.choosing import costs
     from ngpt.evaluation.config import Config
     from ngpt.evaluation.run import evaluate
@@ -331,7 +332,7 @@ def test_a_toy_is_compared_at_equal_time(renderer, tmp_path, monkeypatch):
         return costs.render_stack(scene, spp, seed, **options), spp * (3.0 if options["sampler"] == "toy" else 2.0)
 
     monkeypatch.setattr(costs, "timed", timed)
-    rows = {cell["method"]: cell for cell in evaluate(config, tmp_path, Console(quiet=True), "")["cells"]}
+    rows = {cell["method"]: cell for cell in evaluate(config, tmp_path, Console(quiet=True), "", service)["cells"]}
     assert rows.keys() == {"wcv (auto)", "wcv (toy)"} and not any(row["absent"] for row in rows.values())
     # The toy, whose samples cost more, gets fewer in the time, by whole batches.
     assert rows["wcv (auto)"]["spp used"] == 64

@@ -1,15 +1,15 @@
 """What a cached picture depends on: the code that renders it and the scene, not what is written about either."""
 
-import ast
 import re
 import shutil
 from pathlib import Path
 
 import pytest
 
+from data_gen import code, service
 from ngpt.evaluation import keys, stacks
 from ngpt.evaluation.config import Config
-from ngpt.evaluation.keys import library_hash, renderer_hash, scene_hash, source_hash
+from ngpt.evaluation.keys import library_hash, scene_hash, source_hash
 from ngpt.evaluation.stacks import SceneStacks
 
 ROOT = Path(__file__).parents[2]
@@ -19,7 +19,7 @@ ROOT = Path(__file__).parents[2]
 def tree(tmp_path, monkeypatch):
     """A copy of data_gen that the keys are made of."""
     shutil.copytree(ROOT / "data_gen", tmp_path / "data_gen", ignore=shutil.ignore_patterns("__pycache__"))
-    monkeypatch.setattr(keys, "_data_gen", lambda: tmp_path / "data_gen")
+    monkeypatch.setattr(code, "ROOT", tmp_path / "data_gen")
     return tmp_path / "data_gen"
 
 
@@ -29,8 +29,8 @@ def replace(path: Path, old: str, new: str) -> None:
     path.write_text(text.replace(old, new, 1))
 
 
-def key_of(scene: str, folder: Path) -> str:
-    return SceneStacks("s", scene, Config(scenes=(scene,)), folder, lambda text: None).key
+def key_of(scene: str, folder: Path, sampler: str = "gpt") -> str:
+    return SceneStacks("s", scene, Config(scenes=(scene,)), folder, service).key(sampler)
 
 
 def test_a_changed_weight_in_the_film_is_another_key(tree, tmp_path):
@@ -42,10 +42,34 @@ def test_a_changed_weight_in_the_film_is_another_key(tree, tmp_path):
     assert not set(before) & {key_of(scene, tmp_path) for scene in scenes}
 
 
-def test_a_new_file_that_renders_is_another_key(tree):
-    before = renderer_hash()
-    (tree / "samplers" / "toy.py").write_text("x = 1\n")
-    assert renderer_hash() != before
+def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
+    """What is shared changes all, a sampler's own code that sampler, and those that use it."""
+    names = ("auto", "gpt", "gmlt", "bdpt", "gbdpt", "primal", "ppm", "gpm")
+
+    def keys_of() -> dict[str, str]:
+        return {name: key_of("diffuse", tmp_path, name) for name in names}
+
+    def changed(file: str) -> set[str]:
+        before = keys_of()
+        (tree / file).write_text((tree / file).read_text() + "\nsomething = 1\n")
+        return {name for name, key in keys_of().items() if key != before[name]}
+
+    for shared in ("film/gradient_film.py", "render.py", "passes.py", "samplers/common.py", "samplers/registry.py"):
+        assert changed(shared) == set(names), shared
+    assert changed("samplers/studies/gmlt/chains.py") == changed("samplers/studies/gmlt/integrator.py") == {"gmlt"}
+    assert changed("samplers/gpt/about.py") == {"auto", "gpt"}
+    assert changed("samplers/gpt/offset_path.py") == {
+        "auto",
+        "gpt",
+        "gmlt",
+    }  # gmlt shifts the paths of its chains by it
+    assert {"ppm", "gpm"} <= changed("samplers/photons/map/trace.py") <= {"ppm", "gpm"}
+    (tree / "paths" / "fresh.py").write_text("x = 1\n")
+    before = keys_of()
+    path = tree / "samplers" / "primal" / "sampler.py"
+    path.write_text(path.read_text() + "\ndef late():\n    from data_gen.paths import fresh\n")
+    assert {name for name, key in keys_of().items() if key != before[name]} == {"primal"}
+    assert changed("paths/fresh.py") == {"primal"}
 
 
 def test_a_changed_colour_of_a_built_in_scene_is_another_key_of_built_in_scenes(tree, tmp_path):
@@ -70,7 +94,8 @@ def test_what_renders_nothing_does_not_change_the_key(tree, tmp_path):
     before = key_of("diffuse", tmp_path)
     film = tree / "film" / "gradient_film.py"
     film.write_text("# A remark.\n" + re.sub(r'"""(?=[A-Z])', '"""More words. ', film.read_text()))
-    for name in ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/costs.py", "__main__.py"):
+    files = ("dataset/crops.py", "scenes/procedural/scenes.py", "inspect.py", "choosing/costs.py", "__main__.py")
+    for name in (*files, "session.py", "cli/render.py", "samplers/studies/about.py", "samplers/__init__.py"):
         (tree / name).write_text((tree / name).read_text() + "\nsomething = 1\n")
     assert key_of("diffuse", tmp_path) == before
 
@@ -88,20 +113,6 @@ def test_a_docstring_of_a_report_changes_nothing(tree, tmp_path):
     assert len(library_hash()) == 64
 
 
-def test_what_renders_imports_nothing_that_is_left_out():
-    """But the built-in scenes, which have a key of their own."""
-    left_out = {f"data_gen.{name.removesuffix('.py').replace('/', '.')}" for name in keys._NOT_RENDERING}
-    seen = set()
-    for path in (ROOT / "data_gen").rglob("*.py"):
-        name = path.relative_to(ROOT / "data_gen").as_posix()
-        if any(name == part or name.startswith(f"{part}/") for part in keys._NOT_RENDERING):
-            continue
-        for node in ast.walk(ast.parse(path.read_text())):
-            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("data_gen"):
-                seen |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
-    assert {name for name in seen if name in left_out} == {"data_gen.scenes.builtin"}
-
-
 def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
     (tmp_path / "scene.xml").write_text('<scene><include filename="part.xml"/></scene>')
     (tmp_path / "part.xml").write_text('<string name="filename" value="meshes/m.ply"/><float value="0.5"/>')
@@ -113,4 +124,4 @@ def test_the_hash_of_a_scene_is_that_of_all_its_files(tmp_path):
     hashes.append(scene_hash(str(tmp_path / "scene.xml")))
     (tmp_path / "scene.xml").write_text("<scene/>")
     hashes.append(scene_hash(str(tmp_path / "scene.xml")))
-    assert len({*hashes, scene_hash("diffuse"), scene_hash("glossy")}) == 5
+    assert len({*hashes, code.scene_code("diffuse"), code.scene_code("glossy")}) == 5

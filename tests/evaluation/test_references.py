@@ -7,6 +7,7 @@ import pytest
 from folders import read, smooth_image, write_halves, write_scene
 
 import ngpt
+from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.references import find_reference, read_reference, reference_noise
 from ngpt.evaluation.run import evaluate
@@ -70,14 +71,14 @@ def test_the_noise_of_the_reference_is_not_in_the_errors(tmp_path):
     clean = tmp_path / "room"
     write_scene(clean, rng, spp=(16,))
     config = read(CONFIG.format(folder=clean).replace('"primal", ', ""), tmp_path)
-    true = error_of(evaluate(config, tmp_path / "clean", QUIET, ""))
+    true = error_of(evaluate(config, tmp_path / "clean", QUIET, "", service))
     (clean / "reference.exr").unlink()
     halves, one = [], []
     for i in range(12):
         write_halves(clean, rng, 0.03)
-        halves.append(error_of(evaluate(config, tmp_path / f"halves{i}", QUIET, "")))
+        halves.append(error_of(evaluate(config, tmp_path / f"halves{i}", QUIET, "", service)))
         (clean / "reference-b.exr").unlink()
-        one.append(error_of(evaluate(config, tmp_path / f"one{i}", QUIET, "")))
+        one.append(error_of(evaluate(config, tmp_path / f"one{i}", QUIET, "", service)))
         (clean / "reference-a.exr").unlink()
     assert np.mean(halves) == pytest.approx(true, rel=0.08)
     assert np.mean(one) > 2 * true
@@ -91,7 +92,7 @@ def test_tables_say_what_halves_do(tmp_path, rng):
     write_scene(tmp_path / "room", rng)
     write_halves(tmp_path / "room", rng, 0.1)
     out = tmp_path / "out"
-    results = evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), out, QUIET, "")
+    results = evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), out, QUIET, "", service)
     entry = results["scenes"]["room"]["reference"]
     assert entry["halves"] and entry["spp"] == 200
     a, b = (read_image(tmp_path / "room" / f"reference-{half}.exr").astype(np.float64) for half in "ab")
@@ -110,7 +111,7 @@ def test_two_files_named_in_the_configuration_are_halves(tmp_path, rng):
     write_halves(tmp_path, rng, 0.1, "mine")
     files = [str(tmp_path / f"mine-{half}.exr") for half in "ab"]
     text = CONFIG.format(folder=tmp_path / "room") + f"[references]\nroom = {files}\n"
-    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "")
+    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)
     assert results["scenes"]["room"]["reference"]["halves"]
 
 
@@ -123,6 +124,6 @@ def test_stability_takes_the_noise_off_the_bias(tmp_path, rng):
     assert flicker_and_bias(images, (a + b) / 2, share=0)["bias"] > 0.004
     write_scene(tmp_path / "room", rng)
     write_halves(tmp_path / "room", rng, 0.1)
-    evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out", QUIET, "")
+    evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), tmp_path / "out", QUIET, "", service)
     rows = {row["method"]: row for row in study(tmp_path / "out")}
     assert abs(rows["primal"]["bias"]) < 0.003 and rows["primal"]["flicker"] > 0.01

@@ -10,6 +10,7 @@ import pytest
 from folders import read, write_scene
 
 import ngpt
+from data_gen import service
 from eval import main as command
 from ngpt.errors import NgptError
 from ngpt.evaluation import cells
@@ -46,7 +47,7 @@ def room(tmp_path, rng):
 def test_the_folder_of_results(room):
     folder, config = room
     out = folder / "out"
-    evaluate(config, out, QUIET, "the command")
+    evaluate(config, out, QUIET, "the command", service)
     results = json.loads((out / "results.json").read_text())
     found = {(c["spp"], c["method"], c["seed"]): c for c in results["cells"]}
     assert len(found) == len(results["cells"]) == 2 * 2 * 5
@@ -71,7 +72,7 @@ def test_the_folder_of_results(room):
 
 def test_a_missing_method_is_a_row_that_says_why(room):
     folder, config = room
-    results = evaluate(config, folder / "out", QUIET, "")
+    results = evaluate(config, folder / "out", QUIET, "", service)
     rows = [cell for cell in results["cells"] if cell["method"] == "oracle"]
     assert len(rows) == 4 and all("no method 'oracle'" in row["absent"] for row in rows)
     assert "- `oracle`: there is no method 'oracle'" in (folder / "out" / "results.md").read_text()
@@ -79,9 +80,9 @@ def test_a_missing_method_is_a_row_that_says_why(room):
 
 def test_what_is_done_is_not_done_again(room, monkeypatch):
     folder, config = room
-    first = evaluate(config, folder / "out", QUIET, "")
+    first = evaluate(config, folder / "out", QUIET, "", service)
     monkeypatch.setattr(cells, "reconstruct", lambda *a, **k: pytest.fail("reconstructed again"))
-    assert evaluate(config, folder / "out", QUIET, "")["cells"] == first["cells"]
+    assert evaluate(config, folder / "out", QUIET, "", service)["cells"] == first["cells"]
 
 
 def test_killed_half_way_goes_on(room, monkeypatch):
@@ -96,11 +97,11 @@ def test_killed_half_way_goes_on(room, monkeypatch):
 
     monkeypatch.setattr(cells, "reconstruct", dies)
     with pytest.raises(KeyboardInterrupt):
-        evaluate(config, folder / "out", QUIET, "")
+        evaluate(config, folder / "out", QUIET, "", service)
     done = len(list((folder / "out" / "cache" / "cells").glob("*.json")))
     assert done > 0
     calls[:] = [None] * 8
-    results = evaluate(config, folder / "out", QUIET, "")
+    results = evaluate(config, folder / "out", QUIET, "", service)
     assert sum(not cell["absent"] for cell in results["cells"]) == 16
     # One warm-up for each method, and the cells that were left.
     assert len(calls) - 8 == 4 + 16 - done
@@ -108,10 +109,10 @@ def test_killed_half_way_goes_on(room, monkeypatch):
 
 def test_a_changed_stack_is_another_cell(room, rng):
     folder, config = room
-    first = evaluate(config, folder / "out", QUIET, "")
+    first = evaluate(config, folder / "out", QUIET, "", service)
     shutil.rmtree(folder / "room")
     write_scene(folder / "room", rng)
-    second = evaluate(config, folder / "out", QUIET, "")
+    second = evaluate(config, folder / "out", QUIET, "", service)
     assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]
 
 
@@ -130,7 +131,7 @@ def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message
     spoil(tmp_path / "room", clean)
     scenes = f'"{tmp_path}/room", "{tmp_path}/hall", "{tmp_path}/none"'
     config = read(CONFIG.replace('"{folder}"', scenes), tmp_path)
-    results = evaluate(config, tmp_path / "out", QUIET, "")
+    results = evaluate(config, tmp_path / "out", QUIET, "", service)
     absent = {cell["absent"] for cell in results["cells"] if cell["scene"] == "room" and cell["method"] == "l2"}
     assert any(why and message in why for why in absent)
     assert results["scenes"]["hall"]["absent"] is None
@@ -143,7 +144,7 @@ def test_a_stack_without_features_is_an_absent_cell(room):
     for path in (folder / "room").glob("features-*.exr"):
         path.unlink()
         shutil.copy(path.with_name(path.name.replace("features", "path")), path)
-    results = evaluate(config, folder / "out", QUIET, "")
+    results = evaluate(config, folder / "out", QUIET, "", service)
     rows = {cell["method"]: cell["absent"] for cell in results["cells"]}
     assert "method 'nfor' needs layers 'albedo'" in rows["nfor"] and rows["l2"] is None
 
@@ -202,7 +203,7 @@ def test_the_command(room, capsys):
 
 def test_stability(room):
     folder, config = room
-    evaluate(config, folder / "out", QUIET, "")
+    evaluate(config, folder / "out", QUIET, "", service)
     rows = {(r["spp"], r["method"]): r for r in study(folder / "out")}
     # Noise of 0.5 / sqrt(n) on values of about 1.
     assert 4 * rows[16, "primal"]["flicker"] == pytest.approx(rows[4, "primal"]["flicker"], rel=0.2)
@@ -231,7 +232,7 @@ def test_rolling_shutter_takes_each_row_of_its_seed():
 
 def test_the_tiny_configuration(renderer, tmp_path):
     config = read_config(Path(__file__).parents[2] / "configs/eval-tiny.toml")
-    results = evaluate(config, tmp_path, QUIET, "")
+    results = evaluate(config, tmp_path, QUIET, "", service)
     assert not any(entry["absent"] for entry in results["scenes"].values())
     costs = results["scenes"]["glossy"]["cost"]
     assert costs["gradients"]["median"] > costs["path"]["median"]
@@ -244,4 +245,7 @@ def test_the_tiny_configuration(renderer, tmp_path):
     assert "albedo" not in ngpt.read(stack)
     # A second run renders nothing.
     stamp = stack.stat().st_mtime_ns
-    assert evaluate(config, tmp_path, QUIET, "")["cells"] == results["cells"] and stack.stat().st_mtime_ns == stamp
+    assert (
+        evaluate(config, tmp_path, QUIET, "", service)["cells"] == results["cells"]
+        and stack.stat().st_mtime_ns == stamp
+    )

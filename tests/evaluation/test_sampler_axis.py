@@ -8,6 +8,7 @@ import pytest
 from folders import read, write_scene
 
 import ngpt
+from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import Config, read_config
 from ngpt.evaluation.renders import Render
@@ -121,7 +122,7 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
         write_scene(room, rng, gradients=name)
     text = f'scenes = ["{room}"]\nspp = [4, 16]\nseeds = 2\nmethods = ["primal", "l2"]\nimages = "all"\n'
     text += 'samplers = ["ours", "theirs"]\nmetrics = ["relMSE", "relMSE trimmed"]\n'
-    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "")
+    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)
     names = ["primal", "l2 (ours)", "l2 (theirs)"]
     assert list(results["methods"]) == names and not any(cell["absent"] for cell in results["cells"])
     entry = results["methods"]["l2 (theirs)"]
@@ -138,7 +139,9 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
     assert "l2 (theirs)" in page and "equal time to 4 spp of sampler auto" in page
     # A single sampler that is not the usual one: names are those of the methods.
-    results = evaluate(read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path, QUIET, "")
+    results = evaluate(
+        read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path, QUIET, "", service
+    )
     assert list(results["methods"]) == ["primal", "l2"]
 
 
@@ -157,9 +160,9 @@ timing_repeats = 3
 
 def test_two_samplers_at_equal_time(renderer, tmp_path):
     out = tmp_path / "out"
-    before = evaluate(read(SETTINGS, tmp_path), out, QUIET, "")
+    before = evaluate(read(SETTINGS, tmp_path), out, QUIET, "", service)
     text = SETTINGS + 'samplers = ["gpt", "gpt-basic"]\nrivals = ["primal", "ppn"]\n'
-    results = evaluate(read(text, tmp_path), out, QUIET, "")
+    results = evaluate(read(text, tmp_path), out, QUIET, "", service)
     names = ["primal (primal)", "primal (ppn)", "wcv (gpt)", "wcv (gpt-basic)"]
     assert list(results["methods"]) == names
     cells = {(cell["method"], cell["seed"]): cell for cell in results["cells"]}
@@ -200,7 +203,7 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     assert "Milliseconds a sample" in page and "gradients gpt-basic" in page
     assert json.loads((out / "results.json").read_text())["methods"]["wcv (gpt)"]["sampler"] == "gpt"
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
-    slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "")
+    slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "", service)
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
 
 
@@ -212,7 +215,7 @@ def test_processor_time_and_a_reference_by_another_sampler(renderer, tmp_path, m
     ticks = count()
     monkeypatch.setitem(costs.CLOCKS, "processor", lambda: float(next(ticks)))
     config = read(SETTINGS + 'time = "processor"\nreference_sampler = "gpt"\n', tmp_path)
-    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, lambda text: None)
+    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, service)
     stacks.reference()
     halves = [ngpt.read(path) for path in sorted(stacks.folder.glob("reference-gpt-128spp*"))]
     assert [half.attributes["ngpt:sampler"] for half in halves] == ["gpt", "gpt"]
@@ -225,7 +228,7 @@ def test_processor_time_and_a_reference_by_another_sampler(renderer, tmp_path, m
 
 def test_a_sampler_of_the_other_kind_is_refused_with_the_entry_it_belongs_to(renderer, tmp_path):
     config = read(SETTINGS, tmp_path)
-    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, lambda text: None)
+    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, service)
     with_gradients, without = Render("features", "gpt"), Render("gradients", "primal")
     assert not stacks._can(with_gradients) and not stacks._can(without)
     assert stacks.lacks[with_gradients.name] == "sampler 'gpt' renders gradients: list it under samplers"

@@ -8,6 +8,7 @@ import pytest
 from folders import read, smooth_image, write_halves
 
 import ngpt
+from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.worth import REACH, samples_for, worth_of_gradients, worth_tables
@@ -97,7 +98,9 @@ def room(tmp_path, rng):
 
 def test_stacks_of_known_worth(room):
     folder, text = room
-    results = evaluate(read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", QUIET, "the command")
+    results = evaluate(
+        read(text + '\n[groups]\nrooms = ["room"]\n', folder), folder / "out", QUIET, "the command", service
+    )
     best = [row for row in results["worth"]["rows"] if row["best"]]
     assert [(row["spp"], row["method"], row["rival"]) for row in best] == [(n, "ours", "primal") for n in (4, 16, 64)]
     assert [row["W"] for row in best] == pytest.approx([WORTH] * 3, rel=0.15)
@@ -122,7 +125,7 @@ def test_stacks_of_known_worth(room):
 def test_costs_make_the_difference(room):
     """C is of what the two columns are given, and the rival is the one that is done first."""
     folder, text = room
-    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
     results["scenes"]["room"]["cost"] = {
         "gradients": {"median": 0.03, "sampler": "gpt"},  # the usual one here: "gpt" is found under this name
         "gradients slow": {"median": 0.06, "sampler": "slow"},
@@ -141,7 +144,7 @@ def test_costs_make_the_difference(room):
 
 def test_means_over_scenes_are_geometric_and_carry_marks(room):
     folder, text = room
-    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
     from ngpt.evaluation.worth import _means
@@ -157,7 +160,7 @@ def test_means_over_scenes_are_geometric_and_carry_marks(room):
 def test_without_both_kinds_of_methods_nothing_is_written(room):
     folder, text = room
     text = text.replace(', "primal", "theirs-worse"]', "]")
-    results = evaluate(read(text, folder), folder / "out", QUIET, "")
+    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
     assert results["worth"] == {"rows": [], "means": []}
     assert not list((folder / "out").glob("worth*")) and not list((folder / "out" / "plots").glob("worth*"))
     write_evaluation_report(folder / "out", folder / "report.html")

@@ -5,12 +5,12 @@ import shlex
 from pathlib import Path
 from typing import Any
 
+from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
-from ngpt.cli.frame_patterns import frames, targets
 from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.system.console import Console

@@ -1,0 +1,14 @@
+"""The verbs of ``ngpt`` that render: they come to it by the entry point of group "ngpt.verbs" in pyproject.toml."""
+
+from ngpt.cli import CONTINUES, Verb
+
+ROOM = "data_gen.cli"
+
+VERBS = {
+    "demo": Verb(
+        "render built-in scenes, reconstruct with every method, and write a report to open in a browser", ROOM
+    ),
+    "render": Verb("render a scene to a gradient stack", ROOM),
+    "advise": Verb("say which method and how many samples to use, for a time or an error", ROOM),
+    "dataset": Verb("make a training set, or continue one", ROOM, "train", CONTINUES),
+}

@@ -1,0 +1,102 @@
+"""Which code a render runs: what cached stacks are keyed by, so that no other code can have made them.
+
+The files are found by following imports, wherever in a file they stand, from the sampler's own module and from
+``data_gen.render``, which all share. Nothing is listed by hand. Nothing is imported either: Mitsuba need not be there.
+"""
+
+from __future__ import annotations
+
+import ast
+import hashlib
+from collections.abc import Iterable
+from functools import lru_cache
+from pathlib import Path
+
+from data_gen.samplers import SAMPLERS
+from ngpt.evaluation.keys import code_text
+
+ROOT = Path(__file__).parent
+# The registry knows all samplers; of what it imports, a render needs its own family's entries.
+_REGISTRY, _MACHINERY = "data_gen.samplers", "data_gen.samplers.registry"
+# The face of the package hands on what others have.
+_FACE = "data_gen"
+# What the built-in scenes are made of: a scene has a key of its own.
+_BUILT_IN = ("data_gen.scenes.builtin", "data_gen.scenes.grids")
+
+
+def code(sampler: str) -> str:
+    """SHA-256 of the files that a render by the sampler runs, without comments and docstrings; of "auto", by any of the
+    samplers that a scene's description may stand for. Of an unknown name, of what all share."""
+    return _hash(reached(sampler))
+
+
+def scene_code(name: str) -> str:
+    """SHA-256 of a built-in scene: its name, and the files that all of them are made in."""
+    return _hash(_BUILT_IN, name)
+
+
+def reached(sampler: str) -> list[str]:
+    """The modules of data_gen that a render by the sampler runs, sorted."""
+    entries = [SAMPLERS[sampler]] if sampler in SAMPLERS else [s for s in SAMPLERS.values() if s.rank]
+    modules = [entry.module for entry in entries if sampler in (entry.name, "auto") and entry.module]
+    queue, found = ["data_gen.render", _MACHINERY, *modules, *filter(None, map(_entries_of, modules))], set()
+    while queue:
+        module = queue.pop()
+        if module not in found and module not in (_REGISTRY, _FACE, *_BUILT_IN):
+            found.add(module)
+            queue += _imports(_file(module))
+    return sorted(found)
+
+
+def _entries_of(module: str) -> str | None:
+    """The module with a sampler's entry: the ``about`` of its family."""
+    while (module := module.rpartition(".")[0]) not in ("", _REGISTRY):
+        if _exists(about := f"{module}.about"):
+            return about
+    return None
+
+
+def _imports(file: Path) -> set[str]:
+    """The modules of data_gen that a file imports, and the packages they are in."""
+    found = set()
+    for node in ast.walk(_tree(file, file.stat().st_mtime_ns)):
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and not node.level:
+            names = [node.module or "", *(f"{node.module}.{alias.name}" for alias in node.names)]
+        else:
+            continue
+        for name in names:
+            parts = name.split(".")
+            prefixes = [".".join(parts[: i + 1]) for i in range(len(parts))]
+            found |= {prefix for prefix in prefixes if parts[0] == "data_gen" and _exists(prefix)}
+    return found
+
+
+# Of files as they were when last changed
+@lru_cache(maxsize=1024)
+def _tree(file: Path, changed: int) -> ast.Module:
+    return ast.parse(file.read_bytes())
+
+
+@lru_cache(maxsize=1024)
+def _text(file: Path, changed: int) -> str:
+    return code_text(file)
+
+
+def _exists(module: str) -> bool:
+    return _file(module).is_file()
+
+
+def _file(module: str) -> Path:
+    """The file of a module of data_gen, or of a package's ``__init__``."""
+    path = ROOT.joinpath(*module.split(".")[1:])
+    return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
+
+
+def _hash(modules: Iterable[str], name: str = "") -> str:
+    digest = hashlib.sha256(name.encode())
+    for module in modules:
+        file = _file(module)
+        digest.update(f"{module}\n{_text(file, file.stat().st_mtime_ns)}\n".encode())
+    return digest.hexdigest()

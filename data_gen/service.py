@@ -1,0 +1,85 @@
+"""What ngpt asks of a renderer: this module is a ``ngpt.renderer.Renderer``, which says more of each function."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from data_gen.backend import use_variant
+from data_gen.code import code as code
+from data_gen.code import scene_code as scene_code
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing
+from ngpt.stack import GradientStack
+
+if TYPE_CHECKING:
+    import mitsuba as mi
+
+
+def load(source: str, size: tuple[int, int]) -> mi.Scene:
+    use_variant()
+    from data_gen.scenes.load import load_scene
+
+    return load_scene(source, size)
+
+
+def render(scene: mi.Scene, spp: int | None, seed: int, sampler: str, *, seconds: float | None = None) -> GradientStack:
+    from data_gen.render import render_stack
+
+    return render_stack(scene, spp, seed, sampler, seconds=seconds)
+
+
+def warm_up(*args: Any) -> GradientStack:
+    from data_gen.choosing import costs
+
+    return costs.warm_up(*args)
+
+
+def timed(*args: Any) -> tuple[GradientStack, float]:
+    from data_gen.choosing import costs
+
+    return costs.timed(*args)
+
+
+def measure(*args: Any, **options: Any) -> tuple[dict[str, list[float]], GradientStack]:
+    from data_gen.choosing import costs
+
+    return costs.measure(*args, **options)
+
+
+def batch(sampler: str) -> int:
+    return SAMPLERS[sampler].batch
+
+
+def overview() -> dict[str, Any]:
+    use_variant()
+    from data_gen.scenes.builtin import SCENES
+
+    titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
+    found = {
+        title: {name: entry.summary for name, entry in by_standing(standing).items()}
+        for title, standing in titles.items()
+    }
+    return found | {"built-in scenes": {name: (make.__doc__ or "").split("\n")[0] for name, make in SCENES.items()}}
+
+
+def describe_sampler(name: str) -> dict[str, Any]:
+    entry = SAMPLERS.get(name) or FRAME_SAMPLERS.get(name)
+    if entry is None:
+        return {}
+    options = {option: str(value) for option, value in entry.options.items()}
+    return {"sampler": name, "summary": entry.summary, "standing": entry.standing, "options": options}
+
+
+def inspect(name: str, parameters: dict[str, str]) -> dict[str, Any]:
+    use_variant()
+    from data_gen.inspect import inspect_scene
+
+    return inspect_scene(name, parameters)
+
+
+def stream(config: Path) -> Any:
+    from data_gen.dataset.config import read_config
+    from data_gen.dataset.jobs import processes
+    from data_gen.dataset.stream import Stream
+
+    return Stream(read_config(config), processes(1))

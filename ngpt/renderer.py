@@ -1,0 +1,58 @@
+"""The renderer as ngpt sees it: what the evaluation, ``ngpt info`` and ``ngpt train`` ask of it.
+
+``ngpt.system.parts.find_renderer`` finds the one that is installed, ``data_gen.service``: an entry point of the group
+"ngpt.renderers" names it. Nothing in ngpt imports it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Protocol
+
+from ngpt.stack import GradientStack
+
+# Of a render: the name of a sampler, and whether features are rendered
+Options = Mapping[str, Any]
+
+
+class Renderer(Protocol):
+    """All raise NgptError for scenes and samplers that do not exist or do not go together."""
+
+    def load(self, source: str, size: tuple[int, int]) -> Any:
+        """A scene, of a file or built in, in pixels (width, height)."""
+
+    def render(self, scene: Any, spp: int | None, seed: int, sampler: str, *, seconds: float | None) -> GradientStack:
+        """A stack of ``spp`` samples per pixel, or of so many ``seconds``."""
+
+    def warm_up(self, scene: Any, options: Options) -> GradientStack:
+        """Has the kernels of a render compiled; its stack of one sample."""
+
+    def timed(self, scene: Any, options: Options, spp: int, seed: int, clock: str) -> tuple[GradientStack, float]:
+        """A stack and its seconds, by the ``clock`` "wall" or "processor"."""
+
+    def measure(
+        self, scene: Any, renders: Mapping[str, Options], spp: int, repeats: int, *, clock: str
+    ) -> tuple[dict[str, list[float]], GradientStack]:
+        """Seconds per sample of each of the ``renders`` by name, and the last stack of the first of them."""
+
+    def batch(self, sampler: str) -> int:
+        """Samples per pixel that depend on each other; 0: none do."""
+
+    def code(self, sampler: str) -> str:
+        """A hash of the code that a render by the sampler runs; "auto" is a sampler too."""
+
+    def scene_code(self, name: str) -> str:
+        """A hash of a built-in scene."""
+
+    def overview(self) -> dict[str, Any]:
+        """Samplers and built-in scenes, for ``ngpt info``."""
+
+    def describe_sampler(self, name: str) -> dict[str, Any]:
+        """What the registry says of a sampler; nothing where there is none of that name."""
+
+    def inspect(self, name: str, parameters: dict[str, str]) -> dict[str, Any]:
+        """What a scene is made of and how it would be rendered."""
+
+    def stream(self, config: Path) -> Any:
+        """Crops of a dataset's configuration, rendered in another process while they are trained on."""
