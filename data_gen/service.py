@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 from data_gen.backend import use_variant
 from data_gen.code import code as code
 from data_gen.code import scene_code as scene_code
-from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS, by_standing, find
+from ngpt.renderer import Options
 from ngpt.stack import GradientStack
 
 if TYPE_CHECKING:
@@ -22,10 +23,10 @@ def load(source: str, size: tuple[int, int]) -> mi.Scene:
     return load_scene(source, size)
 
 
-def render(scene: mi.Scene, spp: int | None, seed: int, sampler: str, *, seconds: float | None = None) -> GradientStack:
+def render(scene: mi.Scene, options: Options, spp: int | None, seed: int, *, seconds: float | None) -> GradientStack:
     from data_gen.render import render_stack
 
-    return render_stack(scene, spp, seed, sampler, seconds=seconds)
+    return render_stack(scene, spp, seed, seconds=seconds, **options)
 
 
 def warm_up(*args: Any) -> GradientStack:
@@ -48,6 +49,15 @@ def measure(*args: Any, **options: Any) -> tuple[dict[str, list[float]], Gradien
 
 def batch(sampler: str) -> int:
     return SAMPLERS[sampler].batch
+
+
+def gradients(sampler: str) -> bool:
+    return sampler not in SAMPLERS or SAMPLERS[sampler].gradients
+
+
+def unusual(sampler: str, options: Options) -> str:
+    entry = find(sampler)
+    return entry.unusual(entry.settings(options))
 
 
 def overview() -> dict[str, Any]:

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 
 from ngpt.stack import GradientStack
 
-# Of a render: the name of a sampler, and whether features are rendered
+# Of a render: its sampler's name, the sampler's own options, and whether features are rendered
 Options = Mapping[str, Any]
 
 
@@ -22,7 +22,9 @@ class Renderer(Protocol):
     def load(self, source: str, size: tuple[int, int]) -> Any:
         """A scene, of a file or built in, in pixels (width, height)."""
 
-    def render(self, scene: Any, spp: int | None, seed: int, sampler: str, *, seconds: float | None) -> GradientStack:
+    def render(
+        self, scene: Any, options: Options, spp: int | None, seed: int, *, seconds: float | None
+    ) -> GradientStack:
         """A stack of ``spp`` samples per pixel, or of so many ``seconds``."""
 
     def warm_up(self, scene: Any, options: Options) -> GradientStack:
@@ -38,6 +40,12 @@ class Renderer(Protocol):
 
     def batch(self, sampler: str) -> int:
         """Samples per pixel that depend on each other; 0: none do."""
+
+    def gradients(self, sampler: str) -> bool:
+        """Whether it renders them; of an unknown one nobody knows better."""
+
+    def unusual(self, sampler: str, options: Options) -> str:
+        """Those of its options that are not defaults: "radius=1, photons=2". Raises NgptError for wrong ones."""
 
     def code(self, sampler: str) -> str:
         """A hash of the code that a render by the sampler runs; "auto" is a sampler too."""

@@ -7,11 +7,11 @@ from glob import glob, has_magic
 from pathlib import Path
 from typing import Any
 
-from data_gen.samplers import SAMPLERS, find
 from ngpt.errors import NgptError
 from ngpt.evaluation.renders import KINDS, Render
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
+from ngpt.system.parts import find_renderer
 from ngpt.system.records import check, from_table, read_toml
 
 # Of which seeds pictures are kept.
@@ -126,14 +126,13 @@ class Config:
         return Render("features" if kind == "path" and name != KINDS["path"] else kind, name, given)
 
     def sampler(self, name: str) -> tuple[str, str]:
-        """What the registry calls the sampler that is called ``name`` here, and its options that are not defaults."""
+        """What the renderer calls the sampler that is called ``name`` here, and its options that are not defaults."""
         table = dict(self.sampler_options.get(name, {}))
         if not table:
             return name, ""
         own = table.pop("sampler", name)
         try:
-            entry = find(own)
-            return own, entry.unusual(entry.settings(table))
+            return own, find_renderer().unusual(own, table)
         except NgptError as error:
             raise NgptError(f"evaluation: samplers.{name}: {error}") from None
 
@@ -155,10 +154,6 @@ class Config:
         return asdict(self)
 
 
-def _has_gradients(sampler: str) -> bool:
-    return sampler not in SAMPLERS or SAMPLERS[sampler].gradients
-
-
 def file_part(column: str) -> str:
     """What file names call a column: "wcv (gpt-basic)" is wcv-gpt-basic."""
     return column.replace(" (", "-").removesuffix(")")
@@ -178,6 +173,7 @@ def read_config(path: str | Path) -> Config:
     values = read_toml(path)
     if isinstance(tables := values.get("samplers"), dict):
         check(tables, {str: dict}, f"{path}: samplers")
-        with_gradients = [name for name, table in tables.items() if _has_gradients(table.get("sampler", name))]
+        gradients = find_renderer().gradients
+        with_gradients = [name for name, table in tables.items() if gradients(table.get("sampler", name))]
         values |= {"samplers": with_gradients or [KINDS["gradients"]], "sampler_options": tables}
     return from_table(Config, values, str(path))

@@ -1,19 +1,10 @@
 """Stacks, references and costs of one scene: rendered once, then taken from the cache.
 
-<<<<<<< HEAD
-The cache has a folder for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
-files, the size, the code that renders, and Mitsuba's version. In it are RENDER-SPP-SEED.exr, where RENDER is a kind of
-stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are some
-("gradients-gpt-shift=manifold"), and SPP the number of samples that were rendered; the two halves of references,
-reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
-reference may be one image.
-=======
 The cache has folders for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
 files, the size, Mitsuba's version, and the code that their sampler runs. In them are RENDER-SPP-SEED.exr, where RENDER
 is a kind of stack ("gradients"), followed by the sampler where it is not the usual one ("gradients-gpt-basic"), and SPP
 the number of samples that were rendered; the two halves of references, reference-*-a.exr and -b.exr; and cost-*.json. A
 folder of stacks of one's own looks the same, without the costs; its reference may be one image.
->>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
 """
 
 from __future__ import annotations
@@ -101,27 +92,17 @@ class SceneStacks:
         if self.given:
             return find_reference(Path(self.source))
         limit = f"{config.reference_spp}spp" if config.reference_spp else f"{config.reference_seconds:g}s"
-<<<<<<< HEAD
         render = config.render("features", config.reference_sampler)
         name = "-".join(["reference", *render.by.split(), limit])
-        paths = [self.folder / f"{name}{half}.exr" for half in HALVES]
-=======
-        by = "" if config.reference_sampler == KINDS["path"] else f"{config.reference_sampler}-"
-        folder = self.folder(config.reference_sampler)
-        paths = [folder / f"reference-{by}{limit}{half}.exr" for half in HALVES]
->>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
+        folder = self.folder(render.sampler)
+        paths = [folder / f"{name}{half}.exr" for half in HALVES]
         for i, path in enumerate(paths):
             if not path.exists():
                 self.say(f"{self.name}: rendering the reference, half {i + 1} of {limit}")
                 scene = self.load()
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
-<<<<<<< HEAD
-                write(path, render_stack(scene, spp, REFERENCE_SEED + i, seconds=seconds, **render.options))
-=======
-                sampler = config.reference_sampler
-                write(path, self.renderer.render(scene, spp, REFERENCE_SEED + i, sampler, seconds=seconds))
->>>>>>> f5e4bf3 (Verbs that render, and the renderer itself, come to ngpt by entry points: nothing in ngpt imports data_gen; stacks are cached by the code their sampler runs)
+                write(path, self.renderer.render(scene, render.options, spp, REFERENCE_SEED + i, seconds=seconds))
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:

@@ -93,7 +93,7 @@ def test_options_of_samplers_reach_the_stacks(renderer, tmp_path):
         timing_repeats=1,
         sampler_options={"joined": {"sampler": "gpt", "reuse": True}},
     )
-    cells = evaluate(config, tmp_path, QUIET, "")["cells"]
+    cells = evaluate(config, tmp_path, QUIET, "", service)["cells"]
     assert {cell["method"] for cell in cells} == {"wcv (gpt)", "wcv (joined)"} and not any(c["absent"] for c in cells)
     stacks = sorted((tmp_path / "cache").rglob("gradients-*reuse*.exr"))
     assert stacks and all(ngpt.read(file).attributes["ngpt:samplerOptions"] == "reuse=true" for file in stacks)
