@@ -2,9 +2,10 @@
 
 The cache has folders for each scene, NAME-HASH, named by what the pictures depend on: the contents of the scene's
 files, the size, Mitsuba's version, and the code that their sampler runs. In them are RENDER-SPP-SEED.exr, where RENDER
-is a kind of stack ("gradients"), followed by the sampler where it is not the usual one ("gradients-gpt-basic"), and SPP
-the number of samples that were rendered; the two halves of references, reference-*-a.exr and -b.exr; and cost-*.json. A
-folder of stacks of one's own looks the same, without the costs; its reference may be one image.
+is a kind of stack ("gradients"), followed by the sampler where it is not the usual one and its options where there are
+some ("gradients-gpt-shift=manifold"), and SPP the number of samples that were rendered; the two halves of references,
+reference-*-a.exr and -b.exr; and cost-*.json. A folder of stacks of one's own looks the same, without the costs; its
+reference may be one image.
 """
 
 from __future__ import annotations
@@ -76,9 +77,7 @@ class SceneStacks:
         """Where the pictures by a sampler are."""
         if self.given:
             return Path(self.source)
-        folder = self.cache / f"{self.name}-{self.key(sampler)[:12]}"
-        folder.mkdir(parents=True, exist_ok=True)
-        return folder
+        return self.cache / f"{self.name}-{self.key(sampler)[:12]}"
 
     def reference(self) -> Reference:
         """The reference that the configuration names, or the folder holds; else two halves, of half the budget each.
@@ -102,6 +101,7 @@ class SceneStacks:
                 scene = self.load()
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
+                path.parent.mkdir(parents=True, exist_ok=True)
                 write(path, self.renderer.render(scene, render.options, spp, REFERENCE_SEED + i, seconds=seconds))
         return read_reference(paths)
 
@@ -133,7 +133,9 @@ class SceneStacks:
             for name, render in new.items():
                 known[name] = {key: value * unit for key, value in summaries[name].items()}
                 known[name]["sampler"] = _sampler(self._warm[name])
-                write_json(self._cost_file(render), self._costs_in(render) | {name: known[name]})
+                file = self._cost_file(render)
+                file.parent.mkdir(parents=True, exist_ok=True)
+                write_json(file, self._costs_in(render) | {name: known[name]})
         return known
 
     def _cost_file(self, render: Render) -> Path:
@@ -171,6 +173,7 @@ class SceneStacks:
             self._warm_up(render)
             stack, seconds = self.renderer.timed(self.load(), render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
+            path.parent.mkdir(parents=True, exist_ok=True)
             write(path, stack)
         # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
         return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)

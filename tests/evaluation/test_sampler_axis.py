@@ -192,12 +192,13 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     row = next(line for line in lines if line.startswith(f"| diffuse | {costs['gradients']['median'] * 1e3:.1f} |"))
     assert row.endswith(f"| {ratio:.2f} | 128 | `gpt` |")
     # Stacks of their own, under names of their own; gpt's are the usual ones.
-    folder = next((out / "cache").glob("diffuse-*"))
-    stack = ngpt.read(next(folder.glob("gradients-gpt-basic-*-1.exr")))
+    cache = out / "cache"
+    stack = ngpt.read(next(cache.glob("diffuse-*/gradients-gpt-basic-*-1.exr")))
     assert stack.attributes["ngpt:sampler"] == "gpt-basic"
-    assert not list(folder.glob("gradients-gpt-[0-9]*")) and (folder / "gradients-8-1.exr").is_file()
-    assert sorted(p.name for p in folder.glob("reference*")) == ["reference-128spp-a.exr", "reference-128spp-b.exr"]
-    seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in folder.glob("reference*")}
+    assert not list(cache.glob("*/gradients-gpt-[0-9]*")) and len(list(cache.glob("diffuse-*/gradients-8-1.exr"))) == 1
+    references = sorted(cache.glob("diffuse-*/reference*"))
+    assert [path.name for path in references] == ["reference-128spp-a.exr", "reference-128spp-b.exr"]
+    seeds = {ngpt.read(path).attributes["ngpt:seed"] for path in references}
     assert len(seeds) == 2 and results["scenes"]["diffuse"]["reference"]["spp"] == 128
     page = write_evaluation_report(out, tmp_path / "report.html").read_text()
     assert "Milliseconds a sample" in page and "gradients gpt-basic" in page
@@ -217,7 +218,7 @@ def test_processor_time_and_a_reference_by_another_sampler(renderer, tmp_path, m
     config = read(SETTINGS + 'time = "processor"\nreference_sampler = "gpt"\n', tmp_path)
     stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, service)
     stacks.reference()
-    halves = [ngpt.read(path) for path in sorted(stacks.folder.glob("reference-gpt-128spp*"))]
+    halves = [ngpt.read(path) for path in sorted(stacks.folder("gpt").glob("reference-gpt-128spp*"))]
     assert [half.attributes["ngpt:sampler"] for half in halves] == ["gpt", "gpt"]
     # Every render takes a tick of that clock, so samples cost the same; so does a stack.
     assert {cost["median"] for cost in stacks.costs().values()} == {1 / 8}
