@@ -64,10 +64,11 @@ def test_commands_exist(page, capsys):
 
 def parser_of(verb):
     """The real parser of a verb, which refuses a line by leaving with status 2."""
-    from ngpt.cli import VERBS, _filled, _Parser
+    from ngpt.cli import _filled, _Parser, all_verbs
 
-    assert verb in VERBS, f"ngpt {verb}"
-    return _filled(_Parser(prog=f"ngpt {verb}"), verb)
+    verbs = all_verbs()
+    assert verb in verbs, f"ngpt {verb}"
+    return _filled(_Parser(prog=f"ngpt {verb}"), verb, verbs[verb])
 
 
 def unknown_options(line):
