@@ -66,7 +66,7 @@ def main() -> None:
             folder = args.out / scene / shot
             if shot not in SPEEDS and (scene, shot) not in MOVES:
                 continue
-            kinds = render_shot(args, scene, shot, folder)
+            kinds = render_stacks(args, scene, shot, folder)
             stacks, paired, references, plain = (
                 [ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in (*kinds, "plain")
             )
@@ -123,7 +123,7 @@ def line(row: dict) -> str:
     return f"| {row['scene']} | {row['shot']} | {row['method']} | {row['relMSE']:.5f} | {row['flicker']:.5f} |"
 
 
-def render_shot(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
+def render_stacks(args: argparse.Namespace, scene: str, shot: str, folder: Path) -> tuple[str, str, str]:
     """Renders stacks, those with pairs (the same without ``--pairs``) and references; returns the names of the folders.
 
     What is there already is kept.

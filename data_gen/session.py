@@ -178,7 +178,7 @@ def render_frames(
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
     options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics}
-    found = render_shot(Shot(describe, size, camera), frames, spp, seed, dt, skip, sampler=sampler, **options)
+    found = render_shot(Shot(describe, size, camera), frames, spp, seed, dt, skip=skip, sampler=sampler, **options)
 
     def whole() -> Iterator[tuple[int, GradientStack]]:
         for frame, stack in found:

@@ -99,6 +99,7 @@ def render_shot(
     spp: int | None,
     seed: int = 0,
     dt: int = 0,
+    *,
     skip: Callable[[int], bool] = lambda frame: False,
     progress: Callable[[int], Callable[[int, int], None]] = lambda frame: lambda done, total: None,
     sampler: str = "auto",
@@ -156,20 +157,20 @@ def render_shot(
         stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
         stack = stack.replace(motion=motion)
         del scene  # two scenes in memory would make kernels larger
-        yield frame, _with_dt(stack, shot, other, frame, previous, dt, frame_seed(seed, frame, 1)) if dt else stack
+        yield frame, _with_dt(stack, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1)) if dt else stack
 
 
 def _with_dt(
-    stack: GradientStack, shot: Shot, other: Shot, frame: int, previous: int, pairs: int, seed: int
+    stack: GradientStack, here: tuple[Shot, int], before: tuple[Shot, int], pairs: int, seed: int
 ) -> GradientStack:
-    """The stack with ``dt`` and ``dt_var``; the ``other`` shot has the scene of the frame before."""
+    """The stack with ``dt`` and ``dt_var``; ``here`` and ``before`` are what has the scene, and the frame's number."""
     motion = stack["motion"]
     mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
     if np.isfinite(motion).any():
-        scene, begun = shot.at(frame), time.perf_counter()
+        scene, begun = here[0].at(here[1]), time.perf_counter()
         now, seconds = light(scene, seed, pairs), time.perf_counter() - begun
         del scene
-        scene, begun = other.at(previous), time.perf_counter()
+        scene, begun = before[0].at(before[1]), time.perf_counter()
         mean, variance = difference(now, light(scene, seed, pairs, motion))
         stack.attributes["ngpt:seconds"] += seconds + time.perf_counter() - begun
     stack.attributes["ngpt:pairs"] = pairs

@@ -217,6 +217,7 @@ def train(
     training: Sequence[Clip],
     rounds: int,
     steps: int,
+    *,
     batch: int = 8,
     learning_rate: float = 2e-3,
     seed: int = 0,
