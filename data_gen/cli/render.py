@@ -80,7 +80,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )
     shot = parser.add_argument_group(
-        "sequences",
+        "shots",
         "SCENE, the values of -D and the output may hold {frame}, {frame:04d} or {10 + frame * 3:.2f}. The output may "
         "be a folder.",
     )
@@ -111,7 +111,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
-        "--skip-existing", action="store_true", help="leave frames out whose stacks are there: goes on with a sequence"
+        "--skip-existing", action="store_true", help="leave frames out whose stacks are there: goes on with a shot"
     )
     add_json(parser)
 
@@ -134,7 +134,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
-            raise NgptError(f"{option} belongs to a sequence; name its frames: --frames 0:120")
+            raise NgptError(f"{option} belongs to a shot; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
             raise NgptError(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")

@@ -54,14 +54,14 @@ def test_targets_are_patterns_and_folders(tmp_path):
         targets("{frame}.png", "box", [1])
 
 
-def test_what_belongs_to_sequences_is_refused_without(tmp_path, capsys):
+def test_what_belongs_to_shots_is_refused_without(tmp_path, capsys):
     assert main(["render", "diffuse", "--camera", "x.json", "-o", str(tmp_path / "a.exr")]) == 2
     assert "--frames" in capsys.readouterr().err
     assert main(["render", "diffuse", "-D", "a={frame}", "-o", str(tmp_path / "a.exr")]) == 2
     assert "changes from frame to frame" in capsys.readouterr().err
 
 
-def test_a_sequence_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
+def test_a_shot_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
     path = tmp_path / "path.json"
     keys = [{"frame": f, "origin": [f / 10, 1.25, 3.9], "target": [0, 1.15, 0]} for f in (0, 2)]
     path.write_text(json.dumps({"keys": keys}))
@@ -101,7 +101,7 @@ def alike(stack, other):
     assert all(np.array_equal(stack[name], other[name], equal_nan=True) for name in stack.names)
 
 
-def test_parts_of_a_sequence_are_its_frames(renderer, tmp_path, monkeypatch, capsys):
+def test_parts_of_a_shot_are_its_frames(renderer, tmp_path, monkeypatch, capsys):
     whole = parts(renderer, tmp_path, "whole", monkeypatch)
     found = [list(parts(renderer, tmp_path, f"part{i}", monkeypatch, "--shard", f"{i}/2")) for i in range(2)]
     assert [len(names) for names in found] == [3, 2] and sorted(found[0] + found[1]) == list(whole)
@@ -110,7 +110,7 @@ def test_parts_of_a_sequence_are_its_frames(renderer, tmp_path, monkeypatch, cap
         alike(stack, whole[name])
     assert second["diffuse.0006.exr"].attributes["ngpt:previousFrame"] == 4
     assert main(["render", "diffuse", "--shard", "0/2", "-o", str(tmp_path / "a.exr")]) == 2
-    assert "--shard belongs to a sequence" in capsys.readouterr().err
+    assert "--shard belongs to a shot" in capsys.readouterr().err
 
 
 def test_a_cluster_renders_the_parts_that_are_missing(renderer, tmp_path, monkeypatch, capsys):
@@ -140,7 +140,7 @@ def test_one_pair_is_refused_and_two_are_rendered(renderer, tmp_path, capsys):
     assert main([*words, "--frames", "0:2", "--dt", "1"]) == 2
     assert "use --dt 2" in capsys.readouterr().err
     assert main([*words[:-1], str(tmp_path / "a.exr"), "--dt", "2"]) == 2
-    assert "--dt belongs to a sequence" in capsys.readouterr().err
+    assert "--dt belongs to a shot" in capsys.readouterr().err
     assert main([*words, "--frames", "0:2", "--dt", "2"]) == 0
     stack = ngpt.read(tmp_path / "shot/diffuse.0001.exr")
     assert not stack["dt"].any() and stack["dt_var"].shape == stack["primal"].shape

@@ -80,7 +80,7 @@ def test_variances_are_those_over_seeds(renderer):
 
 
 def test_single_images_are_refused_and_why(renderer, tmp_path, capsys):
-    with pytest.raises(NgptError, match=r"sequences.*2 to 3 times as long.*--sampler gpt"):
+    with pytest.raises(NgptError, match=r"shots.*2 to 3 times as long.*--sampler gpt"):
         find("restir")
     assert main(["render", "diffuse", "--sampler", "restir", "-o", str(tmp_path / "x.exr")]) == 2
     assert "--frames" in capsys.readouterr().err
