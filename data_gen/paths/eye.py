@@ -42,10 +42,6 @@ class Eye:
         """Through the place ``uv`` on the film, in pixels, and the place ``lens`` on the lens."""
         return self.sensor.sample_ray(self.time, self.wavelength, uv / mi.Vector2f(self.size), lens)[0]
 
-    def toward(self, x: Any, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
-        """The connection of vertex ``x`` to the camera, Mitsuba's DirectionSample3f, and its importance."""
-        return self.sensor.sample_direction(x, lens, active)
-
     def shows(self, uv: mi.Point2f) -> mi.Bool:
         """Whether the place ``uv`` is on the film."""
         size = self.size

@@ -17,5 +17,5 @@ class World:
 
     scene: mi.Scene
     lights: LightEnds
-    materials: Materials
+    materials: Materials | None = None  # for samplers that ask nothing of them
     fog: Any = None  # ``photons.map.fog.Fog``: the media, for samplers that gather photons there

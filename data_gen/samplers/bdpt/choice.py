@@ -12,6 +12,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.light_path import LightPath
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.vertex import Vertex, cosine
 
@@ -20,15 +21,16 @@ _LEAST_COSINE = 0.1
 
 
 @dr.syntax
-def choose(z: Vertex, active, kept, count: mi.UInt32, longest: int, u: mi.Float):
-    """The place of the chosen vertex in ``kept``, and 1 / the probability of that choice; 0 where there is none.
+def choose(z: Vertex, active, light: LightPath, longest: int, u: mi.Float):
+    """The number of the chosen vertex of ``light``, and 1 / the probability of that choice; 0 where there is none.
 
     Vertices that paths of at most ``longest`` edges lead to can be chosen, by the random number ``u``.
     """
-    end = dr.minimum(count, longest - 1 - z.depth)
+    kept, end = light.kept, dr.minimum(light.count, longest - 1 - z.depth)
     come_from = cosine(z.si, z.si.to_world(z.si.wi))
-    i, chosen = mi.UInt32(0), mi.UInt32(0)
-    total, own = mi.Float(0), mi.Float(0)
+    i = mi.UInt32(0)  # the vertex that is looked at
+    chosen = mi.UInt32(0)  # one of those before it, each with a probability in proportion to its worth
+    total, own = mi.Float(0), mi.Float(0)  # their worth, and that of the chosen one
     while dr.hint(active & (i < end), label="choice"):
         w = worth(z, come_from, kept.read(i))
         total += w
@@ -52,7 +54,8 @@ def worth(z: Vertex, come_from: mi.Float, y) -> mi.Float:
     distance2 = dr.squared_norm(to)
     d = to * dr.rsqrt(distance2)
     cos_z, cos_y = cosine(z.si, d), dr.abs(dr.dot(y.n, d))
-    p_z, q_z, p_y, q_y = (cos / dr.pi for cos in (cos_z, come_from, cos_y, dr.abs(dr.dot(y.n, y.d))))
-    others = mis.others_connected(z.end, cos_z, p_z, q_z, Partial(y.vcm, y.vc), cos_y, p_y, q_y, distance2)
+    side_z = mis.Side(cos_z, cos_z / dr.pi, come_from / dr.pi)
+    side_y = mis.Side(cos_y, cos_y / dr.pi, dr.abs(dr.dot(y.n, y.d)) / dr.pi)
+    others = mis.others_connected(z.end, Partial(y.vcm, y.vc), mis.Edge(side_z, side_y, distance2))
     w = dr.max(y.β) * (cos_z + _LEAST_COSINE) * (cos_y + _LEAST_COSINE) / (distance2 * (1 + others))
     return dr.select((y.depth > 0) & dr.isfinite(w), w, 0)

@@ -93,8 +93,26 @@ def others_to_camera(end: Partial, e: mi.Float, cos: mi.Float, q: mi.Float) -> m
     return e * cos * (end.vcm + end.vc * q)
 
 
-def others_connected(z: Partial, cos_z, p_z, q_z, y: Partial, cos_y, p_y, q_y, distance2) -> mi.Float:
+@dataclass
+class Side:
+    """Of a vertex at which two paths are connected."""
+
+    cos: mi.Float  # of the edge
+    p: mi.Float  # density of sampling the edge
+    q: mi.Float  # the same with both directions swapped
+
+
+@dataclass
+class Edge:
+    """It connects the last vertices of a camera path and of a light path."""
+
+    z: Side
+    y: Side
+    distance2: mi.Float
+
+
+def others_connected(z: Partial, y: Partial, edge: Edge) -> mi.Float:
     """Of a camera path connected to a light path: ``z`` and ``y`` are their last vertices."""
-    from_camera = p_z * cos_y / distance2 * (y.vcm + y.vc * q_y)
-    from_light = p_y * cos_z / distance2 * (z.vcm + z.vc * q_z)
+    from_camera = edge.z.p * edge.y.cos / edge.distance2 * (y.vcm + y.vc * edge.y.q)
+    from_light = edge.y.p * edge.z.cos / edge.distance2 * (z.vcm + z.vc * edge.z.q)
     return from_camera + from_light

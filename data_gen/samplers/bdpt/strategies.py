@@ -15,6 +15,7 @@ import mitsuba as mi
 
 from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.mis import Edge, Side
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, Vertex, cosine, evaluate
 
 
@@ -27,7 +28,7 @@ def emission_at(scene, lights: LightEnds, si, ref, active) -> tuple[mi.Spectrum,
     return Le, p, dr.select(p > 0, e, 0)
 
 
-def to_light(lights: LightEnds, z: Vertex, light, weight, f, p, q) -> tuple[mi.Spectrum, mi.Float]:
+def to_light(lights: LightEnds, z: Vertex, light, weight, f, *, p, q) -> tuple[mi.Spectrum, mi.Float]:
     """s = 1: ``light`` and its ``weight`` Le / p are Mitsuba's; f, p, q those of ``evaluate`` toward it."""
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
@@ -37,11 +38,11 @@ def to_light(lights: LightEnds, z: Vertex, light, weight, f, p, q) -> tuple[mi.S
 
 def connected(scene, z: Vertex, z_bsdf, y: Vertex, active) -> tuple[mi.Spectrum, mi.Float]:
     """s, t > 1, occlusion included."""
-    C, known = connection(scene, z, z_bsdf, y, active)
-    return z.β * C, mis.others_connected(z.end, *known[:3], y.end, *known[3:])
+    C, edge = connection(scene, z, z_bsdf, y, active)
+    return z.β * C, mis.others_connected(z.end, y.end, edge)
 
 
-def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, tuple]:
+def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool = False) -> tuple[mi.Spectrum, Edge]:
     """The same without the camera path's throughput, and what else its MIS weight is made of.
 
     Where it is known that the vertices see each other, ``seen``, no ray is traced.
@@ -55,7 +56,7 @@ def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool
     # Vertices in one place are no path: their density is infinite.
     lit = active & (dr.max(z.β * C) > 0) & (distance2 > 0)
     C = dr.select(lit & ~scene.ray_test(z.si.spawn_ray_to(y.si.p), lit & ~mi.Bool(seen)), C, 0)
-    return C, (cosine(z.si, d), p_z, q_z, cosine(y.si, d), p_y, q_y, distance2)
+    return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
 
 
 def to_camera(sensor, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:

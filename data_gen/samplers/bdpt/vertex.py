@@ -61,25 +61,27 @@ def record_class(variant: str) -> type:
 
 def record(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, vertex: Vertex, smooth: mi.Bool) -> Any:
     """What is kept of a ``vertex`` that ``ray`` has hit; its depth is 0 if nothing can be connected to it."""
-    end = vertex.end
-    where = (mi.Point3f(ray.o), mi.Vector3f(ray.d), mi.Float(hit.t), mi.Point2f(hit.prim_uv), mi.UInt32(hit.prim_index))
-    shapes = (mi.ShapePtr(hit.shape), mi.ShapePtr(hit.instance))
-    depth = dr.select(smooth, vertex.depth, 0)
     return record_class(mi.variant())(
-        *where, *shapes, mi.Normal3f(vertex.si.n), mi.Spectrum(vertex.β), mi.Float(end.vcm), mi.Float(end.vc), depth
+        o=mi.Point3f(ray.o),
+        d=mi.Vector3f(ray.d),
+        t=mi.Float(hit.t),
+        prim_uv=mi.Point2f(hit.prim_uv),
+        prim_index=mi.UInt32(hit.prim_index),
+        shape=mi.ShapePtr(hit.shape),
+        instance=mi.ShapePtr(hit.instance),
+        n=mi.Normal3f(vertex.si.n),
+        β=mi.Spectrum(vertex.β),
+        vcm=mi.Float(vertex.end.vcm),
+        vc=mi.Float(vertex.end.vc),
+        depth=dr.select(smooth, vertex.depth, 0),
     )
 
 
 def recall(kept, time: mi.Float, wavelengths: mi.Wavelength) -> Vertex:
     """The vertex of which a record was kept."""
     hit = dr.zeros(mi.PreliminaryIntersection3f, dr.width(kept.t))
-    hit.t, hit.prim_uv, hit.prim_index, hit.shape, hit.instance = (
-        kept.t,
-        kept.prim_uv,
-        kept.prim_index,
-        kept.shape,
-        kept.instance,
-    )
+    hit.t, hit.prim_uv, hit.prim_index = kept.t, kept.prim_uv, kept.prim_index
+    hit.shape, hit.instance = kept.shape, kept.instance
     # Not told by any other field: without it the vertex would be void.
     hit.valid = mi.Bool(True)
     si = hit.compute_surface_interaction(mi.Ray3f(kept.o, kept.d, time, wavelengths))

@@ -8,42 +8,30 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.manifold import event
-from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import SMOOTH, event_kind
+from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt import plan as both_ends
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import emission_at, to_light
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, context, cosine, reverse_density, scatters_smoothly
 from data_gen.samplers.gbdpt.pairs import difference
 
 
-@dataclass
-class Plan:
-    """What does not change while a scene is rendered."""
+@dataclass(kw_only=True)
+class Plan(both_ends.Plan):
+    """``bdpt``'s, and how copies are weighted."""
 
-    lights: LightEnds
-    materials: Materials
-    max_depth: int
-    rr_depth: int
-    longest: int  # the number of edges up to which paths are found from both ends
     pair: Callable = difference  # Δ of a path and its copy, by one of the weights of ``pairs``
-    η: mi.Float | None = None  # of ``mis``, where photons are gathered, too
 
-    @property
-    def joins(self) -> bool:
-        """Whether there are paths from lights."""
-        return self.longest > 1 and self.lights.emitters is not None
 
-    def merged(self, bsdf: mi.BSDFPtr, joins: mi.Bool | bool = True) -> mi.Float:
-        """η at a vertex of that material; 0 where nothing merges."""
-        if self.η is None:
-            return mi.Float(0)
-        return dr.select(self.materials.connectable(bsdf) & joins, self.η, 0)
+@dataclass
+class Past:
+    """What a base path has gone through."""
 
-    def known(self, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
-        """What a light path knows at a vertex of that material."""
-        return end if self.η is None else mis.gathered(end, self.merged(bsdf))
+    η: mi.Float  # product of the relative indices of refraction
+    sky: Sky
 
 
 @dataclass
@@ -91,23 +79,14 @@ class Step:
 
 
 def base_step(
-    scene,
-    plan: Plan,
-    random,
-    z: Vertex,
-    active,
-    η: mi.Float,
-    sky_seen: mi.Bool,
-    brightest_offset: mi.Float,
-    completed: mi.Bool | bool = True,
-) -> tuple[Step, mi.Float, mi.Bool]:
-    """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the next ``η`` and ``sky_seen``.
+    plan: Plan, random, z: Vertex, past: Past, active, *, brightest_offset: mi.Float, completed: mi.Bool | bool = True
+) -> tuple[Step, Past]:
+    """Samples an emitter and the next vertex from vertex ``z``; returns the step, and the ``past`` of that vertex.
 
-    ``η`` is the product of all indices of refraction, ``sky_seen`` whether an escape sees the environment, and
-    ``brightest_offset`` the most that any offset path may yet bring: Russian roulette is to starve none. Light is asked
-    for where paths are ``completed`` at z; random numbers are drawn all the same.
+    ``brightest_offset`` is the most that any offset path may yet bring: Russian roulette is to starve none. Light is
+    asked for where paths are ``completed`` at z; random numbers are drawn all the same.
     """
-    lights, materials = plan.lights, plan.materials
+    scene, lights, materials = plan.scene, plan.lights, plan.materials
     si, end, bsdf = z.si, z.end, z.si.bsdf()
     smooth = active & completed & scatters_smoothly(bsdf)
     joins = z.depth + 1 <= plan.longest
@@ -123,7 +102,7 @@ def base_step(
     lit &= dr.max(f * weight) > 0
     q = reverse_density(si, bsdf, wo, lit)
     known = Vertex(si, z.β, known_end(end, joins), z.depth)
-    C, others = to_light(lights, known, light, weight, f, p, q)
+    C, others = to_light(lights, known, light, weight, f, p=p, q=q)
     C = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit), C, 0)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = lights.emission(lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
@@ -131,20 +110,17 @@ def base_step(
     # ------------------------ Next vertex ------------------------
     found = active & (sample.pdf > 0)
     kind = event_kind(sample.sampled_type)
-    sky_seen = sky_seen | (found & (kind != NULL))
-    η = dr.select(found, η * sample.eta, η)
+    past = Past(dr.select(found, past.η * sample.eta, past.η), past.sky.behind(kind, found))
     d = si.to_world(sample.wo)
     q_next = reverse_density(si, bsdf, sample.wo, found & (kind == SMOOTH))
     β = z.β * f_p
-    # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
-    brightest = dr.fmax(dr.max(β), brightest_offset)
-    survives = dr.select(z.depth < plan.rr_depth, 1, dr.fmin(brightest * dr.square(η), 0.95))
+    survives = roulette(dr.fmax(dr.max(β), brightest_offset), z.depth >= plan.limits.rr_depth, past.η)
     goes_on = found & (dr.max(β) > 0) & (u_survival < survives)
     survival = dr.rcp(survives)
     x1 = scene.ray_intersect(si.spawn_ray(d), goes_on)
 
     # ------------------ Emission met by chance -------------------
-    met = goes_on & (x1.is_valid() | sky_seen)
+    met = goes_on & past.sky.meets(x1)
     Le, p_met, e_met = emission_at(scene, lights, x1, si, met)
     # Longer paths are not found by light paths.
     counted = z.depth + 1 <= plan.longest
@@ -187,7 +163,7 @@ def base_step(
         e_met=e_met,
         counted=counted,
     )
-    return step, η, sky_seen
+    return step, past
 
 
 def known_end(end: Partial, joins: mi.Bool) -> Partial:

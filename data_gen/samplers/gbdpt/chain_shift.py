@@ -27,6 +27,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -63,7 +64,7 @@ def next_course(course: Course, step: Step) -> Course:
 
 
 def along(
-    scene, plan: Plan, step: Step, course: Course | None, chain: Chain | None
+    plan: Plan, step: Step, course: Course | None, chain: Chain | None
 ) -> tuple[Step, Course | None, Chain | None]:
     """The step that leads from ``course`` and ``chain`` to the next ones, with such light as Δ has a share in: that of
     bent paths where there is a ``chain``, else of all others; of all where there is no ``course``."""
@@ -74,7 +75,7 @@ def along(
     if chain is None:
         now, then = ~now, ~then
     else:
-        chain = next_chain(scene, plan, chain, course, step)
+        chain = next_chain(plan, chain, course, step)
     C_light, C_met = dr.select(now, step.C_light, 0), dr.select(then, step.C_met, 0)
     return replace(step, shared=now, C_light=C_light, C_met=C_met), behind, chain
 
@@ -105,16 +106,24 @@ class Chain:
 
 
 def no_chain(lanes: int) -> Chain:
-    chain = dr.zeros(mi.SurfaceInteraction3f, lanes), mi.Vector3f(0), mi.Float(1), mi.Float(1), mi.UInt32(0)
-    return Chain(*chain, mi.Bool(False), mi.Bool(False))
+    """That of so many base paths which have none yet."""
+    return Chain(
+        x1=dr.zeros(mi.SurfaceInteraction3f, lanes),
+        ω=mi.Vector3f(0),
+        p=mi.Float(1),
+        survival=mi.Float(1),
+        events=mi.UInt32(0),
+        open=mi.Bool(False),
+        arrives=mi.Bool(False),
+    )
 
 
-def ends(scene, plan: Plan, y: mi.SurfaceInteraction3f) -> mi.Bool:
+def ends(plan: Plan, y: mi.SurfaceInteraction3f) -> mi.Bool:
     """Whether a chain ends at ``y``, if by no other event: its copies do not go on there either."""
-    return ~y.is_valid() | plan.materials.connectable(y.bsdf()) | (y.emitter(scene) != None)  # noqa: E711 - pointers
+    return ~y.is_valid() | plan.materials.connectable(y.bsdf()) | (y.emitter(plan.scene) != None)  # noqa: E711 - pointers
 
 
-def next_chain(scene, plan: Plan, chain: Chain, course: Course, step: Step) -> Chain:
+def next_chain(plan: Plan, chain: Chain, course: Course, step: Step) -> Chain:
     """The chain behind ``step``; ``course`` is the one before it."""
     begins = course.ahead & (step.kind == SMOOTH) & step.connectable & step.goes_on
     events, fits = add_event(chain.events, step.event)
@@ -126,30 +135,32 @@ def next_chain(scene, plan: Plan, chain: Chain, course: Course, step: Step) -> C
         p=dr.select(begins, step.p, chain.p),
         survival=dr.select(begins, 1, chain.survival) * step.survival,
         events=dr.select(begins, 0, dr.select(longer, events, chain.events)),
-        open=begins | (longer & ~ends(scene, plan, step.x1)),
+        open=begins | (longer & ~ends(plan, step.x1)),
         arrives=longer & lit,
     )
 
 
-def follow_chain(scene, plan: Plan, step: Step, chain: Chain, own, bsdf, β, r, end: Partial, active) -> tuple:
-    """The copy's way from its ``own`` x1' to y, the vertex that ``step`` has led to; β, r and ``end`` are those there.
+def follow_chain(plan: Plan, step: Step, chain: Chain, start: Any, own: mi.SurfaceInteraction3f, active) -> tuple:
+    """The copy's way from its ``own`` x1' to y, the vertex that ``step`` has led to.
 
-    Returned are the ray that arrives at y, β, r and ``end`` behind it, and what it meets at y: f J / p and ``others``.
+    ``start`` has β, r and ``end`` at x1', as an offset path does. Returned are the ray that arrives at y, β, r and
+    ``end`` behind it, and what it meets at y: f J / p and ``others``.
     """
     # -------------------------- The walk -------------------------
-    y, reached = step.x1, step.x1.is_valid()
+    scene, y, reached = plan.scene, step.x1, step.x1.is_valid()
     target = Target(y.p, dr.select(reached, mi.Vector3f(y.n), step.d), ~reached)
     base = shoot(scene, chain.x1, chain.ω, chain.events, target, active)
-    walk = chain.x1, chain.ω, base, own, chain.events, target, active
-    ω, shot, J, found = follow(scene, *walk, ends=partial(ends, scene, plan))
-    f, p, q = evaluate(RADIANCE, own, bsdf, own.to_local(ω), found)
+    ω, shot, J, found = follow(
+        scene, chain.x1, chain.ω, base, own, chain.events, target, active, ends=partial(ends, plan)
+    )
+    f, p, q = evaluate(RADIANCE, own, own.bsdf(), own.to_local(ω), found)
 
     # ------------------------ Throughput -------------------------
     J *= shot.P / (chain.p * base.P)
-    β, r = β * f * shot.weight * (J * chain.survival), r * p * J
+    β, r = start.β * f * shot.weight * (J * chain.survival), start.r * p * J
     found &= (p > 0) & dr.isfinite(dr.sum(β)) & dr.isfinite(r)
     β, r = dr.select(found, β, 0), dr.select(found, r, 0)
-    end = mis.leave(end, cosine(own, ω), p, q, mi.Bool(False))
+    end = mis.leave(start.end, cosine(own, ω), p, q, mi.Bool(False))
     end = Partial(mi.Float(0), end.vc * shot.turns)
 
     # ----------------------- Emission at y -----------------------

@@ -6,7 +6,6 @@ a shift is eight rays: so each seen vertex has a lane of its own in a second ker
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -14,12 +13,13 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.film.splats import Splats
-from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.eye import Sight
+from data_gen.paths.light_ends import LightRay
 from data_gen.paths.manifold import event, prepend_event
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import SMOOTH, event_kind
-from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on, unmerged
-from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.light_path import End, Seen, begin, go_on
+from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import record, record_class
 from data_gen.samplers.gbdpt.pairs import weighted
 
@@ -95,35 +95,33 @@ def next_link(link: Link, depth: mi.UInt32, sample: mi.BSDFSample3f, survival: m
     )
 
 
-@dr.syntax
-def light_again(
-    scene,
-    lights: LightEnds,
-    camera,
-    random,
-    camera_ray: mi.Ray3f,
-    depth: mi.UInt32,
-    rr_depth: int,
-    known: Callable[[Partial, mi.BSDFPtr], Partial] = unmerged,
-) -> tuple[LightRay, End, Link, Any, mi.Point2f, mi.Bool]:
-    """Traces light paths up to the vertex at ``depth``; all that ``light_path`` has sampled is sampled again.
-    ``known`` is the same.
+@dataclass
+class Again:
+    """A light path up to a vertex, traced once more."""
 
-    Returned are where light begins, the vertex, its ``Link``, what is kept of the vertex at the other end of that, the
-    place on the lens, and whether it is there.
-    """
-    lens = camera.sensor.needs_aperture_sample()
-    start, end, active = begin(scene, lights, random, camera_ray)
+    start: LightRay
+    end: End  # the vertex, and how the path came there
+    link: Link
+    left: Any  # what is kept of the vertex at the other end of the link
+    lens: mi.Point2f  # the place on the lens to which the vertex is connected
+    there: mi.Bool  # whether the path comes so far
+
+
+@dr.syntax
+def light_again(plan: Plan, sight: Sight, depth: mi.UInt32) -> Again:
+    """Traces light paths up to the vertex at ``depth``; all that ``light_path`` has sampled is sampled again."""
+    eye, random = sight.eye, sight.random.clone()
+    start, end, active = begin(plan, random, sight.ray)
     link, left = first_link(), dr.zeros(record_class(mi.variant()))
     while dr.hint(active & (end.y.depth < depth), label="light path again"):
         bsdf = end.y.si.bsdf()
-        y = replace(end.y, end=known(end.y.end, bsdf))
+        y = replace(end.y, end=plan.known(end.y.end, bsdf))
         here = record(end.ray, end.hit, y, active)
-        if dr.hint(lens, mode="scalar"):
-            random.next_2d()
-        end, active, sample, survival = go_on(scene, random, start, y, bsdf, rr_depth, active)
+        # Where the path was joined to the camera
+        eye.place_on_lens(random)
+        end, active, sample, survival = go_on(plan, random, start, y, bsdf, active)
         link = next_link(link, y.depth, sample, survival)
         left = dr.select(link.depth == y.depth, here, left)
-    on_lens = random.next_2d() if lens else mi.Point2f(0.5)
-    end.y.end = known(end.y.end, end.y.si.bsdf())
-    return start, end, link, left, on_lens, active
+    on_lens = eye.place_on_lens(random)
+    end.y.end = plan.known(end.y.end, end.y.si.bsdf())
+    return Again(start, end, link, left, on_lens, active)

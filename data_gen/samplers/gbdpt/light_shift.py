@@ -6,7 +6,6 @@ glass lie between the two, the vertex before them stays, and the copy goes throu
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -14,12 +13,11 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS
 from data_gen.film.splats import Splats
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.light_ends import LightRay
 from data_gen.paths.manifold import Target, follow, walk
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.light_path import pixel_at
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.strategies import to_camera
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, cosine, evaluate, recall, scatters_smoothly
@@ -48,11 +46,9 @@ class Splatted:
 
 
 def splat_differences(
-    scene,
     plan: Plan,
-    camera: CameraSamples,
+    sight: Sight,
     depth: mi.UInt32,
-    first_hit: Callable,
     splats: dict[str, Splats],
     bent: bool = False,
     times: mi.Float | float = 1.0,
@@ -62,34 +58,42 @@ def splat_differences(
     Those at ``depth`` edges from the light, each so many ``times``. Bent is what ends behind mirrors or glass: with
     ``bent`` its differences alone are splatted, else all others. Returns which are bent.
     """
-    ray, importance, _ = camera.rays()
-    random = camera.random.clone()
-    again = scene, plan.lights, camera, random, ray, depth, plan.rr_depth, plan.known
-    start, end, link, left, lens, there = light_again(*again)
-    y = end.y
+    eye, ray, connectable = sight.eye, sight.ray, plan.materials.connectable
+    again = light_again(plan, sight, depth)
+    y, link = again.end.y, again.link
     bsdf = y.si.bsdf()
+    joined = again.there & scatters_smoothly(bsdf)
     # It has been seen: nothing is in between.
-    C, others, uv = to_camera(camera.sensor, lens, y, bsdf, there & scatters_smoothly(bsdf), lambda *_: mi.Bool(False))
+    C, others, uv = to_camera(eye.sensor, again.lens, y, bsdf, joined, lambda *_: mi.Bool(False))
     lit = dr.max(C) > 0
 
     # --------------------- Its four shifts -----------------------
-    first, before = link.depth == 0, recall(left, ray.time, ray.wavelengths)
-    connectable = plan.materials.connectable
-    allowed = link.whole & connectable(bsdf) & (first | connectable(before.si.bsdf()))
+    first, before = link.depth == 0, recall(again.left, ray.time, ray.wavelengths)
     path = Splatted(
-        *(y, end.ray.d, uv, lens, C, others, first, start, before),
-        *(link.p, link.survival, link.events, allowed),
+        y=y,
+        d=again.end.ray.d,
+        uv=uv,
+        lens=again.lens,
+        C=C,
+        others=others,
+        first=first,
+        start=again.start,
+        before=before,
+        p=link.p,
+        survival=link.survival,
+        events=link.events,
+        allowed=link.whole & connectable(bsdf) & (first | connectable(before.si.bsdf())),
     )
-    is_bent = lit & allowed & (link.events != 0)
-    Δ = differences(scene, plan, camera, path, first_hit, is_bent if bent else lit & ~is_bent, bent)
-    pixel = pixel_at(uv, camera.size)
+    is_bent = lit & path.allowed & (link.events != 0)
+    Δ = differences(plan, eye, path, is_bent if bent else lit & ~is_bent, bent)
+    pixel = eye.pixel_at(uv)
     for name, (one, on_film) in Δ.items():
-        splats[name].add(pixel, list(to_rgb(one * importance * times, ray.wavelengths)), on_film)
+        splats[name].add(pixel, list(to_rgb(one * sight.importance * times, ray.wavelengths)), on_film)
     return is_bent
 
 
 def differences(
-    scene, plan: Plan, camera, path: Splatted, first_hit: Callable, lit: mi.Bool, bent: bool = False
+    plan: Plan, eye: Eye, path: Splatted, lit: mi.Bool, bent: bool = False
 ) -> dict[str, tuple[mi.Spectrum, mi.Bool]]:
     """For each of SHIFTS Δ of the path, and whether there is one: light arrives, and that pixel is on the film.
 
@@ -101,10 +105,10 @@ def differences(
     def one(i, *Δ):
         shift = mi.Vector2f(choose(i, [x for x, _ in shifts]), choose(i, [y for _, y in shifts]))
         uv = path.uv + shift
-        active = lit & inside(camera, uv)
+        active = lit & eye.shows(uv)
 
         def pair(_):
-            C, r, others = shifted(scene, plan, camera, path, uv, active & path.allowed, first_hit, bent)
+            C, r, others = shifted(plan, eye, path, uv, active & path.allowed, bent)
             weights = difference_of_one if bent else difference
             return weights(path.C, path.others, C, r, others)
 
@@ -112,17 +116,16 @@ def differences(
         return i + 1, *(dr.select(i == k, Δ1, old) for k, old in enumerate(Δ))
 
     Δ = dr.while_loop(state, lambda i, *_: lit & (i < len(shifts)), one, label="shifts to the camera")[1:]
-    on_film = [lit & inside(camera, path.uv + mi.Vector2f(*shift)) for shift in shifts]
+    on_film = [lit & eye.shows(path.uv + mi.Vector2f(*shift)) for shift in shifts]
     return dict(zip(SHIFTS, zip(Δ, on_film, strict=True), strict=True))
 
 
-def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bool = False):
+def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: bool = False) -> tuple:
     """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
-    sensor, y = camera.sensor, path.y
-    size = mi.Vector2f(camera.size)
-    ray, _ = sensor.sample_ray(camera.time, camera.wavelength, uv / size, path.lens)
-    x = first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
+    scene, sensor, y = plan.scene, eye.sensor, path.y
+    ray = eye.ray(uv, path.lens)
+    x = plan.first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
     bsdf = x.bsdf()
     active = active & x.is_valid() & plan.materials.connectable(bsdf)
     toward, importance = sensor.sample_direction(x, path.lens, active)
@@ -156,7 +159,7 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bo
         return d, β, p / path.p * G, end.vcm, end.vc, x.spawn_ray_to(before.si.p)
 
     if bent:
-        d, β, r, vc = through_glass(scene, plan, path, x, active)
+        d, β, r, vc = through_glass(plan, path, x, active)
         vcm = mi.Float(0)
     else:
         d, β, r, vcm, vc, shadow = dr.if_stmt(edge, path.first, from_start, from_before)
@@ -172,7 +175,7 @@ def shifted(scene, plan, camera, path: Splatted, uv, active, first_hit, bent: bo
     return C, r * J, mis.others_to_camera(end, importance[0], cosine(x, toward.d), q)
 
 
-def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
+def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
     """The edge from ``x`` to the vertex before, through the same ``events`` as the path from its own last vertex.
 
     Returned are the direction in which light arrives, its β there (0 if it does not), r, and ``vc`` of ``mis``. With
@@ -184,7 +187,7 @@ def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
 
     No other strategy follows such paths, so weights are this one's own (``pairs``).
     """
-    y, before, lights = path.y, path.before, plan.lights
+    scene, lights, y, before = plan.scene, plan.lights, path.y, path.before
     far = path.first & lights.far(path.start.index)
     # ------------------------- The chain -------------------------
     ω = -path.d
@@ -216,10 +219,6 @@ def through_glass(scene, plan: Plan, path: Splatted, x, active) -> tuple:
     vc *= dr.rcp(shot.turns * cosine(x, ω1))
     found &= (ratio > 0) & dr.isfinite(dr.sum(β)) & dr.isfinite(r) & dr.isfinite(vc)
     return -ω1, dr.select(found, β, 0), dr.select(found, r, 0), dr.select(found, vc, 0)
-
-
-def inside(camera, uv: mi.Point2f) -> mi.Bool:
-    return (uv.x >= 0) & (uv.y >= 0) & (uv.x < camera.size.x) & (uv.y < camera.size.y)
 
 
 def choose(i: mi.UInt32, values: list[float]) -> mi.Float:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.eye import Eye
 from data_gen.paths.shift import reconnection_jacobian
 from data_gen.paths.vertex import SMOOTH, event_kind, seen_from
 from data_gen.samplers.bdpt import mis
@@ -36,17 +37,21 @@ class Offset:
     Δ: mi.Spectrum
 
 
-def start(sensor, lens, x, ray, hit, β, inside) -> Offset:
-    """An offset path up to its first vertex; none where there is no base path."""
+def start(eye: Eye, x, shifted: tuple, hit) -> Offset:
+    """An offset path up to its first vertex; none where there is no base path.
+
+    It begins with the ``shifted`` camera ray, its importance, and whether it is on the film.
+    """
+    ray, importance, inside = shifted
     y = hit.compute_surface_interaction(ray)
     lives = inside & hit.is_valid() & x.is_valid()
-    _, density = sensor.sample_direction(y, lens, lives)
+    _, density = eye.sensor.sample_direction(y, eye.lens, lives)
     end = mis.begin_camera(density[0], cosine(y, ray.d))
     n = dr.width(hit.t)
     return Offset(
         ray=mi.Ray3f(ray),
         hit=hit,
-        β=dr.select(lives, mi.Spectrum(β), 0),
+        β=dr.select(lives, mi.Spectrum(importance), 0),
         r=mi.Float(1),
         end=Partial(dr.select(lives, end.vcm, 0), mi.Float(0)),
         apart=lives,
@@ -74,22 +79,21 @@ def with_differences(offsets: list[Offset], Δ: list[mi.Spectrum]) -> list[Offse
     return [replace(offset, Δ=total) for offset, total in zip(offsets, Δ, strict=True)]
 
 
-def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times, offsets, Δ) -> tuple:
-    """C and ``others`` of the connection of ``z`` to ``y``, a vertex of the light path; and the sums Δ with it.
-
-    ``found`` is what ``strategies.connection`` has found for the base path; it counts so many ``times`` in Δ.
-    """
-    g, known = found
-    C, others = z.β * g, mis.others_connected(z.end, *known[:3], y.end, *known[3:])
+def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ: list) -> tuple:
+    """C and ``others`` of the connection of the vertex of ``step`` to ``y``, one of the light path; and the sums Δ with
+    it, where it counts so many ``times``."""
+    scene, z = plan.scene, step.z
+    g, edge = connection(scene, z, z.si.bsdf(), y, mi.Bool(True))
+    C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
     lit = dr.max(C) > 0
     busy, sums = mi.Bool(False), []
     for offset, Δ_before in zip(offsets, Δ, strict=True):
         own = offset.apart | offset.joined
         busy |= own
-        others1 = mis.others_connected(offset.end, *known[:3], y.end, *known[3:])
+        others1 = mis.others_connected(offset.end, y.end, edge)
         sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
     # What a shift to y needs of the materials, but for the offset path's own
-    both = z_connectable & plan.materials.connectable(y.si.bsdf())
+    both = step.connectable & plan.materials.connectable(y.si.bsdf())
 
     def one(i, *Δ):
         offset = pick(offsets, i)
@@ -98,8 +102,8 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times
             v = Vertex(own_vertex(offset, z.si), offset.β, offset.end, z.depth)
             bsdf = v.si.bsdf()
             good = lit & (offset.joined | (both & plan.materials.connectable(bsdf)))
-            g1, known1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
-            others1 = mis.others_connected(v.end, *known1[:3], y.end, *known1[3:])
+            g1, edge1 = connection(scene, v, bsdf, y, good, seen=offset.joined)
+            others1 = mis.others_connected(v.end, y.end, edge1)
             return times * plan.pair(C, others, v.β * g1, offset.r, others1)
 
         Δ1 = dr.if_stmt((mi.Spectrum(0),), lit & (offset.apart | offset.joined), own, lambda Δ1: Δ1)
@@ -111,7 +115,7 @@ def connect(scene, plan: Plan, z: Vertex, z_connectable, y: Vertex, found, times
 
 
 def take_step(
-    scene, plan: Plan, step: Step, offsets: list[Offset], course: Course | None = None, chain: Chain | None = None
+    plan: Plan, step: Step, offsets: list[Offset], course: Course | None = None, chain: Chain | None = None
 ) -> list[Offset]:
     """Takes all offset paths along a step of their base path; connections to the light path are not in it.
 
@@ -124,7 +128,7 @@ def take_step(
 
     def rotate(i, y, *others):
         own = y.apart | y.joined
-        y = dr.if_stmt((y,), own, lambda y: step_own(scene, plan, step, y, course, chain), lambda y: y)
+        y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain), lambda y: y)
         return i + 1, *others, y
 
     state = (mi.UInt32(0), *offsets)
@@ -160,9 +164,7 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
     )
 
 
-def step_own(
-    scene, plan: Plan, step: Step, y: Offset, course: Course | None = None, chain: Chain | None = None
-) -> Offset:
+def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, chain: Chain | None = None) -> Offset:
     """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
     # ------------------------ The vertex -------------------------
     si = own_vertex(y, step.z.si)
@@ -171,7 +173,7 @@ def step_own(
 
     # ------------------------ To a light -------------------------
     lit = (dr.max(step.C_light) > 0) & step.connectable & connectable
-    C, r, others = to_same_light(scene, plan, step, y, si, bsdf, lit)
+    C, r, others = to_same_light(plan, step, y, si, bsdf, lit)
     Δ = y.Δ + plan.pair(step.C_light, step.others_light, C, y.r * r, others)
 
     # ------------- Next vertex: reconnect, or replay -------------
@@ -188,11 +190,11 @@ def step_own(
         replays &= course.ahead
         state = dr.select(waits, (replace(y, Δ=Δ), *state[1:]), state)
         walks = waits & chain.arrives
-        state = dr.if_stmt(state, walks, lambda *_: bend(scene, plan, step, chain, y, none, si, bsdf), lambda *old: old)
-    state = dr.if_stmt(state, joins, lambda *_: reconnect(scene, plan, step, y, none, si, bsdf), lambda *old: old)
+        state = dr.if_stmt(state, walks, lambda *_: bend(plan, step, chain, y, none, si), lambda *old: old)
+    state = dr.if_stmt(state, joins, lambda *_: reconnect(plan, step, y, none, si, bsdf), lambda *old: old)
     # Where all is smooth there is nothing to replay.
     if not plan.materials.all_connectable:
-        state = dr.if_stmt(state, replays, lambda *_: replay(scene, plan, step, y, none, si, bsdf), lambda *old: old)
+        state = dr.if_stmt(state, replays, lambda *_: replay(plan, step, y, none, si, bsdf), lambda *old: old)
     moved, C, others = state
 
     # ------------------ Emission met by chance -------------------
@@ -200,7 +202,7 @@ def step_own(
     return moved
 
 
-def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+def reconnect(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """Straight to the base path's next vertex, or, where that escapes, along with it; and emission there."""
     # ------------------------ The segment ------------------------
     x, x1 = step.z.si, step.x1
@@ -213,7 +215,7 @@ def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tup
     ray = dr.select(reaches, si.spawn_ray_to(x1.p), si.spawn_ray(d))
     good = (p > 0) & dr.isfinite(J) & (dr.max(f) > 0)
     # A joined path goes the way of its base path.
-    good &= ~scene.ray_test(ray, good & y.apart)
+    good &= ~plan.scene.ray_test(ray, good & y.apart)
     β, r = y.β * f * (J / step.p * step.survival), y.r * (J * p / step.p)
     good &= dr.isfinite(dr.sum(β)) & dr.isfinite(r)
     β, r = dr.select(good, β, 0), dr.select(good, r, 0)
@@ -221,7 +223,7 @@ def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tup
 
     # ----------------------- Emission at x1 ----------------------
     y1 = seen_from(x1, d)
-    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    Le, p_met, e = emission_at(plan.scene, plan.lights, y1, si, good & step.met)
     others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(x1, d), distance2)
     # Behind vertices that are not connectable the shift is rejected, but they may emit.
@@ -231,7 +233,7 @@ def reconnect(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tup
     return moved, β * Le, others
 
 
-def replay(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
+def replay(plan: Plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[Offset, mi.Spectrum, mi.Float]:
     """By the mirror, glass or hole that the base path's random numbers find here; and emission at its next vertex.
 
     Only camera paths find such events in front of the first one that is smooth, so that their random numbers belong to
@@ -241,33 +243,33 @@ def replay(scene, plan, step: Step, y: Offset, none: Offset, si, bsdf) -> tuple[
     good = (sample.pdf > 0) & (event_kind(sample.sampled_type) == step.kind)
     d = si.to_world(sample.wo)
     ray = si.spawn_ray(d)
-    hit = scene.ray_intersect_preliminary(ray, active=good)
+    hit = plan.scene.ray_intersect_preliminary(ray, active=good)
     y1 = hit.compute_surface_interaction(ray)
     β = dr.select(good, y.β * f_p * step.survival, 0)
     β = dr.select(dr.isfinite(dr.sum(β)), β, 0)
     end = mis.leave(y.end, cosine(si, d), sample.pdf, mi.Float(0), mi.Bool(True))
-    Le, p_met, e = emission_at(scene, plan.lights, y1, si, good & step.met)
+    Le, p_met, e = emission_at(plan.scene, plan.lights, y1, si, good & step.met)
     others = mis.others_emitted(known_met(end, step.counted), e, p_met)
     end = mis.arrive(end, cosine(y1, d), dr.square(y1.t))
     lives = good & y1.is_valid() & step.x1.is_valid()
     return Offset(ray, hit, dr.select(lives, β, 0), y.r, end, lives, mi.Bool(False), none.Δ), β * Le, others
 
 
-def bend(scene, plan, step: Step, chain: Chain, y: Offset, none: Offset, si, bsdf) -> tuple:
+def bend(plan: Plan, step: Step, chain: Chain, y: Offset, none: Offset, si) -> tuple:
     """Through the mirrors and glass of the base path to its next vertex; and emission there."""
-    ray, β, r, end, C, others = follow_chain(scene, plan, step, chain, si, bsdf, y.β, y.r, y.end, mi.Bool(True))
+    ray, β, r, end, C, others = follow_chain(plan, step, chain, y, si, mi.Bool(True))
     lives = step.x1.is_valid() & step.x1_connectable & (dr.max(β) > 0)
     return Offset(ray, none.hit, dr.select(lives, β, 0), r, end, mi.Bool(False), lives, none.Δ), C, others
 
 
-def to_same_light(scene, plan: Plan, step: Step, y: Offset, si, bsdf, active):
+def to_same_light(plan: Plan, step: Step, y: Offset, si, bsdf, active):
     """f J / p, the factor of r, and ``others``, of the path that ends at the same point of an emitter."""
     base = step.light
-    light, weight, r = plan.lights.seen_from_elsewhere(scene, base, step.weight, si, active)
+    light, weight, r = plan.lights.seen_from_elsewhere(plan.scene, base, step.weight, si, active)
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(light.d), active)
     C = y.β * f * weight
     lit = active & (dr.max(C) > 0)
-    C = dr.select(lit & ~scene.ray_test(si.spawn_ray_to(light.p), lit & y.apart), C, 0)
+    C = dr.select(lit & ~plan.scene.ray_test(si.spawn_ray_to(light.p), lit & y.apart), C, 0)
     cos = dr.abs(dr.dot(light.n, light.d))
     e = plan.lights.emission(plan.lights.index_of(light.emitter), light.pdf, cos, dr.square(light.dist))
     p_light = dr.select(light.delta, 0, light.pdf)

@@ -47,8 +47,8 @@ class Rater(Marker):
     def of(cls, splats: Splats, ray: mi.Ray3f, importance: mi.Spectrum, lanes: int, longest: int) -> Rater:
         """That of so many ``lanes``, of light paths of at most ``longest`` edges."""
         places = lanes * min(RATED, longest - 1)
-        kept = dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places)
-        return cls(splats, ray, importance, *kept, dr.opaque(mi.UInt32, lanes))
+        worth, pixel = dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places)
+        return cls(splats, ray, importance, worth, pixel, dr.opaque(mi.UInt32, lanes))
 
     def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
         lane = dr.arange(mi.UInt32, dr.width(self.ray))

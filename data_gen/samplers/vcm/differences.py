@@ -53,8 +53,9 @@ class ShiftedMerging(Merging):
                 alike = ~(offset.apart | offset.joined)
                 g1 = dr.select(alike, g, dr.select(own, g1, 0))
                 p1, q1 = dr.select(alike, p, p1), dr.select(alike, q, q1)
-                pair = C, others, offset.β * g1, offset.r, mis.others_merged(offset.end, q1, end, p1, photons.η)
-                found.append(dr.select(offset.apart, difference_of_one(*pair), difference(*pair)))
+                C1, others1 = offset.β * g1, mis.others_merged(offset.end, q1, end, p1, photons.η)
+                own_map = difference_of_one(C, others, C1, offset.r, others1)
+                found.append(dr.select(offset.apart, own_map, difference(C, others, C1, offset.r, others1)))
             return tuple(total + one for total, one in zip(sums, (weighted(C, others), *found), strict=True))
 
         zeros = tuple(dr.zeros(mi.Spectrum, dr.width(z.depth)) for _ in (z, *offsets))

@@ -24,8 +24,8 @@ Space Extension for Robust Light Transport Simulation"]
 
 from __future__ import annotations
 
-from functools import partial
-from types import SimpleNamespace
+from dataclasses import replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -34,17 +34,20 @@ from data_gen.film import GradientFilm
 from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
+from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
+from data_gen.samplers.bdpt.light_path import light_path
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes, refuse_variants
-from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, Reader, eta, known
+from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
 
 # Of a camera sample, its features and its light path, beside the map: what was seen, and some more
 SAMPLE_BYTES = 1536
@@ -77,11 +80,6 @@ class VCM(BDPT):
         self.radius, self.threshold = self.options["radius"], self.options["roughness_threshold"]
 
     @property
-    def longest(self) -> int:
-        """Edges of paths that are found from both ends."""
-        return min(self.max_depth, self.joined_depth)
-
-    @property
     def vertices(self) -> int:
         """The most that are kept of a light path."""
         return max(self.longest - 1, 0)
@@ -107,48 +105,51 @@ class VCM(BDPT):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One light path and one camera path for each camera sample, of which a pixel has one."""
-        scene, frozen = passes.world.scene, passes.frozen
-        (ray, importance, _), random = camera.rays(), camera.random.clone()
-        dr.eval(ray, importance)
-        values = frozen(features, scene, camera.sensor, camera.random, ray, fixed=True)
-        ends = scene, passes.world.lights, passes.world.materials, camera.sensor, camera.lens
-        photons = None
-        if self.vertices and passes.world.lights.emitters is not None:
-            random, photons, _ = self.light_paths(passes, camera, random, ray, importance, film.splats("primal"))
-        L, Le = frozen(self.seen, *ends, random, ray, importance, photons, fixed=True)
-        values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
+        world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
+        dr.eval(sight.ray, sight.importance)
+        values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
+        if self.plan(world).joins:
+            kept, sight, _ = self.light_pass(passes, sight, camera.first, film.splats("primal"))
+            photons = Photons(kept, self.radius_of(passes, camera.first), dr.width(camera.pixel))
+        L, Le = frozen(self.camera_pass, world, sight, photons, fixed=True)
+        values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         dr.eval(values)
         film.put_all(values)
 
-    def light_paths(self, passes: Passes, camera: CameraSamples, random, ray, importance, splats: Splats) -> tuple:
-        """Traces and splats them: random numbers to go on by, the photons, and the splatter's state."""
-        n, radius = dr.width(camera.pixel), self.radius * passes.width * shrunk(camera.first)
-        kept, η = Map.empty(n, self.vertices), dr.opaque(mi.Float, eta(radius, n))
-        ends = passes.world.scene, passes.world.lights, passes.world.materials, camera.sensor, camera.lens
-        path = random, ray, importance, kept, η
-        numbers, sums, kept, state = passes.frozen(self.lit, *ends, *path, fixed=True, sums=splats.zeros)
-        dr.eval(numbers, sums, kept, state)
+    def radius_of(self, passes: Passes, number: int) -> float:
+        """That of pass ``number``."""
+        return self.radius * passes.width * shrunk(number)
+
+    # ------------------------ The light paths of a pass ------------------------
+
+    def light_pass(self, passes: Passes, sight: Sight, number: int, splats: Splats) -> tuple[Map, Sight, Any]:
+        """Light paths, whose ends at the camera are splatted: the map of their vertices, the ``sight`` with random
+        numbers to go on by, and the splatter's state."""
+        n = dr.width(sight.ray)
+        η = dr.opaque(mi.Float, eta(self.radius_of(passes, number), n))
+        empty = Map.empty(n, self.vertices)
+        kept, numbers, state, sums = passes.frozen(
+            self.light_paths, passes.world, sight, η, empty, fixed=True, sums=splats.zeros
+        )
+        dr.eval(kept, numbers, state, sums)
         splats.take(sums)
-        return type(random)(numbers), Photons(kept, radius, n), state
+        return kept, replace(sight, random=type(sight.random)(numbers)), state
 
-    def lit(self, scene, lights, materials, sensor, lens, random, ray, importance, kept: Map, η, sums: tuple) -> tuple:
-        """Light paths, kept in the map ``kept`` and splatted to the ``sums``; what ``light_paths`` goes on with."""
-        size = mi.ScalarVector2u(sensor.film().crop_size())
-        camera = SimpleNamespace(sensor=sensor, lens=lens, size=size)
-        keeper = Keeper(self.splatter(Splats.on(int(dr.prod(size)), 3, sums), ray, importance), η, kept)
-        at_vertices = partial(known, materials, η)
-        ends = scene, lights, camera, random.clone(), ray
-        _, count, random, state = self.light_path(*ends, self.longest, keeper, known=at_vertices)
-        return random.random, sums, Map(kept.vertices, kept.photon, kept.first, count), state
+    def light_paths(self, world: World, sight: Sight, η: mi.Float, empty: Map, sums: tuple) -> tuple:
+        """Fills the ``empty`` map and the ``sums`` of splats; with them random numbers, and the splatter's state."""
+        splatter = self.splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
+        path, random, state = light_path(self.plan(world, η=η), sight, Keeper(splatter, η, empty))
+        return replace(empty, count=path.count), random.random, state, sums
 
-    def seen(self, scene, lights, materials, sensor, lens, random, ray, importance, photons: Photons | None) -> tuple:
+    # ------------------- Camera paths: joins, and merges -----------------------
+
+    def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple[mi.Spectrum, mi.Spectrum]:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all."""
-        camera = SimpleNamespace(sensor=sensor, lens=lens)
-        ends = scene, lights, camera, random.clone(), ray, importance
+        sight = replace(sight, random=sight.random.clone())
         if photons is None:
-            return self.camera_path(*ends, None, mi.UInt32(0), self.longest)
-        kept, merging = photons.kept, Merging(photons, materials, self.longest)
-        return self.camera_path(*ends, Reader(kept), kept.count, self.longest, merging)
+            return camera_path(self.plan(world), sight, None)
+        plan = self.plan(world, η=photons.η)
+        return camera_path(plan, sight, photons.kept.paths(), Merging(photons, plan))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

@@ -14,10 +14,10 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import Materials
 from data_gen.samplers.bdpt import mis
-from data_gen.samplers.bdpt.light_path import Seen, Visitor
+from data_gen.samplers.bdpt.light_path import LightPath, Seen, Visitor
 from data_gen.samplers.bdpt.mis import Partial
+from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon, faces
@@ -47,9 +47,13 @@ class Map:
         dr.make_opaque(found)
         return found
 
+    def paths(self) -> LightPath:
+        """Each lane's own light path."""
+        return LightPath(Reader(self), self.count)
+
 
 class Reader:
-    """The vertices of each lane's own light path, as ``bdpt`` reads them."""
+    """The vertices of each lane's own light path, as ``bdpt`` reads them: no part of a loop's state."""
 
     def __init__(self, kept: Map):
         self.kept = kept
@@ -73,7 +77,7 @@ class Keeper:
         place, here = self.kept.first + seen.y.depth - 1, seen.kept.depth > 0
         for target, value in zip(_values(self.kept.vertices), _values(seen.kept), strict=True):
             dr.scatter(target, value, place, here)
-        # As ``known`` has it
+        # As ``Plan.known`` has it
         photon = dr.select(seen.y.end.vcm == self.η, mi.UInt32(1), 0)
         dr.scatter(self.kept.photon, photon, place, here)
         return self.splatter.sees(state, seen)
@@ -98,14 +102,10 @@ class Photons:
 
 
 class Merging:
-    """Merges camera paths of at most ``longest`` edges, photons and theirs together; as ``bdpt`` asks for it."""
+    """Merges camera paths of at most ``plan.longest`` edges, photons and theirs together; as ``bdpt`` asks for it."""
 
-    def __init__(self, photons: Photons, materials: Materials, longest: int):
-        self.photons, self.materials, self.longest = photons, materials, longest
-
-    def at(self, bsdf: mi.BSDFPtr, joined: mi.Bool) -> mi.Float:
-        """η at a vertex of that material; 0 where nothing merges."""
-        return dr.select(joined & self.materials.connectable(bsdf), self.photons.η, 0)
+    def __init__(self, photons: Photons, plan: Plan):
+        self.photons, self.materials, self.longest = photons, plan.materials, plan.longest
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
         """That of the photons near to the vertex ``z``, weighted."""
@@ -144,11 +144,6 @@ def brought(photon: Photon, si, bsdf: mi.BSDFPtr, active) -> tuple[mi.Spectrum, 
     f, p, q = evaluate(RADIANCE, si, bsdf, si.to_local(-photon.d), active)
     # f has a cosine; the photons lie as densely as the geometric one is large.
     return f * photon.Φ / dr.abs(dr.dot(photon.n, photon.d)), p, q
-
-
-def known(materials: Materials, η: mi.Float, end: Partial, bsdf: mi.BSDFPtr) -> Partial:
-    """What a light path knows at a vertex of that material, where photons are gathered if it scatters widely."""
-    return mis.gathered(end, dr.select(materials.connectable(bsdf), η, 0))
 
 
 def eta(radius: float, paths: int) -> float:

@@ -1,0 +1,120 @@
+"""The path from the camera, vertex by vertex: each is joined to lamps, to a light path, and to photons near by."""
+
+from __future__ import annotations
+
+from typing import Any, Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.eye import Sight
+from data_gen.paths.vertex import event_kind
+from data_gen.paths.walk import Sky, roulette
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.light_path import LightPath
+from data_gen.samplers.bdpt.plan import Plan
+from data_gen.samplers.bdpt.strategies import connected, emission_at, to_light
+from data_gen.samplers.bdpt.vertex import (
+    RADIANCE,
+    Vertex,
+    context,
+    cosine,
+    leave,
+    recall,
+    reverse_density,
+    scatters_smoothly,
+)
+
+
+class Merges(Protocol):
+    """What gathers photons at the vertices of camera paths, see ``vcm.merging``."""
+
+    def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
+        """That of the photons near to the vertex ``z``, weighted."""
+
+
+@dr.syntax
+def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging: Merges | None = None) -> tuple:
+    """L and Le of a path from the camera, joined to the vertices of a ``light_path`` and to photons, where there are.
+
+    Le is the emission that the camera sees directly, L all other light.
+    """
+    scene, lights, limits, random = plan.scene, plan.lights, plan.limits, sight.random
+    ray = mi.Ray3f(sight.ray)
+    si = plan.first_hit(scene, ray).compute_surface_interaction(ray)
+    Le = sight.importance * si.emitter(scene).eval(si, mi.Bool(limits.shows))
+
+    L = dr.zeros(mi.Spectrum, dr.width(ray))
+    β = mi.Spectrum(sight.importance)  # throughput f / p up to the vertex si
+    η = mi.Float(1)  # product of the relative indices of refraction
+    depth = mi.UInt32(1)  # edges of the path up to si
+    sky = Sky.from_camera(limits.hide_emitters)
+    active = si.is_valid() & (depth < limits.max_depth)
+    _, density = sight.eye.sensor.sample_direction(si, sight.eye.lens, active)
+    end = mis.begin_camera(density[0], cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    while dr.hint(active, label="camera path"):
+        z = Vertex(si, β, end, depth)
+        bsdf = si.bsdf()
+        smooth = active & scatters_smoothly(bsdf)
+        joined = depth + 1 <= plan.longest
+
+        # ---------------------- To a light -----------------------
+        u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
+        u_survival = random.next_1d()
+        light, weight = scene.sample_emitter_direction(si, u_light, False, smooth)
+        lit = smooth & (light.pdf > 0)
+        wo = si.to_local(light.d)
+        # One call for both: the material toward the light, and where the path goes on to.
+        f, p, sample, f_p = bsdf.eval_pdf_sample(context(RADIANCE), si, wo, u_lobe, u_direction)
+        f = dr.select(dr.isfinite(dr.sum(f)) & dr.isfinite(p), f, 0)
+        lit &= dr.max(f * weight) > 0
+        q = reverse_density(si, bsdf, wo, lit)
+        z.end = mis.Partial(dr.select(joined, end.vcm, 0), dr.select(joined, end.vc, 0), end.waiting)
+        C, others = to_light(lights, z, light, weight, f, p=p, q=q)
+        lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
+        L += dr.select(lit, C / (1 + others), 0)
+
+        # ------------------- To the light path -------------------
+        if dr.hint(light_path is not None, mode="scalar"):
+            u_connection = random.next_1d()
+            L += connection(plan, z, bsdf, smooth & joined, light_path, u_connection)
+
+        # ------------------- To photons near by ------------------
+        if dr.hint(merging is not None, mode="scalar"):
+            L += merging.light(z, bsdf, smooth & joined)
+
+        # ---------------------- Next vertex ----------------------
+        found = active & (sample.pdf > 0)
+        sky = sky.behind(event_kind(sample.sampled_type), found)
+        η = dr.select(found, η * sample.eta, η)
+        d, end = leave(z, bsdf, sample, found, plan.merged(bsdf, joined))
+        β *= f_p
+        survival = roulette(dr.max(β), depth >= limits.rr_depth, η)
+        active = found & (dr.max(β) > 0) & (u_survival < survival)
+        β /= survival
+        depth += 1
+        reached = scene.ray_intersect(si.spawn_ray(d), active)
+
+        # ----------------- Emission met by chance ----------------
+        met = active & sky.meets(reached)
+        Le_met, p, e = emission_at(scene, lights, reached, si, met)
+        # Longer paths are not found by light paths.
+        end.vc = dr.select(depth <= plan.longest, end.vc, 0)
+        L += dr.select(met, β * Le_met / (1 + mis.others_emitted(end, e, p)), 0)
+        si = reached
+        active &= si.is_valid() & (depth < limits.max_depth)
+        end = mis.arrive(end, cosine(si, d), dr.square(si.t))
+    return L, Le
+
+
+@dr.syntax
+def connection(plan: Plan, z: Vertex, bsdf, active, light_path: LightPath, u: mi.Float) -> Any:
+    """The light of all paths that join vertex ``z`` to one of a light path's, by one of them that ``u`` chooses."""
+    L = dr.zeros(mi.Spectrum, dr.width(z.depth))
+    chosen, times = choose(z, active, light_path, plan.longest, u)
+    if active & (times > 0):
+        y = recall(light_path.kept.read(chosen), z.si.time, z.si.wavelengths)
+        C, others = connected(plan.scene, z, bsdf, y, mi.Bool(True))
+        L = dr.select(dr.max(C) > 0, C * (times / (1 + others)), 0)
+    return L

@@ -1,0 +1,100 @@
+"""The camera path and its four copies, vertex by vertex: what completes one completes the others, as far as they go."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths.eye import Sight
+from data_gen.paths.walk import Sky
+from data_gen.samplers.bdpt import mis
+from data_gen.samplers.bdpt.choice import choose
+from data_gen.samplers.bdpt.light_path import LightPath
+from data_gen.samplers.bdpt.vertex import Vertex, cosine, recall, scatters_smoothly
+from data_gen.samplers.gbdpt.base_path import Past, Plan, Step, base_step
+from data_gen.samplers.gbdpt.chain_shift import Chain, Course, along, completes, matters
+from data_gen.samplers.gbdpt.offset_path import Offset, brightest, connect, start, take_step, with_differences
+from data_gen.samplers.gbdpt.pairs import weighted
+
+
+class MergesPairs(Protocol):
+    """What gathers photons at camera paths and their copies, see ``vcm.differences``."""
+
+    def differences(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool, offsets: list[Offset]) -> tuple:
+        """The light of the photons near to the vertex ``z``, weighted; and Δ of the ``offsets``, with it."""
+
+
+@dr.syntax
+def shifted_camera_path(
+    plan: Plan,
+    sight: Sight,
+    shifted: list[tuple],
+    light_path: LightPath | None,
+    merging: MergesPairs | None = None,
+    bends: tuple[Course | None, Chain | None] = (None, None),
+) -> tuple:
+    """L and Le of ``bdpt``'s ``camera_path``, Δ of its four offset paths, and where its course has led.
+
+    Offset paths begin with the ``shifted`` rays, each with its importance, and whether it is on the film. ``bends`` are
+    course and chain. Bent paths are rejected; where there is a course, they are left out of Δ; where there is a chain
+    as well, all others are, and bent ones are followed.
+    """
+    course, chain = bends
+    scene, limits, random = plan.scene, plan.limits, sight.random
+    ray = mi.Ray3f(sight.ray)
+    si = plan.first_hit(scene, ray).compute_surface_interaction(ray)
+    offsets = [start(sight.eye, si, one, plan.first_hit(scene, one[0])) for one in shifted]
+    Le = sight.importance * si.emitter(scene).eval(si, mi.Bool(limits.shows))
+
+    L = dr.zeros(mi.Spectrum, dr.width(ray))
+    β = mi.Spectrum(sight.importance)  # throughput f / p up to the vertex si
+    depth = mi.UInt32(1)  # edges of the path up to si
+    past = Past(mi.Float(1), Sky.from_camera(limits.hide_emitters))
+    active = si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
+    _, density = sight.eye.sensor.sample_direction(si, sight.eye.lens, active)
+    end = mis.begin_camera(density[0], cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    while dr.hint(active, label="camera path"):
+        # ------- The base path: to a light, and to the next vertex -------
+        z = Vertex(si, β, end, depth)
+        wanted = completes(course, chain)
+        step, past = base_step(plan, random, z, past, active, brightest_offset=brightest(offsets), completed=wanted)
+        L += weighted(step.C_light, step.others_light) + weighted(step.C_met, step.others_met)
+        # Δ has a share in such light of the step as belongs to this kernel. ``came`` is the course at z.
+        came, (step, course, chain) = course, along(plan, step, course, chain)
+
+        # -------------- All five paths: to the light path ----------------
+        if dr.hint(light_path is not None, mode="scalar"):
+            joins = active & wanted & scatters_smoothly(si.bsdf()) & step.joins
+            u = random.next_1d()
+            light, Δ = shifted_connection(plan, step, joins, light_path, u, offsets)
+            L, offsets = L + light, with_differences(offsets, Δ)
+
+        # -------------- All five paths: to photons near by ---------------
+        if dr.hint(merging is not None, mode="scalar"):
+            gathers = active & scatters_smoothly(si.bsdf()) & step.joins
+            light, Δ = merging.differences(z, si.bsdf(), gathers, offsets)
+            L, offsets = L + light, with_differences(offsets, Δ)
+
+        # ------ The copies: to the same light, and the next vertex -------
+        offsets = take_step(plan, step, offsets, came, chain)
+        si, β, end = step.x1, step.β1, step.end1
+        depth += 1
+        active = step.goes_on & si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
+    return L, Le, [offset.Δ for offset in offsets], course
+
+
+@dr.syntax
+def shifted_connection(plan: Plan, step: Step, active, light_path: LightPath, u: mi.Float, offsets: list[Offset]):
+    """The light of the paths that join the vertex of ``step`` to one of a light path's, by ``u``; and Δ, with them.
+
+    It is chosen by the base path alone, so that it stands for all of them in differences as well.
+    """
+    z, L, Δ = step.z, dr.zeros(mi.Spectrum, dr.width(step.z.depth)), [offset.Δ for offset in offsets]
+    chosen, times = choose(z, active, light_path, plan.longest, u)
+    if active & (times > 0):
+        y = recall(light_path.kept.read(chosen), z.si.time, z.si.wavelengths)
+        C, others, Δ = connect(plan, step, y, dr.select(step.shared, times, 0), offsets, Δ)
+        L = weighted(C, others) * times
+    return L, Δ
