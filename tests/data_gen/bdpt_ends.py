@@ -14,6 +14,27 @@ def without_hole():
     return scene
 
 
+def plan_of(scene, longest=8, **more):
+    """That of ``gbdpt``, for paths of at most so many edges, whose roulette lets all of them live."""
+    from data_gen.paths.light_ends import LightEnds
+    from data_gen.paths.vertex import Materials
+    from data_gen.paths.walk import Limits
+    from data_gen.samplers.common import like_path
+    from data_gen.samplers.gbdpt.base_path import Plan
+
+    lights, materials, integrator = LightEnds(scene), Materials(scene, 0.05), like_path(scene, "gbdpt")
+    ways = {"first_hit": integrator.first_hit, "hidden": integrator.hidden_from_camera}
+    return Plan(scene, lights, materials, limits=Limits(longest, 100), longest=longest, **ways, **more)
+
+
+def fresh(mi):
+    """What the base path has gone through at its first vertex."""
+    from data_gen.paths.walk import Sky
+    from data_gen.samplers.gbdpt.base_path import Past
+
+    return Past(mi.Float(1), Sky.from_camera(False))
+
+
 class Ends:
     """Paths from either end of a scene, one from each a lane, and the densities of all strategies in float64.
 
@@ -170,7 +191,7 @@ def check_weights(ends):
         light.emitter, light.delta = ends.start.emitter, False
         light.pdf = scene.pdf_emitter_direction(z.si, light)
         f, p, q = evaluate(RADIANCE, z.si, z_bsdf, z.si.to_local(light.d))
-        C, others = to_light(ends.lights, z, light, mi.Spectrum(1), f, p, q)
+        C, others = to_light(ends.lights, z, light, mi.Spectrum(1), f, p=p, q=q)
         good = scatters_smoothly(z_bsdf) & (dr.max(C) > 0) & (light.pdf > 0)
         compare(others, ends.densities(t, 0), 1, good, ends.from_camera[:t])
     for s in range(1, 4):

@@ -5,7 +5,7 @@ That it is unbiased on quick scenes, repeats its bits and says how noisy it is, 
 
 import numpy as np
 import pytest
-from bdpt_ends import Ends, check_weights, without_hole
+from bdpt_ends import Ends, check_weights, plan_of, without_hole
 from bdpt_scenes import SCENES
 from data_gen_scenes import glass
 from unbiased import REFERENCES, load, render_ours, render_references
@@ -63,19 +63,17 @@ def test_weights_are_those_of_all_densities(renderer):
 
 
 def light_vertices(mi, scene, spp):
-    """Camera samples of a 16x16 image with what is kept of their light paths: (camera, kept, count)."""
+    """Camera samples of a 16x16 image with their light paths."""
     from data_gen.film.splats import Splats
     from data_gen.paths.camera import CameraSamples
-    from data_gen.paths.light_ends import LightEnds
+    from data_gen.paths.eye import Sight
     from data_gen.samplers.bdpt.integrator import Splatter
-    from data_gen.samplers.common import like_path
+    from data_gen.samplers.bdpt.light_path import light_path
 
     camera = CameraSamples(scene.sensors()[0], 0, spp)
-    ray, importance, _ = camera.rays()
-    integrator = like_path(scene, "bdpt")
-    splatter = Splatter(Splats(256, 3), ray, importance)
-    kept, count, *_ = integrator.light_path(scene, LightEnds(scene), camera, camera.random.clone(), ray, 6, splatter)
-    return camera, kept, count
+    sight = Sight.of(camera)
+    light, _, _ = light_path(plan_of(scene, 6), sight, Splatter(Splats(256, 3), sight.ray, sight.importance))
+    return camera, light
 
 
 def test_light_vertices_are_kept_where_they_belong(renderer):
@@ -83,7 +81,8 @@ def test_light_vertices_are_kept_where_they_belong(renderer):
     import drjit as dr
 
     scene = load(renderer, glass, (16, 16))
-    _, kept, count = light_vertices(renderer, scene, 16)
+    _, light = light_vertices(renderer, scene, 16)
+    kept, count = light.kept, light.count
     depths = [kept.read(renderer.UInt32(i)).depth for i in range(5)]
     dr.eval(depths, count)
     depths, count = np.stack([np.array(depth) for depth in depths], axis=1), np.array(count)[:, None]
@@ -104,12 +103,13 @@ def test_every_connection_counts_once_in_the_mean(renderer):
 
     mi, longest = renderer, 5
     scene = load(mi, glass, (16, 16))
-    camera, kept, count = light_vertices(mi, scene, 256)
+    camera, light = light_vertices(mi, scene, 256)
+    kept, count = light.kept, light.count
     ray, _, _ = camera.rays()
     z = scene.ray_intersect(mi.Ray3f(ray))
     _, e = camera.sensor.sample_direction(z, camera.lens)
     vertex = Vertex(z, mi.Spectrum(1), mis.begin_camera(e[0], cosine(z, ray.d)), mi.UInt32(1))
-    chosen, times = choose(vertex, z.is_valid(), kept, count, longest, camera.random.clone().next_1d())
+    chosen, times = choose(vertex, z.is_valid(), light, longest, camera.random.clone().next_1d())
     depths = [kept.read(mi.UInt32(i)).depth for i in range(5)]
     dr.eval(chosen, times, depths, count)
     chosen, times, count, valid = (np.array(x) for x in (chosen, times, count, z.is_valid()))

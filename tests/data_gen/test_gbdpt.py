@@ -6,6 +6,7 @@ and that it repeats its bits, is among the laws of all samplers.
 
 import numpy as np
 import pytest
+from bdpt_ends import fresh, plan_of
 from bdpt_scenes import SCENES
 from unbiased import FAR, REFERENCES, gradient_tests, load, render_ours, render_references
 
@@ -117,20 +118,17 @@ class Paths:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
-        from data_gen.paths.light_ends import LightEnds
-        from data_gen.paths.vertex import Materials
+        from data_gen.paths.eye import Eye
         from data_gen.samplers.bdpt import mis
         from data_gen.samplers.bdpt.vertex import Vertex, cosine
-        from data_gen.samplers.common import like_path
-        from data_gen.samplers.gbdpt.base_path import Plan, base_step
+        from data_gen.samplers.gbdpt.base_path import base_step
         from data_gen.samplers.gbdpt.offset_path import start, take_step
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, corner, (24, 24))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
         self.sensor, self.lens = camera.sensor, camera.lens
-        self.integrator = like_path(scene, "gbdpt")
-        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8)
+        self.plan = plan = plan_of(scene)
         ray, _, _ = camera.rays()
         self.random = camera.random.clone()
         self.first = plan.lights.sample(scene, self.random, ray.time, ray.wavelengths)
@@ -141,14 +139,14 @@ class Paths:
         _, e = self.sensor.sample_direction(x, self.lens)
         offset_ray, importance, inside = camera.rays(self.SHIFT)
         hit = scene.ray_intersect_preliminary(offset_ray)
-        offsets = [start(self.sensor, self.lens, x, offset_ray, hit, importance, inside)]
+        offsets = [start(Eye.of(camera), x, (offset_ray, importance, inside), hit)]
         z = Vertex(x, mi.Spectrum(1), mis.begin_camera(e[0], cosine(x, ray.d)), mi.UInt32(1))
         active = x.is_valid()
         for _ in range(self.LENGTH):
-            step, _, _ = base_step(scene, plan, self.random, z, active, mi.Float(1), mi.Bool(True), mi.Float(0))
+            step, _ = base_step(plan, self.random, z, fresh(mi), active, brightest_offset=mi.Float(0))
             self.steps.append(step)
             self.offsets.append(offsets[0])
-            offsets = take_step(scene, plan, step, offsets)
+            offsets = take_step(plan, step, offsets)
             z = Vertex(step.x1, step.β1, step.end1, z.depth + 1)
             active = step.goes_on & step.x1.is_valid()
             dr.eval(step, offsets, z, active)
@@ -278,7 +276,7 @@ def test_copies_of_paths_to_a_light(paths, t):
     lamp = (step.light.p, step.light.n)
     if t < 3:
         si = own_vertex(offset, step.z.si)
-        C, r, others = to_same_light(paths.scene, paths.plan, step, offset, si, si.bsdf(), good)
+        C, r, others = to_same_light(paths.plan, step, offset, si, si.bsdf(), good)
         r *= offset.r
     else:  # settled
         cos = cosine(step.z.si, step.light.d)
@@ -304,12 +302,12 @@ def joined(paths, t, s, end=None):
     good &= there & step.connectable
     for _, _, smooth, *_ in paths.from_light[: s - 1]:
         good &= smooth
-    g, known = connection(paths.scene, step.z, step.z.si.bsdf(), y, good)
+    g, edge = connection(paths.scene, step.z, step.z.si.bsdf(), y, good)
     C, end = step.z.β * g, end or offset.end
     if t < 3:
         v = Vertex(own_vertex(offset, step.z.si), offset.β, end, step.z.depth)
-        g, known = connection(paths.scene, v, v.si.bsdf(), y, good, seen=offset.joined)
-    others = mis.others_connected(end, *known[:3], y.end, *known[3:])
+        g, edge = connection(paths.scene, v, v.si.bsdf(), y, good, seen=offset.joined)
+    others = mis.others_connected(end, y.end, edge)
     lamp = (paths.first.end.p, paths.first.end.n)
     brute = paths.brute(base + behind, lamp), paths.brute(copy + behind, lamp)
     return C, (offset.β * g, offset.r, others), *brute, s + 1, good
@@ -350,23 +348,21 @@ def splatted(paths, s):
     good &= paths.plan.materials.connectable(y.si.bsdf())
     nothing_between = lambda si, to, active: paths.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
     C, others, uv = to_camera(paths.sensor, paths.lens, y, y.si.bsdf(), good, nothing_between)
-    return Splatted(
-        *(y, d, uv, paths.lens, C, others, mi.Bool(s == 1), paths.first, before),
-        *(p, mi.Float(1), mi.UInt32(0), mi.Bool(good)),
-    )
+    before_it = {"first": mi.Bool(s == 1), "start": paths.first, "before": before, "p": p, "survival": mi.Float(1)}
+    return Splatted(y, d, uv, paths.lens, C, others, **before_it, events=mi.UInt32(0), allowed=mi.Bool(good))
 
 
 def seen_elsewhere(paths, s):
     """The copy of ``splatted`` through another pixel: path, copy's place and vertex, and arguments of ``compare``."""
-    from data_gen.samplers.gbdpt.light_shift import inside, shifted
+    from data_gen.paths.eye import Eye
+    from data_gen.samplers.gbdpt.light_shift import shifted
 
-    mi, scene, camera = paths.mi, paths.scene, paths.camera
+    mi, scene, eye = paths.mi, paths.scene, Eye.of(paths.camera)
     path = splatted(paths, s)
     uv = path.uv + mi.Vector2f(*paths.SHIFT)
-    good = path.allowed & inside(camera, uv) & (paths.dr.max(path.C) > 0)
-    found = shifted(scene, paths.plan, camera, path, uv, good, paths.integrator.first_hit)
-    ray, _ = paths.sensor.sample_ray(camera.time, camera.wavelength, uv / mi.Vector2f(camera.size), paths.lens)
-    x = scene.ray_intersect(ray, good)
+    good = path.allowed & eye.shows(uv) & (paths.dr.max(path.C) > 0)
+    found = shifted(paths.plan, eye, path, uv, good)
+    x = scene.ray_intersect(eye.ray(uv, paths.lens), good)
     behind = [vertex.si for vertex, *_ in paths.from_light[: s - 1]][::-1]
     lamp = (paths.first.end.p, paths.first.end.n)
     base, copy = paths.brute([path.y.si, *behind], lamp), paths.brute([x, *behind], lamp)
@@ -390,10 +386,11 @@ def test_copies_of_light_paths_to_the_camera(paths, s):
     """Against brute force; and the copy's copy is the path itself, with 1 / r."""
     from dataclasses import replace
 
+    from data_gen.paths.eye import Eye
     from data_gen.samplers.bdpt.vertex import Vertex
     from data_gen.samplers.gbdpt.light_shift import shifted
 
-    mi, dr, scene, camera = paths.mi, paths.dr, paths.scene, paths.camera
+    mi, dr, scene = paths.mi, paths.dr, paths.scene
     path, uv, x, (C, found, base, copy, _, good) = seen_elsewhere(paths, s)
     paths.compare(C, found, base, copy, s + 1, good)
 
@@ -411,7 +408,7 @@ def test_copies_of_light_paths_to_the_camera(paths, s):
         p = before.bsdf().pdf(mi.BSDFContext(), before, before.to_local(d))
     y = Vertex(x, path.y.β, path.y.end, path.y.depth)
     back = replace(path, y=y, d=d, uv=uv, C=C, others=others, start=start, p=p)
-    C, r_back, others = shifted(scene, paths.plan, camera, back, path.uv, good, paths.integrator.first_hit)
+    C, r_back, others = shifted(paths.plan, Eye.of(paths.camera), back, path.uv, good)
     good = np.array(good & (dr.max(C) > 0))
     assert good.sum() > 100
     error = np.abs(np.array(r, np.float64) * np.array(r_back, np.float64) - 1)[good]
@@ -427,19 +424,19 @@ def test_going_straight_to_a_vertex_and_back(paths):
     from data_gen.samplers.bdpt.vertex import Vertex, evaluate
     from data_gen.samplers.gbdpt.offset_path import reconnect
 
-    mi, dr, scene, plan = paths.mi, paths.dr, paths.scene, paths.plan
+    mi, dr, plan = paths.mi, paths.dr, paths.plan
     step, offset = paths.steps[0], paths.offsets[0]
     base, (own, *_), good = vertices_of(paths, 2)
     good &= paths.offsets[1].joined
     none = replace(offset, β=mi.Spectrum(0))
-    there, _, _ = reconnect(scene, plan, step, offset, none, own, own.bsdf())
+    there, _, _ = reconnect(plan, step, offset, none, own, own.bsdf())
     d = there.ray.d
     _, p, _ = evaluate("Radiance", own, own.bsdf(), own.to_local(d), good)
     z = Vertex(own, offset.β, offset.end, step.z.depth)
     reverse = replace(step, z=z, wo=own.to_local(d), d=d, p=p, survival=mi.Float(1))
     x = base[0]
     as_offset = replace(offset, β=step.z.β, r=mi.Float(1), end=step.z.end, apart=mi.Bool(True))
-    back, _, _ = reconnect(scene, plan, reverse, as_offset, none, x, x.bsdf())
+    back, _, _ = reconnect(plan, reverse, as_offset, none, x, x.bsdf())
     good = np.array(good & (dr.max(back.β) > 0))
     assert good.sum() > 1000
     error = np.abs(np.array(there.r, np.float64) * np.array(back.r, np.float64) - 1)[good]
@@ -582,29 +579,26 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
 
     from data_gen.film.splats import Splats
     from data_gen.paths.camera import CameraSamples
-    from data_gen.paths.light_ends import LightEnds
-    from data_gen.samplers.bdpt.light_path import Seen, pixel_at
+    from data_gen.paths.eye import Sight
+    from data_gen.samplers.bdpt.light_path import Seen, light_path
     from data_gen.samplers.bdpt.strategies import to_camera
-    from data_gen.samplers.common import like_path
     from data_gen.samplers.gbdpt.light_again import Marker, light_again, marked
 
     mi, scene = renderer, load(renderer, name, (32, 24))
-    lights, camera = LightEnds(scene), CameraSamples(scene.sensors()[0], 5, 64)
-    integrator, longest = like_path(scene, "gbdpt", rr_depth=3), 7
-    ray, importance, _ = camera.rays()
+    camera, longest = CameraSamples(scene.sensors()[0], 5, 64), 7
+    plan, sight = plan_of(scene, longest), Sight.of(camera)
+    plan.limits.rr_depth = 3
     first, second = Splats(camera.pixels, 3), Splats(camera.pixels, 3)
-    marker = Marker(first, ray, importance)
-    *_, state = integrator.light_path(scene, lights, camera, camera.random.clone(), ray, longest, marker)
+    *_, state = light_path(plan, sight, Marker(first, sight.ray, sight.importance))
     lanes, depths = marked(state, longest)
     assert set(np.array(depths)) == set(range(1, longest)) and np.all(np.diff(np.array(depths).astype(int)) >= 0)
-    some = camera.at(lanes)
-    ray, importance, _ = some.rays()
-    again = light_again(scene, lights, some, some.random.clone(), ray, depths, integrator.rr_depth)
-    _, end, link, left, lens, there = again
+    some = Sight.of(camera.at(lanes))
+    again = light_again(plan, some, depths)
+    end, link, left, there = again.end, again.link, again.left, again.there
     seen = lambda *_: mi.Bool(False)  # noqa: E731
-    C, others, uv = to_camera(camera.sensor, lens, end.y, end.y.si.bsdf(), there, seen)
-    marker = Marker(second, ray, importance)
-    marker.sees(mi.UInt64(0), Seen(end.y, C, others, pixel_at(uv, camera.size), None))
+    C, others, uv = to_camera(camera.sensor, again.lens, end.y, end.y.si.bsdf(), there, seen)
+    marker = Marker(second, some.ray, some.importance)
+    marker.sees(mi.UInt64(0), Seen(end.y, C, others, some.eye.pixel_at(uv), None))
     smooth = link.depth + 1 == end.y.depth
     before = dr.select(link.depth > 0, left.o + left.d * left.t, end.ray.o)
     beside = dr.select(smooth & (link.depth > 0), dr.norm(mi.Vector3f(before - end.ray.o)), 0)

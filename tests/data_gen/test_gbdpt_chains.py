@@ -1,9 +1,11 @@
 """Camera paths of ``gbdpt`` that go through mirrors or glass behind their first vertex, and their copies."""
 
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from bdpt_ends import fresh, plan_of
 from data_gen_scenes import caustics, glass
 from test_gbdpt_glass import by_a_wall, close, number
 from unbiased import DISTANCES, REFERENCES, gradient_tests, load, render_ours
@@ -29,6 +31,14 @@ def lacquered():
 ENDS = {"lamp": caustics, "wall": by_a_wall, "sky": under_a_sky, "room": glass, "lacquer": lacquered}
 
 
+class Start(NamedTuple):
+    """The copy at its own vertex."""
+
+    β: Any
+    r: Any
+    end: Any
+
+
 class Bent:
     """The first camera path of each lane that is bent right behind what the camera sees, up to the end of its chain."""
 
@@ -38,17 +48,15 @@ class Bent:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
-        from data_gen.paths.light_ends import LightEnds
-        from data_gen.paths.vertex import Materials
         from data_gen.samplers.bdpt.vertex import Vertex
-        from data_gen.samplers.gbdpt.base_path import Plan, base_step
+        from data_gen.samplers.gbdpt.base_path import base_step
         from data_gen.samplers.gbdpt.chain_shift import along, no_chain, straight
         from data_gen.samplers.gbdpt.pairs import difference_of_one
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, description, (32, 32))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
-        self.plan = plan = Plan(LightEnds(scene), Materials(scene, 0.05), 8, 100, 8, pair=difference_of_one)
+        self.plan = plan = plan_of(scene, pair=difference_of_one)
         ray, _, _ = camera.rays()
         random, x = camera.random.clone(), scene.ray_intersect(mi.Ray3f(ray))
         z = Vertex(x, mi.Spectrum(1), self.first_end(x, ray), mi.UInt32(1))
@@ -56,8 +64,8 @@ class Bent:
         self.good, self.β = mi.Bool(False), mi.Spectrum(0)
         for depth in range(1, self.LENGTH + 1):
             z.depth = mi.UInt32(depth)
-            step, _, _ = base_step(scene, plan, random, z, active, mi.Float(1), mi.Bool(True), mi.Float(0))
-            step, course, chain = along(scene, plan, step, course, chain)
+            step, _ = base_step(plan, random, z, fresh(mi), active, brightest_offset=mi.Float(0))
+            step, course, chain = along(plan, step, course, chain)
             here = active & chain.arrives & ~self.good & dr.all(chain.x1.p == x.p)
             found = (step, chain)
             self.step, self.chain = dr.select(here, found, (self.step, self.chain)) if depth > 1 else found
@@ -83,10 +91,8 @@ class Bent:
     def copy(self, step, chain, x, end, active):
         from data_gen.samplers.gbdpt.chain_shift import follow_chain
 
-        mi = self.mi
-        found = follow_chain(
-            self.scene, self.plan, step, chain, x, x.bsdf(), mi.Spectrum(1), mi.Float(1), end, mi.Bool(active)
-        )
+        start = Start(self.mi.Spectrum(1), self.mi.Float(1), end)
+        found = follow_chain(self.plan, step, chain, start, x, self.mi.Bool(active))
         self.dr.eval(found)
         return found
 
@@ -101,7 +107,7 @@ class Bent:
         reached = step.x1.is_valid()
         target = Target(step.x1.p, dr.select(reached, self.mi.Vector3f(step.x1.n), step.d), ~reached)
         base = shoot(self.scene, chain.x1, chain.ω, chain.events, target, active)
-        ends = partial(chain_shift.ends, self.scene, self.plan)
+        ends = partial(chain_shift.ends, self.plan)
         ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, target, active, ends)
         dr.eval(ω)
         return ω

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from bdpt_ends import plan_of
 from data_gen_scenes import caustics
 from unbiased import DISTANCES, REFERENCES, gradient_tests, load, render_ours
 
@@ -47,22 +48,17 @@ class Caustics:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
-        from data_gen.paths.light_ends import LightEnds
-        from data_gen.paths.vertex import Materials
         from data_gen.samplers.bdpt import mis
         from data_gen.samplers.bdpt.strategies import to_camera
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves, scatters_smoothly
-        from data_gen.samplers.common import like_path
-        from data_gen.samplers.gbdpt.base_path import Plan
         from data_gen.samplers.gbdpt.light_again import first_link, next_link
         from data_gen.samplers.gbdpt.light_shift import Splatted
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, description, (32, 32))
         self.camera = camera = CameraSamples(scene.sensors()[0], 1, 64)
-        self.first_hit = like_path(scene, "gbdpt").first_hit
-        lights, materials = LightEnds(scene), Materials(scene, 0.05)
-        self.plan = Plan(lights, materials, 8, 100, 8)
+        self.plan = plan_of(scene)
+        lights, materials = self.plan.lights, self.plan.materials
         ray, _, _ = camera.rays()
         random = camera.random.clone()
         start = lights.sample(scene, random, ray.time, ray.wavelengths)
@@ -89,24 +85,24 @@ class Caustics:
         y, d, link, before, good = found
         nothing_between = lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
         C, others, uv = to_camera(camera.sensor, camera.lens, y, y.si.bsdf(), good, nothing_between)
-        self.path = Splatted(
-            *(y, d, uv, camera.lens, C, others, link.depth == 0, start, before),
-            *(link.p, link.survival, link.events, good),
-        )
+        before_it = {"first": link.depth == 0, "start": start, "before": before, "p": link.p}
+        before_it |= {"survival": link.survival, "events": link.events}
+        self.path = Splatted(y, d, uv, camera.lens, C, others, **before_it, allowed=good)
         dr.eval(self.path)
 
     def shift(self, path, uv, active):
         """(C', r, others') at that place on the film."""
+        from data_gen.paths.eye import Eye
         from data_gen.samplers.gbdpt.light_shift import shifted
 
-        return shifted(self.scene, self.plan, self.camera, path, uv, active, self.first_hit, True)
+        return shifted(self.plan, Eye.of(self.camera), path, uv, active, True)
 
     def copy(self, path, pixels):
         """Its copy so many pixels to the right and half as many down: where it is, and C', r, others'."""
-        from data_gen.samplers.gbdpt.light_shift import inside
+        from data_gen.paths.eye import Eye
 
         uv = path.uv + self.mi.Vector2f(pixels, pixels / 2)
-        active = path.allowed & inside(self.camera, uv) & (self.dr.max(path.C) > 0)
+        active = path.allowed & Eye.of(self.camera).shows(uv) & (self.dr.max(path.C) > 0)
         return uv, active, self.shift(path, uv, active)
 
 
@@ -137,16 +133,15 @@ def moved_path(paths, uv, good):
     """The copy at ``uv`` as if light had found it: traced forward from the vertex that stays."""
     from dataclasses import replace
 
+    from data_gen.paths.eye import Eye
     from data_gen.samplers.bdpt import mis
     from data_gen.samplers.bdpt.strategies import to_camera
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, evaluate, light_leaves
     from data_gen.samplers.gbdpt.light_shift import through_glass
 
     mi, dr, scene, camera, path = paths.mi, paths.dr, paths.scene, paths.camera, paths.path
-    size = mi.Vector2f(camera.size)
-    ray, _ = camera.sensor.sample_ray(camera.time, camera.wavelength, uv / size, path.lens)
-    x = scene.ray_intersect(ray, good)
-    d, β, *_ = through_glass(scene, paths.plan, path, x, good & x.is_valid())
+    x = scene.ray_intersect(Eye.of(camera).ray(uv, path.lens), good)
+    d, β, *_ = through_glass(paths.plan, path, x, good & x.is_valid())
     good &= dr.max(β) > 0
     dr.eval(x, d, good)
     # ------------------- To the vertex that stays ----------------
@@ -240,11 +235,11 @@ def test_what_is_bent_is_shifted_by_a_kernel_of_its_own(renderer, monkeypatch):
 
     found, differences = {False: renderer.UInt32(0), True: renderer.UInt32(0)}, light_shift.differences
 
-    def counted(scene, plan, camera, path, first_hit, lit, bent=False):
+    def counted(plan, eye, path, lit, bent=False):
         # A light path without a vertex of its own to come from is the light's.
         there = path.first | (path.before.depth > 0)
         dr.scatter_add(found[bent], 1, 0, (dr.max(path.C) > 0) & (path.events != 0) & path.allowed & there)
-        return differences(scene, plan, camera, path, first_hit, lit, bent)
+        return differences(plan, eye, path, lit, bent)
 
     monkeypatch.setattr(light_shift, "differences", counted)
     stack = render_stack(load(renderer, by_a_wall, (32, 32)), 64, 3, "gbdpt")
@@ -321,7 +316,7 @@ def test_less_noise_than_without(renderer, long_passes, monkeypatch):
 
     followed = noise()
 
-    def lost(scene, plan, path, x, active):
+    def lost(plan, path, x, active):
         return renderer.Vector3f(path.d), renderer.Spectrum(0), renderer.Float(0), renderer.Float(0)
 
     monkeypatch.setattr(light_shift, "through_glass", lost)

@@ -9,7 +9,7 @@ from operator import itemgetter
 
 import numpy as np
 import pytest
-from bdpt_ends import Ends, without_hole
+from bdpt_ends import Ends, fresh, plan_of, without_hole
 from bdpt_scenes import SCENES
 from test_gpm import assert_no_bias, gain, passes
 from test_vcm import seen_through_glass
@@ -34,17 +34,18 @@ class Copies:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.eye import Eye
         from data_gen.paths.vertex import SMOOTH, Materials
         from data_gen.samplers.bdpt import mis
         from data_gen.samplers.bdpt.vertex import Vertex, cosine
-        from data_gen.samplers.gbdpt.base_path import Plan, base_step
+        from data_gen.samplers.gbdpt.base_path import base_step
         from data_gen.samplers.gbdpt.offset_path import own_vertex, start, take_step
 
         self.mi, self.dr = mi, dr
         self.scene = scene = load(mi, without_hole, (24, 24))
         self.materials = Materials(scene, 0.05)
         self.base = Ends(mi, scene, ETA, self.materials.connectable, spp=64)
-        plan = self.plan = Plan(self.base.lights, self.materials, 12, 100, 12, η=mi.Float(ETA))
+        plan = self.plan = plan_of(scene, 12, η=mi.Float(ETA))
         camera = CameraSamples(scene.sensors()[0], 1, 64)
         ray, _, _ = camera.rays()
         random = self.base.random
@@ -52,11 +53,11 @@ class Copies:
         _, e = camera.sensor.sample_direction(x, camera.lens)
         shifted, importance, inside = camera.rays(self.SHIFT)
         hit = scene.ray_intersect_preliminary(shifted)
-        offsets = [start(camera.sensor, camera.lens, x, shifted, hit, importance, inside)]
+        offsets = [start(Eye.of(camera), x, (shifted, importance, inside), hit)]
         z = Vertex(x, mi.Spectrum(1), mis.begin_camera(e[0], cosine(x, ray.d)), mi.UInt32(1))
         active, base, other, self.offsets, self.steps = x.is_valid(), [], [], [], []
         for _ in range(self.LENGTH):
-            step, _, _ = base_step(scene, plan, random, z, active, mi.Float(1), mi.Bool(True), mi.Float(0))
+            step, _ = base_step(plan, random, z, fresh(mi), active, brightest_offset=mi.Float(0))
             offset = offsets[0]
             own = own_vertex(offset, z.si)
             alive = active & (dr.max(offset.β) > 0)
@@ -66,7 +67,7 @@ class Copies:
             other.append((Vertex(si, offset.β, offset.end, z.depth), alive, si.bsdf(), delta))
             self.steps.append(step)
             self.offsets.append(offset)
-            offsets = take_step(scene, plan, step, offsets)
+            offsets = take_step(plan, step, offsets)
             z = Vertex(step.x1, step.β1, step.end1, z.depth + 1)
             active = step.goes_on & step.x1.is_valid()
             dr.eval(base, other, step, offset, offsets, z, active)
@@ -91,8 +92,8 @@ def weights(copies, t, s):
     good = alive & scatters_smoothly(y_bsdf) & connectable(y_bsdf) & connectable(bsdf)
     for _, there, *_ in copies.base.from_light[:s]:
         good &= there
-    C, known = connection(copies.scene, Vertex(own.si, own.β, own.end, own.depth), bsdf, y, good)
-    others = mis.others_connected(own.end, *known[:3], y.end, *known[3:])
+    C, edge = connection(copies.scene, Vertex(own.si, own.β, own.end, own.depth), bsdf, y, good)
+    others = mis.others_connected(own.end, y.end, edge)
     # Mirrors in front of the first rough vertex have Jacobians of their own.
     (z, _, _, bent), (x, *_) = copies.base.from_camera[0], copies.copy.from_camera[0]
     straight = ~bent if t > 1 else ~dr.zeros(copies.mi.Bool, dr.width(C))
@@ -183,7 +184,7 @@ class Beside:
         kept.photon = dr.full(mi.UInt32, 1, n)
         self.photons = Photons(kept, radius, n)
         self.places = np.array(z.si.p).T, np.array(z.si.p + aside).T
-        self.merging = ShiftedMerging(self.photons, copies.materials, 12)
+        self.merging = ShiftedMerging(self.photons, copies.plan)
 
     def found(self, end, η=1.0):
         """L and Δ of the base paths of that ``end``, 0 or 1, where paths merge with this η: (3, n) of each."""

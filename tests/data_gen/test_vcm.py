@@ -5,7 +5,7 @@ That it repeats its bits, says how noisy it is and stays within its memory is am
 
 import numpy as np
 import pytest
-from bdpt_ends import Ends, check_weights, compare, without_hole
+from bdpt_ends import Ends, check_weights, compare, plan_of, without_hole
 from bdpt_scenes import SCENES
 from unbiased import REFERENCES, light_of_gradients, load
 
@@ -39,10 +39,7 @@ def test_weights_of_merging_are_those_of_all_densities(ends):
     class Gathered:
         η = ends.mi.Float(ETA)
 
-    class Wide:
-        connectable = staticmethod(ends.connectable)
-
-    merging = Merging(Gathered, Wide, 10)
+    merging = Merging(Gathered, plan_of(ends.scene, 10))
     for t in range(3):
         for s in range(2, 4):
             (y, _, y_bsdf, _), (*_, delta) = ends.from_light[s - 1], ends.from_light[s - 2]
