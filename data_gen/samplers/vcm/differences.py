@@ -32,7 +32,8 @@ class ShiftedMerging(Merging):
         """The light of the photons near to the vertex ``z``, weighted; and Δ of the ``offsets``, with it."""
         photons, connectable = self.photons, self.materials.connectable
         active = active & connectable(bsdf)
-        # What does not change from photon to photon
+
+        # ------------- The copies, the same for all photons --------------
         vertices = [own_vertex(offset, z.si) for offset in offsets]
         materials = [y.bsdf() for y in vertices]
         receives = [
@@ -41,11 +42,15 @@ class ShiftedMerging(Merging):
         ]
 
         def one_more(sums, i, near):
+            """The ``sums`` of light and of Δ, with photon ``i`` of the grid."""
+            # --------------------- At the base path ----------------------
             photon, end, near = self.photon(i, z, near)
             g, p, q = brought(photon, z.si, bsdf, near)
             g = dr.select(near & dr.isfinite(dr.sum(g)), g, 0)
             C, others = z.β * g, mis.others_merged(z.end, q, end, p, photons.η)
             lit, found = dr.max(C) > 0, []
+
+            # ----------------------- At each copy ------------------------
             for offset, y, material, own in zip(offsets, vertices, materials, receives, strict=True):
                 own = own & lit & (offset.joined | is_near(photon, y, photons.radius2))
                 g1, p1, q1 = brought(photon, y, material, own)

@@ -62,8 +62,7 @@ class GVCM(VCM):
         dr.eval(sight.ray, sight.importance, shifted)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
         if self.plan(world).joins:
-            kept, sight, marks = self.light_pass(passes, sight, camera.first, film.splats("primal"))
-            photons = Photons(kept, self.radius_of(passes, camera.first), dr.width(camera.pixel))
+            photons, sight, marks = self.light_pass(passes, sight, camera.first, film.splats("primal"))
             self.shift_splats(passes, camera, film, marks, photons.η)
         L, Le, Δ = frozen(self.shifted_camera_pass, world, sight, shifted, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
@@ -73,7 +72,7 @@ class GVCM(VCM):
         for name, value, (_, _, inside) in zip(SHIFTS, Δ, shifted, strict=True):
             film.put(name, value, inside)
 
-    # ------------------- Light paths that end at the camera --------------------
+    # ------------------- Light paths that end at the camera: shifts ------------------
 
     def shift_splats(
         self, passes: Passes, camera: CameraSamples, film: GradientFilm, marks: mi.UInt64, η: mi.Float
@@ -102,7 +101,7 @@ class GVCM(VCM):
         splats = {name: Splats.on(sight.eye.pixels, 3, one) for name, one in zip(SHIFTS, sums, strict=True)}
         return sums, splat_differences(self.plan(world, η=η), sight, depths, splats, bent)
 
-    # ------------------- Camera paths: joins, and merges -----------------------
+    # -------------------- Camera paths and copies: joins, and merges -----------------
 
     def shifted_camera_pass(self, world: World, sight: Sight, shifted: list, photons: Photons | None) -> tuple:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all; and four Δ."""

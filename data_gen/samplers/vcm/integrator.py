@@ -109,31 +109,25 @@ class VCM(BDPT):
         dr.eval(sight.ray, sight.importance)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
         if self.plan(world).joins:
-            kept, sight, _ = self.light_pass(passes, sight, camera.first, film.splats("primal"))
-            photons = Photons(kept, self.radius_of(passes, camera.first), dr.width(camera.pixel))
+            photons, sight, _ = self.light_pass(passes, sight, camera.first, film.splats("primal"))
         L, Le = frozen(self.camera_pass, world, sight, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         dr.eval(values)
         film.put_all(values)
 
-    def radius_of(self, passes: Passes, number: int) -> float:
-        """That of pass ``number``."""
-        return self.radius * passes.width * shrunk(number)
+    # ----------------------- Light paths: splats, and photons ------------------------
 
-    # ------------------------ The light paths of a pass ------------------------
-
-    def light_pass(self, passes: Passes, sight: Sight, number: int, splats: Splats) -> tuple[Map, Sight, Any]:
-        """Light paths, whose ends at the camera are splatted: the map of their vertices, the ``sight`` with random
-        numbers to go on by, and the splatter's state."""
-        n = dr.width(sight.ray)
-        η = dr.opaque(mi.Float, eta(self.radius_of(passes, number), n))
-        empty = Map.empty(n, self.vertices)
+    def light_pass(self, passes: Passes, sight: Sight, number: int, splats: Splats) -> tuple[Photons, Sight, Any]:
+        """The light paths of pass ``number``, whose ends at the camera are splatted: their vertices as photons, the
+        ``sight`` with random numbers to go on by, and the splatter's state."""
+        n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(number)
+        η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
         kept, numbers, state, sums = passes.frozen(
             self.light_paths, passes.world, sight, η, empty, fixed=True, sums=splats.zeros
         )
         dr.eval(kept, numbers, state, sums)
         splats.take(sums)
-        return kept, replace(sight, random=type(sight.random)(numbers)), state
+        return Photons(kept, radius, n), replace(sight, random=type(sight.random)(numbers)), state
 
     def light_paths(self, world: World, sight: Sight, η: mi.Float, empty: Map, sums: tuple) -> tuple:
         """Fills the ``empty`` map and the ``sums`` of splats; with them random numbers, and the splatter's state."""
@@ -141,7 +135,7 @@ class VCM(BDPT):
         path, random, state = light_path(self.plan(world, η=η), sight, Keeper(splatter, η, empty))
         return replace(empty, count=path.count), random.random, state, sums
 
-    # ------------------- Camera paths: joins, and merges -----------------------
+    # ------------------------ Camera paths: joins, and merges ------------------------
 
     def camera_pass(self, world: World, sight: Sight, photons: Photons | None) -> tuple[mi.Spectrum, mi.Spectrum]:
         """L and Le of camera paths, joined to their own light paths and to the ``photons`` of all."""
