@@ -86,12 +86,14 @@ def connect(plan: Plan, step: Step, y: Vertex, times, offsets: list[Offset], Δ:
     g, edge = connection(scene, z, z.si.bsdf(), y, mi.Bool(True))
     C, others = z.β * g, mis.others_connected(z.end, y.end, edge)
     lit = dr.max(C) > 0
+    # ------- Settled copies: the same connection, other weights -------
     busy, sums = mi.Bool(False), []
     for offset, Δ_before in zip(offsets, Δ, strict=True):
         own = offset.apart | offset.joined
         busy |= own
         others1 = mis.others_connected(offset.end, y.end, edge)
         sums.append(Δ_before + dr.select(~own, times * plan.pair(C, others, offset.β * g, offset.r, others1), 0))
+    # --------- Others: from the copy's own vertex, one by one ---------
     # What a shift to y needs of the materials, but for the offset path's own
     both = step.connectable & plan.materials.connectable(y.si.bsdf())
 
@@ -126,6 +128,8 @@ def take_step(
         busy |= offset.apart | offset.joined
     offsets = [settled(plan, step, offset) for offset in offsets]
 
+    # A loop over the four has one copy of what a step is, which takes long to compile. Each turn takes the first of
+    # them, and puts it behind the others: after four they are in their order again.
     def rotate(i, y, *others):
         own = y.apart | y.joined
         y = dr.if_stmt((y,), own, lambda y: step_own(plan, step, y, course, chain), lambda y: y)
@@ -166,7 +170,7 @@ def settled(plan: Plan, step: Step, y: Offset) -> Offset:
 
 def step_own(plan: Plan, step: Step, y: Offset, course: Course | None = None, chain: Chain | None = None) -> Offset:
     """A step from a vertex of the offset path's own, or from the shared one to which it has come from elsewhere."""
-    # ------------------------ The vertex -------------------------
+    # --------------- The vertex: apart, or just joined ---------------
     si = own_vertex(y, step.z.si)
     bsdf = si.bsdf()
     connectable = plan.materials.connectable(bsdf)

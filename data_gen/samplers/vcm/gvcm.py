@@ -109,9 +109,8 @@ class GVCM(VCM):
         if photons is None:
             return shifted_camera_path(self.plan(world), sight, shifted, None)[:3]
         plan = self.plan(world, η=photons.η)
-        return shifted_camera_path(plan, sight, shifted, photons.kept.paths(), merging=ShiftedMerging(photons, plan))[
-            :3
-        ]
+        merging = ShiftedMerging(photons, plan)
+        return shifted_camera_path(plan, sight, shifted, photons.kept.paths(), merging)[:3]
 
 
 def make(scene: mi.Scene, **options):
