@@ -1,4 +1,4 @@
-"""Speed of the networks in their runtimes, and of OIDN beside them: the table of docs/lab/onnx-table.md.
+"""Speed of the networks in their runtimes, and of OIDN beside them: bench/results/onnx.json.
 
     python -m bench.onnx
 
@@ -46,7 +46,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--sizes", nargs="*", default=SIZES)
     parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
     parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/onnx.json"))
     args = parser.parse_args()
     packages = ("onnxruntime", "torch", "mitsuba-oidn")
@@ -61,8 +60,6 @@ def main() -> None:
         result["peak MiB"] = {size: peak(size) for size in args.sizes}
         result["bytes"] = {"float32": FAST.stat().st_size, "float16": half.stat().st_size if half else None}
     save(args.output, result)
-    (args.docs / "lab" / "onnx-table.md").write_text(table(result))
-    print(table(result))
 
 
 def stack_of(width: int, height: int) -> GradientStack:
@@ -172,30 +169,6 @@ print(mebibytes("VmHWM") - before)
 """
     done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
     return float(done.stdout)
-
-
-def table(result: dict) -> str:
-    sizes = result["sizes"]
-    lines = [f"| milliseconds | {' | '.join(sizes)} | per megapixel |", "|---|" + "--:|" * (len(sizes) + 1)]
-    width, height = map(int, list(sizes)[-1].split("x"))
-    for name in next(iter(sizes.values())):
-        cells = [
-            f"{1e3 * row[name]['median']:.0f} ({1e3 * row[name]['low']:.0f} .. {1e3 * row[name]['high']:.0f})"
-            for row in sizes.values()
-        ]
-        per = 1e9 * list(sizes.values())[-1][name]["median"] / (width * height)
-        lines.append(f"| {name} | {' | '.join(cells)} | {per:.0f} |")
-    memory = ", ".join(f"{value:.0f} MiB at {size}" for size, value in result["peak MiB"].items())
-    where = result["metadata"]
-    versions = ", ".join(f"{name} {number or 'absent'}" for name, number in where["versions"].items())
-    note = (
-        f"Medians (quartiles) of {result['repeats']}. `ngpt denoise` of 64x64 pixels, from the command to the end: "
-        f"{result['start-up']['median']:.2f} s. Memory of ngpt-fast beside the stack: {memory}. Files: "
-        f"{result['bytes']['float32']} bytes, float16 {result['bytes']['float16']}. {versions}; {where['threads']} "
-        f"threads of {where['cpu']}, {where['date']}, commit {where['commit']}; by `python -m bench.onnx`, which "
-        "explains the rows."
-    )
-    return "\n".join(lines) + f"\n\n{note}\n"
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("expo
 PAGES = [page for page in PAGES if "node_modules" not in page.parts]
 PICTURES = sorted(path for path in ROOT.glob("docs/images/*") if path.suffix in (".png", ".jpg", ".svg", ".webp"))
 # Made by commands, which wrap no lines.
-GENERATED = re.compile(r"-table\.md$|RELIABILITY\.md$|RESULTS\.md$")
+GENERATED = re.compile(r"RELIABILITY\.md$|RESULTS\.md$")
 
 
 def name(page):
