@@ -3,10 +3,13 @@
 stack, plan = data_gen.render_scene("scene.xml", spp=64)                       # what `ngpt render` does
 for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16):    # what it does with --frames
     ...
+scene = mi.load_dict({..., "integrator": {"type": "gpt"}})                     # our integrators are Mitsuba's plugins
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from data_gen.plugins import register_when_ready
 
 if TYPE_CHECKING:
     from data_gen.backend import use_variant
@@ -41,3 +44,6 @@ def __getattr__(name: str) -> object:
 
 def __dir__() -> list[str]:
     return sorted({*globals(), *__all__})
+
+
+register_when_ready()

@@ -1,10 +1,7 @@
 """The Mitsuba variant: which one is used, and what has to be in place before it starts."""
 
-import importlib
-import sys
-
 from data_gen.llvm import use_llvm
-from data_gen.samplers import SAMPLERS
+from data_gen.plugins import make_classes
 from ngpt.errors import NgptError, stop_if_interrupted
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
@@ -38,12 +35,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         use_llvm()
     try:
         mi.set_variant(name)
-        # Mitsuba's classes belong to a variant, so the classes derived from them are made anew with each.
-        for module in ("data_gen.samplers.common", *(s.module for s in SAMPLERS.values() if s.module)):
-            if module in sys.modules:
-                importlib.reload(sys.modules[module])
-            else:
-                importlib.import_module(module)
+        make_classes()
     except (ImportError, RuntimeError) as error:
         stop_if_interrupted(error)
         raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error

@@ -1,6 +1,6 @@
 """The gradient stack: the data type between those who render gradients and those who reconstruct from them."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -49,6 +49,31 @@ class GradientStack:
     ) -> "GradientStack":
         """Makes a stack of arrays: ``GradientStack.from_arrays(primal=image, dx=dx, dy=dy)``."""
         return cls({name: np.asarray(array) for name, array in layers.items()}, dict(attributes or {}), path=path)
+
+    @classmethod
+    def from_aovs(
+        cls, tensor: ArrayLike, names: Sequence[str], attributes: Mapping[str, Any] | None = None
+    ) -> "GradientStack":
+        """A stack of the (height, width, channels) tensor that ``mi.render(scene)`` returns of one of our integrators.
+
+        ``names`` are the integrator's ``aov_names()``, a channel each: "primal.R". Raises NgptError where their number
+        is not that of the channels, for a name that is no layer's, and for a layer of which channels are missing.
+        """
+        array = np.asarray(tensor)
+        if array.ndim != 3 or array.shape[2] != len(names):
+            raise NgptError(
+                f"the tensor has shape {array.shape} and there are {len(names)} names; give the tensor of mi.render() "
+                "and the integrator's aov_names() after it"
+            )
+        place = {name: i for i, name in enumerate(names)}
+        layers = {}
+        for name in dict.fromkeys(name.partition(".")[0] for name in names):
+            _check_name(name, "AOVs")
+            channels = [f"{name}.{channel}" for channel in LAYERS[name].channels]
+            if lacking := [channel for channel in channels if channel not in place]:
+                raise NgptError(f"AOVs: layer '{name}' lacks {', '.join(lacking)}")
+            layers[name] = array[..., [place[channel] for channel in channels]]
+        return cls.from_arrays(attributes=attributes, **layers)
 
     @property
     def height(self) -> int:

@@ -46,6 +46,7 @@ data_gen.passes
 data_gen.uneven
 data_gen.samplers
 data_gen.adaptive
+data_gen.plugins
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames

@@ -20,6 +20,7 @@ from data_gen.samplers import SAMPLERS
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
+from ngpt.options import written
 
 
 def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
@@ -68,7 +69,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
-        return render_passes(self.prepare(scene), sensor, seed, spp)
+        entry = SAMPLERS[self.name]
+        return render_passes(self.prepare(scene), sensor, seed, spp, lane_bytes=entry.lane_bytes, batch=entry.batch)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""
@@ -79,7 +81,13 @@ class GradientIntegrator(mi.SamplingIntegrator):
         return mi.TensorXf(np.concatenate(list(layers.values()), axis=-1))
 
     def aov_names(self):
+        """Of the last render; `ngpt.GradientStack.from_aovs` makes a stack of its tensor by them."""
         return self.channels
+
+    def to_string(self):
+        limits = {} if self.nested else self.limits.parameters()
+        lines = "".join(f"  {name} = {written(value)},\n" for name, value in (limits | self.options).items())
+        return f"{type(self).__name__}[\n{lines}]"
 
     def first_hit(self, scene, ray, active=True) -> mi.PreliminaryIntersection3f:
         """Where a camera ray leads, through lamps that hide from the camera."""

@@ -1,0 +1,107 @@
+"""Our integrators as Mitsuba's: ``mi.load_dict({"type": "gpt"})`` after ``import data_gen``, whatever the variant.
+
+Mitsuba knows plugins by variant, and only once one is set. So with each variant that is set, constructors are
+registered that know no more than a name. The classes are made when the first of them is used: that takes a second.
+"""
+
+from __future__ import annotations
+
+import importlib.util
+import sys
+from importlib.abc import MetaPathFinder
+from typing import Any
+
+_made_for = ""
+
+
+def register_when_ready() -> None:
+    """Registers our integrators with each variant of Mitsuba that is set, in the past or future, once it is imported.
+
+    Nothing is imported for it.
+    """
+    if sys.modules.get("mitsuba"):
+        _follow_variants()
+    else:
+        sys.meta_path.insert(0, _UntilMitsubaComes())
+
+
+class _UntilMitsubaComes(MetaPathFinder):
+    """Finds nothing, but hears of the first import of Mitsuba, and has us follow its variants after it."""
+
+    def find_spec(self, name: str, path: Any = None, target: Any = None) -> Any:
+        if name != "mitsuba":
+            return None
+        sys.meta_path.remove(self)
+        spec = importlib.util.find_spec(name)
+        if spec is not None and spec.loader is not None:
+            execute = spec.loader.exec_module
+
+            def execute_and_follow(module: Any) -> None:
+                execute(module)
+                _follow_variants()
+
+            spec.loader.exec_module = execute_and_follow  # type: ignore[method-assign]
+        return spec
+
+
+def _follow_variants() -> None:
+    import mitsuba as mi
+
+    mi.detail.add_variant_callback(lambda old, new: _register())
+    if mi.variant() is not None:
+        _register()
+
+
+def _register() -> None:
+    """Has the current variant know the names of our integrators."""
+    import mitsuba as mi
+
+    from data_gen.samplers import SAMPLERS
+
+    for entry in SAMPLERS.values():
+        if entry.module:
+            mi.register_integrator(plugin_name(entry.name), lambda props, entry=entry: _construct(entry, props))
+
+
+def plugin_name(sampler: str) -> str:
+    """What Mitsuba calls a sampler's integrator."""
+    return sampler.replace("-", "_")
+
+
+def _construct(entry: Any, props: Any) -> Any:
+    """The integrator of a sampler, of the current variant. Raises NgptError where the sampler is none of Mitsuba's."""
+    from ngpt.errors import NgptError
+
+    make_classes()
+    from data_gen.samplers.common import GradientIntegrator
+
+    module = sys.modules[entry.module]
+    for value in vars(module).values():
+        if isinstance(value, type) and issubclass(value, GradientIntegrator) and value.__module__ == entry.module:
+            return value(props)
+    raise NgptError(
+        f"sampler '{entry.name}' is no integrator of Mitsuba; use data_gen.render_scene(scene, sampler='{entry.name}')"
+    )
+
+
+def make_classes() -> None:
+    """Imports the modules of all samplers for the current variant, to which Mitsuba's classes belong, and so those that
+    are derived from them. Raises NgptError for a variant that cannot vectorise."""
+    global _made_for
+    import mitsuba as mi
+
+    from data_gen.samplers import SAMPLERS
+    from ngpt.errors import NgptError
+
+    variant = mi.variant()
+    if variant.startswith("scalar"):
+        able = ", ".join(name for name in mi.variants() if not name.startswith("scalar"))
+        raise NgptError(f"variant '{variant}' is not one that our integrators can vectorise; choose one of: {able}")
+    if variant == _made_for:
+        return
+    for module in ("data_gen.samplers.common", *(entry.module for entry in SAMPLERS.values() if entry.module)):
+        if module in sys.modules:
+            importlib.reload(sys.modules[module])
+        else:
+            importlib.import_module(module)
+    _made_for = variant

@@ -1,0 +1,96 @@
+"""Our integrators as plugins of Mitsuba, from Mitsuba's side: load_dict, print, render, and a stack of the tensor."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.errors import NgptError
+
+USE = (
+    "import numpy as np, ngpt\n"
+    "scene = mi.load_dict(mi.cornell_box() | {'integrator': {'type': 'gpt', 'max_depth': 4, 'shift': 'half-vector'}})\n"
+    "text = str(scene); assert 'GPT[' in text and 'max_depth = 4' in text and 'shift = half-vector' in text, text\n"
+    "mi.traverse(scene.sensors()[0])['film.size'] = [16, 12]\n"
+    "tensor = mi.render(scene, spp=2)\n"
+    "stack = ngpt.GradientStack.from_aovs(tensor, scene.integrator().aov_names())\n"
+    "assert {'primal', 'direct', 'dx', 'dy', 'albedo', 'primal_var', 'dx_var'} <= set(stack.names)\n"
+)
+ORDERS = {
+    "ours first": "import data_gen, sys; assert 'mitsuba' not in sys.modules\n"
+    "import mitsuba as mi; assert mi.variant() is None; mi.set_variant('llvm_ad_rgb')\n",
+    "Mitsuba first": "import mitsuba as mi; import data_gen; mi.set_variant('llvm_ad_rgb')\n",
+    "variant first": "import mitsuba as mi; mi.set_variant('llvm_ad_rgb'); import data_gen\n",
+    "variants there and back": "import data_gen, mitsuba as mi\n"
+    "for name in ('llvm_ad_rgb', 'llvm_ad_spectral', 'scalar_rgb', 'llvm_ad_rgb'):\n"
+    "    mi.set_variant(name)\n"
+    "    if not name.startswith('scalar'): print(mi.load_dict({'type': 'gpt'}))\n",
+    "by our own way": "import data_gen; data_gen.use_variant()\nimport mitsuba as mi\n",
+}
+
+
+def run(code):
+    return subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("order", ORDERS)
+def test_they_are_there_whatever_comes_first(renderer, order):
+    told = run(ORDERS[order] + USE)
+    assert told.returncode == 0, told.stderr[-3000:]
+
+
+def test_a_variant_that_cannot_vectorise_is_named(renderer):
+    told = run("import data_gen, mitsuba as mi; mi.set_variant('scalar_rgb'); mi.load_dict({'type': 'gpt'})")
+    assert "variant 'scalar_rgb' is not one that our integrators can vectorise" in told.stderr
+
+
+def test_without_mitsuba_the_package_is_imported():
+    told = run(
+        "import sys; sys.modules['mitsuba'] = None\nimport data_gen\n"
+        "try: data_gen.render_scene('diffuse')\nexcept data_gen.session.NgptError as error: print(error)\n"
+    )
+    assert "pip install 'ngpt-recon[render]'" in told.stdout, told.stderr
+
+
+def test_each_renders_what_its_sampler_does(renderer):
+    from data_gen.plugins import plugin_name
+    from data_gen.render import render_stack
+    from data_gen.samplers import SAMPLERS, find
+    from data_gen.scenes.facts import scene_facts
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene("diffuse", (8, 8))
+    none = []
+    for name, entry in SAMPLERS.items():
+        if not entry.module:
+            continue
+        own = {"integrator": scene.integrator()} if name == "gpt-basic" else {"max_depth": 8}
+        try:
+            integrator = renderer.load_dict({"type": plugin_name(name), **own})
+        except RuntimeError as error:
+            assert "is no integrator of Mitsuba; use data_gen.render_scene" in str(error)
+            none.append(name)
+            continue
+        assert str(integrator).startswith(f"{type(integrator).__name__}[")
+        if find(name).refuses(scene_facts(scene)):
+            continue
+        spp = max(2, 2 * entry.batch)
+        stack = ngpt.GradientStack.from_aovs(integrator.render(scene, spp=spp), integrator.aov_names())
+        expected = render_stack(scene, spp, 0, name)
+        assert all(np.array_equal(stack[layer], expected[layer], equal_nan=True) for layer in stack.names), name
+    assert set(none) == {"primal", "gmlt", "split"}
+
+
+def test_a_tensor_that_is_no_stack_is_told_why():
+    names = ["primal.R", "primal.G", "primal.B", "depth.Z"]
+    stack = ngpt.GradientStack.from_aovs(np.arange(24.0).reshape(2, 3, 4), names, {"ngpt:spp": 4})
+    assert stack["depth"][0, 1, 0] == 7 and stack["primal"][1, 0, 2] == 14 and stack.attributes["ngpt:spp"] == 4
+    for shape, given, message in (
+        ((2, 3, 4), names[:3], r"shape \(2, 3, 4\) and there are 3 names"),
+        ((2, 3, 3), names[1:], "layer 'primal' lacks primal.R"),
+        ((2, 3, 4), [*names[:3], "Q.X"], "no layer is called 'Q'"),
+    ):
+        with pytest.raises(NgptError, match=message):
+            ngpt.GradientStack.from_aovs(np.zeros(shape), given)
