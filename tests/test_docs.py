@@ -206,6 +206,8 @@ def test_the_example_of_rendering_runs(renderer, tmp_path, monkeypatch):
     made: dict = {}
     exec(blocks[4], made)
     assert made["image"].shape == (48, 64, 3) and len(list(tmp_path.iterdir())) == 4
+    exec(blocks[5], made)
+    assert {"primal", "dx", "primal_var"} <= set(made["stack"].names)
 
 
 def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
