@@ -27,6 +27,7 @@ class Passes:
     integrator: Any
     world: World
     width: float  # of a pixel
+    walk: Any = None  # how camera paths go with those of the neighbours: ``photons.gradients.camera.CameraPaths``
     frozen: Frozen = field(init=False)
 
     def __post_init__(self) -> None:
@@ -43,15 +44,32 @@ class Passes:
         return self.integrator.instead(lane_bytes)
 
 
-def begin(passes: Passes, camera: CameraSamples) -> tuple:
-    """Rays and importance of camera samples, random numbers of their paths, two keys, and the layers of features."""
-    ray, importance, _ = camera.rays()
-    random = camera.random.clone()
-    keys = random.next_key(), random.next_key()
-    random.schedule_state()
-    dr.eval(ray, importance, keys)
-    values = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
-    return ray, importance, random, keys, values
+@dataclass
+class Start:
+    """Where camera paths start."""
+
+    ray: mi.RayDifferential3f
+    importance: mi.Spectrum
+    random: Any  # the stream of their random numbers
+
+
+@dataclass
+class Begun:
+    """What a pass begins with."""
+
+    start: Start
+    keys: tuple[mi.UInt32, mi.UInt32]  # any bits, of which the random numbers of light paths are made
+    features: dict  # layers of the film
+
+    @classmethod
+    def of(cls, passes: Passes, camera: CameraSamples) -> Begun:
+        ray, importance, _ = camera.rays()
+        random = camera.random.clone()
+        keys = random.next_key(), random.next_key()
+        random.schedule_state()
+        dr.eval(ray, importance, keys)
+        layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
+        return cls(Start(ray, importance, random), keys, layers)
 
 
 def refuse_variants(sampler: str) -> None:

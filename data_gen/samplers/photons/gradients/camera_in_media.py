@@ -1,22 +1,30 @@
 """Camera paths of a pixel and its neighbours through media, side by side from piece to piece: for ``gbre``.
 
 As ``camera``, but a level is a piece of a ray through one medium, up to a vertex or to a boundary that bends nothing.
-Where the base path goes through a boundary, those of the neighbours must do so, too, or end.
+Where the base path goes through a boundary, those of the neighbours must do so, too, or end. ``depth`` numbers
+segments, of which each piece is a level.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import media
-from data_gen.paths.vertex import Materials
-from data_gen.samplers.photons.gradients.camera import Level, Path, scattered
-from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.gradients.camera import (
+    CameraPaths,
+    Level,
+    Path,
+    at_lanes,
+    emission_of,
+    scattered,
+    survive,
+    taken,
+)
+from data_gen.samplers.photons.passes import Start
 
 
 @dataclass
@@ -32,120 +40,85 @@ class Piece(Path):
     def end(self, alive: mi.Bool) -> Path:
         """The path where the piece ends."""
         β = self.β * dr.exp(-media.depth(self.σ, self.length()))
-        return Path(self.ray, self.hit, β, alive, self.sky_seen)
+        return Path(self.ray, self.hit, β, alive, self.sky)
 
 
-def levels_in_media(
-    scene: mi.Scene,
-    fog: Fog,
-    materials: Materials,
-    random: mi.Sampler,
-    rays: list,
-    first_surface: Callable,
-    hide_emitters: bool,
-    max_depth: int,
-    rr_depth: int,
-    frozen: Callable,
-) -> Iterator[Level]:
-    """As ``camera.levels()``; ``first_surface`` (scene, ray, medium, active) is what camera rays themselves meet.
+class PathsByPieces(CameraPaths):
+    """Those of ``gbre``, ``gbeams`` and ``gplanes``."""
 
-    ``depth`` numbers segments, of which each piece is a level.
-    """
-    n = dr.width(rays[0][0].o)
-    lanes, numbers, first = dr.arange(mi.UInt32, n), random.random, True
-    η, depth = dr.opaque(mi.Float, 1, n), dr.opaque(mi.UInt32, 1, n)
-    limits = dr.opaque(mi.UInt32, max_depth), dr.opaque(mi.UInt32, rr_depth)
-    pieces = frozen(begun, scene, fog, rays, first_surface, hide_emitters, fixed=True)
-    dr.eval(lanes)
-    while True:
-        dr.eval(pieces)
-        yield Level(first, lanes, depth, pieces[0], pieces[1:])
-        pieces, depth, η, numbers = frozen(onward, fog, materials, pieces, depth, η, type(random)(numbers), limits)
-        dr.eval(pieces, depth, η, numbers)
-        go_on = dr.compress(pieces[0].alive)
-        if not dr.width(go_on):
-            return
-        surfaces = first_surface if hide_emitters else None
-        pieces, lanes, depth, η, numbers = frozen(further, scene, pieces, lanes, depth, η, numbers, go_on, surfaces)
-        dr.eval(lanes, depth, η, numbers)
-        first = False
+    def is_last(self, number: int) -> bool:
+        return False
 
+    def begun(self, start: Level, random, rays: list) -> Level:
+        pieces, fog = [], self.world.fog
+        for path in (self.first(*ray) for ray in rays):
+            medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, dr.width(path.ray)))
+            path.hit = self.integrator.first_surface(self.world.scene, path.ray, medium, mi.Bool(True))
+            pieces.append(Piece(**vars(path), medium=medium, σ=media.extinction(medium, path.ray)))
+        return replace(start, paths=pieces)
 
-def begun(scene, fog: Fog, rays: list, first_surface: Callable, hide_emitters: bool) -> list[Piece]:
-    """The first pieces of these rays: (ray, importance, whether it is on the film) of each."""
-    pieces = []
-    for ray, importance, inside in rays:
-        ray, n = mi.Ray3f(ray.o, ray.d, ray.time, ray.wavelengths), dr.width(ray)
-        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
-        sky_seen = dr.full(mi.Bool, not hide_emitters, n)
-        β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
-        alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, n))
-        medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, n))
-        hit = first_surface(scene, ray, medium, mi.Bool(True))
-        pieces.append(Piece(ray, hit, β, alive, sky_seen, medium, media.extinction(medium, ray)))
-    return pieces
+    def onward(self, level: Level, random) -> Level:
+        """The paths behind the next boundary or event; what they meet there and σ are unknown yet."""
+        random, materials = random.clone(), self.world.materials
+        u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+        η, depth, passes, after = level.η, level.depth, self.goes_through(level.paths[0]), []
+        for k, piece in enumerate(level.paths):
+            # Straight on together with the base path, or by an event at a surface, or the path ends.
+            straight = passes & self.goes_through(piece)
+            scatters = piece.alive & ~passes & ~self.goes_through(piece) & (depth < self.limits.max_depth)
+            at_surface = piece.end(scatters)
+            path, eta = scattered(at_surface, materials, u_lobe, u_direction)
+            si = at_surface.hit.compute_surface_interaction(piece.ray, active=straight | path.alive)
+            d = dr.select(straight, piece.ray.d, path.ray.d)
+            changes = si.is_valid() & si.is_medium_transition()
+            medium = dr.select(changes, si.target_medium(d), piece.medium)
+            β = dr.select(straight, at_surface.β, path.β)
+            alive = (straight | path.alive) & (dr.max(β) > 0)
+            after.append(Piece(si.spawn_ray(d), piece.hit, β, alive, path.sky, medium, piece.σ))
+            if k == 0:
+                η = dr.select(path.alive, η * eta, η)
+        survive(after, u_survival, ~passes & (depth >= self.limits.rr_depth), η)
+        depth = dr.select(passes, depth, depth + 1)
+        return replace(level, paths=after, depth=depth, η=η, numbers=random.random)
 
+    def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
+        scene, depth, pieces = self.world.scene, taken(level.depth, lanes), []
+        for piece in (at_lanes(piece, lanes) for piece in level.paths):
+            ray, alive, medium = piece.ray, piece.alive, taken(piece.medium, lanes)
+            if not self.limits.hide_emitters:
+                hit = scene.ray_intersect_preliminary(ray, active=alive)
+            else:
+                seen = self.integrator.first_surface(scene, ray, medium, alive & (depth == 1))
+                hit = dr.select(depth == 1, seen, scene.ray_intersect_preliminary(ray, active=alive & (depth > 1)))
+            pieces.append(replace(piece, hit=hit, medium=medium, σ=media.extinction(medium, ray)))
+        return self.of_lanes(level, pieces, random.at(lanes), lanes)
 
-def through(fog: Fog, piece: Piece) -> mi.Bool:
-    """Whether the path goes straight on at the end of the piece."""
-    return piece.alive & piece.hit.is_valid() & fog.media.passes(piece.hit.shape)
+    def direct(self, level: Level, start: Start, frozen: Callable) -> mi.Spectrum:
+        return frozen(self.seen_directly, level.paths[0], fixed=True)
 
+    def seen_directly(self, base: Piece) -> mi.Spectrum:
+        """Lamps as seen through media."""
+        fog, none = self.world.fog, mi.UInt32(0)
+        lamps = self.integrator.lamps_in_fog(self.world.scene, fog.media, mi.Ray3f(base.ray), fog.within, none)
+        return base.β * lamps
 
-def ends(fog: Fog, base: Piece, offsets: list[Piece]) -> list[Path]:
-    """All paths where they end at a surface, or nowhere; those that go on behind a boundary are not alive."""
-    return [piece.end(piece.alive & ~through(fog, base) & ~through(fog, piece)) for piece in (base, *offsets)]
+    def emitted(self, level: Level) -> list:
+        """``CameraPaths.emitted()`` of those that have met a vertex."""
+        paths = self.ends(level.paths)
+        for path in paths:
+            path.alive &= level.depth > 1
+        return emission_of(self.world.scene, paths)
 
+    def at_surfaces(self, level: Level, frozen: Callable) -> list[Path]:
+        paths = frozen(self.ends, level.paths)
+        dr.eval(paths)
+        return paths
 
-def onward(fog: Fog, materials: Materials, pieces: list[Piece], depth, η, random, limits: tuple) -> tuple:
-    """The paths behind the next boundary or event; what they meet there and σ are unknown yet."""
-    random, (max_depth, rr_depth) = random.clone(), limits
-    u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-    passes, after = through(fog, pieces[0]), []
-    for k, piece in enumerate(pieces):
-        straight = passes & through(fog, piece)
-        at_surface = piece.end(piece.alive & ~passes & ~through(fog, piece) & (depth < max_depth))
-        path, eta = scattered(at_surface, materials, u_lobe, u_direction)
-        si = at_surface.hit.compute_surface_interaction(piece.ray, active=straight | path.alive)
-        d = dr.select(straight, piece.ray.d, path.ray.d)
-        changes = si.is_valid() & si.is_medium_transition()
-        medium = dr.select(changes, si.target_medium(d), piece.medium)
-        β = dr.select(straight, at_surface.β, path.β)
-        alive = (straight | path.alive) & (dr.max(β) > 0)
-        after.append(Piece(si.spawn_ray(d), piece.hit, β, alive, path.sky_seen, medium, piece.σ))
-        if k == 0:
-            η = dr.select(path.alive, η * eta, η)
-    # All five survive together. As in ``path``: η² undoes what refraction does to radiance.
-    brightest = mi.Float(0)
-    for piece in after:
-        brightest = dr.fmax(brightest, dr.select(piece.alive, dr.max(piece.β), 0))
-    endless = passes | (depth < rr_depth)
-    survival = dr.select(endless, 1, dr.fmin(brightest * dr.square(η), 0.95))
-    after[0].alive &= u_survival < survival
-    for piece in after:
-        piece.β /= survival
-    return after, dr.select(passes, depth, depth + 1), η, random.random
+    def ends(self, pieces: list[Piece]) -> list[Path]:
+        """All paths where they end at a surface, or nowhere; those that go on behind a boundary are not alive."""
+        passes = self.goes_through(pieces[0])
+        return [piece.end(piece.alive & ~passes & ~self.goes_through(piece)) for piece in pieces]
 
-
-def further(scene, pieces: list[Piece], lanes, depth, η, numbers, go_on: mi.UInt32, first_surface) -> tuple:
-    """What belongs to the lanes ``go_on`` alone, up to what their rays hit; ``first_surface`` unless all is seen."""
-
-    def taken(value: Any):
-        return dr.gather(type(value), value, go_on)
-
-    depth, found = taken(depth), []
-    for piece in pieces:
-        old = piece.ray
-        time = taken(old.time) if dr.width(old.time) > 1 else old.time
-        wavelengths = taken(old.wavelengths) if dr.width(old.wavelengths) > 1 else old.wavelengths
-        ray = mi.Ray3f(taken(old.o), taken(old.d), time, wavelengths)
-        alive, medium = taken(piece.alive), taken(piece.medium)
-        if first_surface is None:
-            hit = scene.ray_intersect_preliminary(ray, active=alive)
-        else:
-            seen = first_surface(scene, ray, medium, alive & (depth == 1))
-            hit = dr.select(depth == 1, seen, scene.ray_intersect_preliminary(ray, active=alive & (depth > 1)))
-        known = taken(piece.β), alive, taken(piece.sky_seen)
-        found.append(Piece(ray, hit, *known, medium, media.extinction(medium, ray)))
-    random = mi.PCG32()
-    random.state, random.inc = taken(numbers.state), taken(numbers.inc)
-    return found, taken(lanes), depth, taken(η), random
+    def goes_through(self, piece: Piece) -> mi.Bool:
+        """Whether the path goes straight on at the end of the piece."""
+        return piece.alive & piece.hit.is_valid() & self.world.fog.media.passes(piece.hit.shape)

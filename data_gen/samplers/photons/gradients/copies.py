@@ -16,17 +16,31 @@ and T'_c / T_c in r. Boundaries that bend nothing may lie between a and b, or b'
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import collisions, media, segments
 from data_gen.paths.collisions import Collisions
-from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.light_ends import LightRay
+from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
 from data_gen.samplers.photons.gradients import shift
 from data_gen.samplers.photons.map.photon import Photon, is_near
-from data_gen.samplers.photons.map.trace import vertex_in_media_of, vertex_of
+from data_gen.samplers.photons.map.vertices import vertex_in_media_of, vertex_of
+
+
+@dataclass
+class LightPaths:
+    """What is known of where photons come from."""
+
+    starts: LightRay  # the light's ends of all light paths
+    photons: Any  # the map
+
+    def shifts(self, place: mi.UInt32) -> mi.Bool:
+        """Whether photons, or edges, of the map may have copies: not those from a mirror, or through glass."""
+        return dr.isfinite(dr.gather(mi.Float, self.photons.density, place))
 
 
 @dataclass
@@ -34,11 +48,16 @@ class Way:
     """How light comes from a to the point ``target``, or in its direction."""
 
     ray: mi.Ray3f
-    Φ: mi.Spectrum  # without J
+    Φ: mi.Spectrum  # without J; 0 where no light can come
     ratio: mi.Float  # p' / p
     length2: mi.Float  # squared, from a to the target; 1 from infinity
     base_length2: mi.Float  # from a to b̂
     through: Through | None = None  # what of media is known; None without media
+
+    def leads(self, target: mi.Point3f, r: mi.Float) -> mi.Bool:
+        """Whether light comes to the ``target``, in front of a, with the ratio ``r``; if nothing is in the way."""
+        ahead = dr.dot(target - self.ray.o, self.ray.d) > 0
+        return ahead & (dr.max(self.Φ) > 0) & (r > 0) & dr.isfinite(r)
 
 
 @dataclass
@@ -51,79 +70,94 @@ class Through:
     nulls: Collisions | None  # of the photon's way; None without grids
 
 
-def copy(
-    scene, lights: LightEnds, connectable, starts: LightRay, photons, j, photon: Photon, x, y, radius2, active, fog=None
-):
-    """(copy, r, whether it exists) of the ``photon`` of place ``j`` that is gathered at ``x`` and not at ``y``, for y.
+@dataclass
+class Passage:
+    """What comes of light on a way through media."""
 
-    ``starts`` are the light's ends of all light paths, ``connectable`` (material) says where photons are gathered.
-    """
+    T: mi.Spectrum  # T' / T_c
+    T_c: mi.Float  # T'_c / T_c
+    met: mi.PreliminaryIntersection3f  # the surface
+    ray: mi.Ray3f  # the last piece
+    medium: mi.MediumPtr  # there
+
+
+def copy(
+    world: World, paths: LightPaths, photon: Photon, ends: tuple, radius2: mi.Float, active: mi.Bool
+) -> tuple[Photon, mi.Float, mi.Bool]:
+    """(copy, r, whether it exists) of the ``photon`` that is gathered at x and not at y, the two ``ends``, for y."""
+    x, y = ends
     foot = shift.on_plane(photon.p, photon.d, x.p, x.n)
     target = shift.moved(foot, x.p, x.n, y.p, y.n)
-    way = redirected(scene, lights, starts, photons, j, photon, foot, target, active, fog)
+    way = redirected(world, paths, photon, foot, target, active)
     J = shift.jacobian(photon.d, x.n, way.base_length2, way.ray.d, y.n, way.length2)
     r = way.ratio * J
-    # In front of a
-    good = active & (dr.dot(target - way.ray.o, way.ray.d) > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
-    if fog is None:
-        hit, Φ = scene.ray_intersect(way.ray, good), way.Φ * J
+    good = active & way.leads(target, r)
+    if world.fog is None:
+        hit, Φ = world.scene.ray_intersect(way.ray, good), way.Φ * J
     else:
-        T, T_c, met, ray, _ = let_through(scene, fog, way, mi.Float(dr.inf), good, to_surface=True)
-        hit, Φ, r = met.compute_surface_interaction(ray, active=good), way.Φ * (J * T), r * T_c
+        passage = let_through(world, way, mi.Float(dr.inf), good, to_surface=True)
+        hit = passage.met.compute_surface_interaction(passage.ray, active=good)
+        Φ, r = way.Φ * (J * passage.T), r * passage.T_c
     moved = Photon(hit.p, hit.n, way.ray.d, Φ)
-    good &= hit.is_valid() & connectable(hit.bsdf())
+    good &= hit.is_valid() & world.materials.connectable(hit.bsdf())
     # At x it would be gathered as it is, not as a copy: the shift back would be another.
     return moved, r, good & is_near(moved, y, radius2) & ~is_near(moved, x, radius2)
 
 
-def copy_in_medium(scene, fog, lights: LightEnds, starts: LightRay, photons, j, photon: Photon, target, active):
-    """(copy, r, whether it exists) of the ``photon`` of place ``j``, in a medium, at the ``target``."""
-    way = redirected(scene, lights, starts, photons, j, photon, photon.p, target, active, fog)
+def copy_in_medium(
+    world: World, paths: LightPaths, photon: Photon, target: mi.Point3f, active: mi.Bool
+) -> tuple[Photon, mi.Float, mi.Bool]:
+    """(copy, r, whether it exists) of the ``photon``, in a medium, at the ``target``."""
+    way = redirected(world, paths, photon, photon.p, target, active)
     J = shift.jacobian_in_medium(way.base_length2, way.length2)
     r = way.ratio * J
-    good = active & (dr.dot(target - way.ray.o, way.ray.d) > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
-    reach = dr.norm(target - way.ray.o)
-    T, T_c, met, _, medium = let_through(scene, fog, way, reach, good)
-    good &= ~met.is_valid() & (medium == photon.medium)
-    here = dr.zeros(mi.MediumInteraction3f, dr.width(reach))
-    here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, medium
-    σs, _, σ = medium.get_scattering_coefficients(here, good)
-    σ_c = media.pick(σ, way.through.channel)
-    if not fog.media.grids:
-        return Photon(target, photon.n, way.ray.d, way.Φ * (J * T * dr.select(good, σs / σ_c, 0))), r * T_c, good
+    good = active & way.leads(target, r)
+    passage = let_through(world, way, dr.norm(target - way.ray.o), good)
+    good &= ~passage.met.is_valid() & (passage.medium == photon.medium)
+
+    # -------------- What is scattered there, over the density of the place --------------
+    here = dr.zeros(mi.MediumInteraction3f, dr.width(target))
+    here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, passage.medium
+    σs, _, σ = passage.medium.get_scattering_coefficients(here, good)
+    σ_c, r = media.pick(σ, way.through.channel), r * passage.T_c
+    if not world.fog.media.grids:
+        Φ = way.Φ * (J * passage.T * dr.select(good, σs / σ_c, 0))
+        return Photon(target, photon.n, way.ray.d, Φ), r, good
     # As ``Fog.power()``, with the density of the photon's own place
     here.p = photon.p
     _, _, σ = photon.medium.get_scattering_coefficients(here, good)
     base_σ_c = media.pick(σ, way.through.channel)
     good &= σ_c > 0
-    Φ = dr.select(good & (σs > 0), way.Φ * (J * T) / base_σ_c, 0)
-    return Photon(target, photon.n, way.ray.d, mi.Spectrum(Φ)), r * T_c * (σ_c / base_σ_c), good
+    Φ = dr.select(good & (σs > 0), way.Φ * (J * passage.T) / base_σ_c, 0)
+    return Photon(target, photon.n, way.ray.d, mi.Spectrum(Φ)), r * (σ_c / base_σ_c), good
 
 
-def let_through(scene, fog, way: Way, reach: mi.Float, active, to_surface: bool = False) -> tuple:
-    """T' / T_c and T'_c / T_c of the way, over a distance or up to a surface; the surface, last piece, and medium."""
-    ray, through = media.shortened(way.ray, reach), way.through
-    trace = segments.next_surface(scene)
+def let_through(world: World, way: Way, reach: mi.Float, active, to_surface: bool = False) -> Passage:
+    """What comes through on the way, over the distance ``reach`` or up to a surface."""
+    fog, ray, through = world.fog, media.shortened(way.ray, reach), way.through
+    trace = segments.next_surface(world.scene)
     if through.nulls is not None:
         known = through.channel, through.nulls, active, to_surface
         τ, met, ray, medium, N, N_c = collisions.rescale(fog.media.passes, trace, ray, through.medium, reach, *known)
-        T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
-        return T, T_c, met, ray, medium
-    τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
-    return dr.exp(through.τ_c - τ), dr.exp(through.τ_c - media.pick(τ, through.channel)), met, ray, medium
+    else:
+        τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
+        N, N_c = 1, 1
+    T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
+    return Passage(T, T_c, met, ray, medium)
 
 
-def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, foot, target, active, fog=None) -> Way:
-    """From the photon's predecessor to ``target`` instead of ``foot``. Φ is 0 where that is not possible.
+def redirected(world: World, paths: LightPaths, photon: Photon, foot, target, active) -> Way:
+    """From the photon's predecessor a to ``target`` instead of ``foot``, which is b̂.
 
-    In media it is without their T: see ``let_through``.
+    In media Φ is without T: see ``let_through``.
     """
-    parent = dr.gather(mi.UInt32, photons.parent, j, active)
-    density = dr.gather(mi.Float, photons.density, j, active)
-    first = density == 0
+    scene, lights, photons, j = world.scene, world.lights, paths.photons, photon.place
+    parent = dr.gather(mi.UInt32, photons.parent, j, active)  # a, or the number of the light path
+    density = dr.gather(mi.Float, photons.density, j, active)  # p
+    first = density == 0  # a is on a lamp
 
     # ------------------------ From a lamp ------------------------
-    start = start_of(starts, parent, active & first)
+    start = start_of(paths.starts, parent, active & first)
     beyond = lights.far(start.index)
     # The origin of light from infinity moves, on a plane that the light is normal to.
     aside = target + start.ray.d * dr.dot(start.ray.o - target, start.ray.d)
@@ -135,7 +169,7 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
     beyond &= first
 
     # ------------------------ From a vertex ----------------------
-    if fog is None:
+    if world.fog is None:
         a, scatters = vertex_of(photons, parent, active & ~first), mi.Bool(False)
     else:
         a, place = vertex_in_media_of(photons, parent, active & ~first)
@@ -144,22 +178,24 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
     to = mi.Vector3f(target - origin)
     length2 = dr.squared_norm(to)
     d = to * dr.rsqrt(length2)
+    # f and p' of the new direction, at a surface or in a medium
     f, p, _ = evaluate(IMPORTANCE, a, a.bsdf(), a.to_local(d), active & ~first & ~scatters)
-    if fog is not None:
+    if world.fog is not None:
         phase = place.medium.phase_function()
         of_phase = phase.eval_pdf(mi.PhaseFunctionContext(), media.in_medium(a, place), d, scatters)
         f, p = (dr.select(scatters, new, old) for new, old in zip(of_phase, (f, p), strict=True))
     survival = dr.gather(mi.Float, photons.survival, j, active)
     Φ = dr.gather(mi.Spectrum, photons.β, parent, active) * f / (density * survival)
 
-    # Along the photon's line, b̂ may lie behind a.
-    if fog is None:
+    # ---------- How far b̂ is from a; along the photon's line it may lie behind ----------
+    if world.fog is None:
         through, base_length = None, dr.gather(mi.Float, photons.t, j, active) + dr.dot(foot - photon.p, photon.d)
     else:
         # The record knows the last piece alone.
         origin_of_photon = dr.select(first, start.ray.o, origin)
         base_length = dr.dot(foot - origin_of_photon, photon.d)
-        through = known_of_media(scene, fog, photons, j, photon, origin_of_photon)
+        through = known_of_media(world, photons, photon, origin_of_photon)
+    # Not by a mirror, or through glass
     known = dr.isfinite(density) & (base_length > 0)
     Φ = dr.select(first, moved.β, Φ)
     origin = dr.select(first, dr.select(beyond, aside, moved.ray.o), origin)
@@ -173,24 +209,25 @@ def redirected(scene, lights: LightEnds, starts: LightRay, photons, j, photon, f
     )
 
 
-def known_of_media(scene, fog, photons, j, photon: Photon, origin) -> Through:
-    """Media between the ``photon``, of place ``j``, and the ``origin`` of its last edge."""
-    b = dr.zeros(mi.SurfaceInteraction3f, dr.width(photon.p))
+def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
+    """Media between the ``photon`` and the ``origin`` of its last edge."""
+    b, fog, trace = dr.zeros(mi.SurfaceInteraction3f, dr.width(photon.p)), world.fog, segments.next_surface(world.scene)
     b.p, b.n = photon.p, photon.n
-    back, medium = b.spawn_ray(-photon.d), photon.medium
+    back, medium, nulls = b.spawn_ray(-photon.d), photon.medium, None
     reach = dr.dot(back.o - origin, photon.d)
     if fog.media.grids:
-        trace, back, none = segments.next_surface(scene), media.shortened(back, reach), mi.UInt32(0)
+        # Of the way back the majorant's optical depth M alone: with no collision to place
+        back, none = media.shortened(back, reach), mi.UInt32(0)
         steps = none, mi.Float(1), none, mi.Bool(True)
         τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, photon.channel, *steps)
-        key, n, N_c = (dr.gather(type(v), v, j) for v in (photons.key, photons.nulls, photons.N_c))
-        return Through(medium, media.pick(τ, photon.channel), photon.channel, Collisions(key, n, M, N_c))
-    if not fog.media.boundaries:
+        key, n, N_c = (dr.gather(type(v), v, photon.place) for v in (photons.key, photons.nulls, photons.N_c))
+        nulls = Collisions(key, n, M, N_c)
+    elif not fog.media.boundaries:
         τ = media.depth(media.extinction(medium, back), reach)
     else:
-        trace, back = segments.next_surface(scene), media.shortened(back, reach)
+        back = media.shortened(back, reach)
         τ, _, _, medium = segments.cross(fog.media.passes, trace, back, medium, reach, True)
-    return Through(medium, media.pick(τ, photon.channel), photon.channel, None)
+    return Through(medium, media.pick(τ, photon.channel), photon.channel, nulls)
 
 
 def start_of(starts: LightRay, path: mi.UInt32, active) -> LightRay:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import drjit as dr
 import mitsuba as mi
@@ -35,6 +36,15 @@ class Pairs:
 
         state = (mi.UInt32(self.first), zeros)
         return dr.while_loop(state, lambda i, sums: i < self.end, add, label="sums of pairs")[1]
+
+
+class Receivers(Protocol):
+    """What may have things near to it, one in each lane."""
+
+    def each(self, grid: Grid | None, radius2: mi.Float | None, active: mi.Bool, visit, state: tuple) -> tuple:
+        """``state`` after visits to all that may be near: see ``Grid.each``."""
+
+    def __len__(self) -> int: ...
 
 
 @dataclass
@@ -64,38 +74,38 @@ class Rays:
         return dr.width(self.length)
 
 
-def pieces(
-    grid: Grid, points: Points | Rays, radius2: mi.Float, active: mi.Bool, most: int, frozen: Callable = call
-) -> Iterator[Pairs]:
-    """All pairs of ``active`` points and what the ``grid`` has nearer to them, at most so many at a time."""
-    count = frozen(counts, grid, points, radius2, active)
+def pieces(near, points: Receivers, active: mi.Bool, most: int, frozen: Callable = call) -> Iterator[Pairs]:
+    """All pairs of ``active`` points and what is ``near`` to them (its grid, its radius), at most so many at a time."""
+    around = near.grid, near.radius2
+    count = frozen(counts, around, points, active)
     first = dr.prefix_sum(count)
     dr.eval(count, first, active)
     total = int(dr.sum(count)[0])
     for low in range(0, total, most):
         size = min(most, total - low)
-        part = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+        window = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
         pairs = dr.empty(mi.UInt32, size), dr.empty(mi.UInt32, size)
         dr.make_opaque(pairs)
-        pairs = frozen(piece, grid, points, radius2, active, first, count, part, pairs)
+        pairs = frozen(piece, around, points, active, (first, count), window, pairs)
         dr.eval(pairs)
         yield pairs
 
 
-def counts(grid: Grid, points: Points | Rays, radius2, active) -> mi.UInt32:
-    """How many pairs each point has."""
+def counts(around: tuple, points: Receivers, active) -> mi.UInt32:
+    """How many pairs each point has; ``around``: (grid, squared radius)."""
 
     def one_more(state, i, near):
         return (state[0] + dr.select(near, mi.UInt32(1), 0),)
 
-    return points.each(grid, radius2, active, one_more, (dr.zeros(mi.UInt32, len(points)),))[0]
+    return points.each(*around, active, one_more, (dr.zeros(mi.UInt32, len(points)),))[0]
 
 
-def piece(
-    grid: Grid, points: Points | Rays, radius2, active, first: mi.UInt32, count: mi.UInt32, part: tuple, pairs: tuple
-) -> Pairs:
-    """The ``part`` (low, size) of the list, in arrays of that size; those of a point begin at ``first``."""
-    (begin, length), (point, place) = part, pairs
+def piece(around: tuple, points: Receivers, active, places: tuple, window: tuple, pairs: tuple) -> Pairs:
+    """The part of the list in the ``window`` (low, size), written into ``pairs``, two arrays of that size.
+
+    ``places``: where in the list each point's pairs begin, and how many they are.
+    """
+    (first, count), (begin, length), (point, place) = places, window, pairs
     inside = active & (first < begin + length) & (first + count > begin)
     lane = dr.arange(mi.UInt32, len(points))
 
@@ -107,7 +117,7 @@ def piece(
         dr.scatter(place, i, at, known)
         return (dr.select(near, state[0] + 1, state[0]),)
 
-    points.each(grid, radius2, inside, write, (mi.UInt32(first),))
+    points.each(*around, inside, write, (mi.UInt32(first),))
     last = dr.minimum(first + count, begin + length)
     start = dr.maximum(first, begin)
     return Pairs(point, place, *(dr.select(inside, x - begin, 0) for x in (start, last)))

@@ -15,17 +15,16 @@ NORMAL_COSINE = 0.7
 
 @dataclass
 class Photon:
-    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings.
-
-    ``medium`` is that around it, ``channel`` the colour of its light path; None in scenes without media.
-    """
+    """A photon, or a copy of one: where it is, from where it came along ``d``, and the power Φ it brings."""
 
     p: mi.Point3f
     n: mi.Normal3f
     d: mi.Vector3f
     Φ: mi.Spectrum
-    medium: mi.MediumPtr | None = None
-    channel: mi.UInt32 | None = None
+    place: mi.UInt32 | None = None  # in the map; None of a copy, here and below
+    depth: mi.UInt32 | None = None  # edges from the light
+    medium: mi.MediumPtr | None = None  # around it; None in scenes without media, too
+    channel: mi.UInt32 | None = None  # the colour of its light path
 
 
 def is_near(photon: Photon, x: mi.SurfaceInteraction3f, radius2: mi.Float) -> mi.Bool:
@@ -48,9 +47,10 @@ def light(photon: Photon, x: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, active) 
 
 def photon_of(photons, j: mi.UInt32, active=True) -> Photon:
     """The photon of that place in the map."""
-    n, d = dr.gather(mi.Normal3f, photons.n, j, active), dr.gather(mi.Vector3f, photons.d, j, active)
-    found = Photon(dr.gather(mi.Point3f, photons.p, j, active), n, d, dr.gather(mi.Spectrum, photons.β, j, active))
-    if hasattr(photons, "medium"):
-        found.medium = dr.gather(mi.MediumPtr, photons.medium, j, active)
-        found.channel = dr.gather(mi.UInt32, photons.channel, j, active)
-    return found
+
+    def its(name: str):
+        value = getattr(photons, name)
+        return dr.gather(type(value), value, j, active)
+
+    of_media = (its("medium"), its("channel")) if hasattr(photons, "medium") else (None, None)
+    return Photon(its("p"), its("n"), its("d"), its("β"), j, its("depth"), *of_media)

@@ -31,15 +31,17 @@ from typing import Any, get_type_hints
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import collisions, media
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.radius import shrunk
-from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH, put
-from data_gen.samplers.photons.media.bre import BALL, BRE, Both, scattering_along, seen_along
-from data_gen.samplers.photons.media.vpm import VPM
+from data_gen.samplers.photons.map.trace import EDGE_BYTES, VERTICES_PER_PATH
+from data_gen.samplers.photons.map.vertices import put
+from data_gen.samplers.photons.media.bre import BALL, Along, by_pieces, media_pass, scattering_along, seen_along
 from data_gen.samplers.photons.passes import Passes
 from data_gen.samplers.photons.surfaces.ppm import Gathering
 
@@ -49,7 +51,7 @@ PART = 6
 PARTS = 32
 PART_BYTES = (18 + 9) * 4
 # Of a light path with its edges
-BEAM_BYTES = VPM.map_bytes + VERTICES_PER_PATH * EDGE_BYTES
+BEAM_BYTES = MEDIA_MAP_BYTES + VERTICES_PER_PATH * EDGE_BYTES
 
 
 @cache
@@ -78,21 +80,24 @@ def parts_class(variant: str) -> type:
 
 
 @dr.syntax
-def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, parts: Any) -> mi.UInt32:
-    """How many parts the edges of light paths have, ``rate`` of them in a unit of length.
+def cut(world: World, edges, rate: mi.Float, first: mi.UInt32, window: tuple, parts: Any) -> mi.UInt32:
+    """How many parts the ``edges`` of light paths have, ``rate`` of them in a unit of length.
 
-    Those of an edge are numbered from ``first`` on. The ``part`` (low, size) of them is entered into the arrays
+    Those of an edge are numbered from ``first`` on. The parts in the ``window`` (low, size) are entered into the arrays
     ``parts``, unless these are None.
     """
-    low, size = part
-    ray, medium, Φ = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins), mi.Spectrum(edges.power)
-    number, alive, edge = mi.UInt32(first), edges.bounce > 0, dr.arange(mi.UInt32, len(edges))
+    scene, fog, (low, size) = world.scene, world.fog, window
+    ray, medium = mi.Ray3f(edges.o, edges.e), mi.MediumPtr(edges.begins)  # a piece, and what it goes through
+    Φ = mi.Spectrum(edges.power)  # where the piece begins
+    number = mi.UInt32(first)  # of the next part
+    alive, edge = edges.bounce > 0, dr.arange(mi.UInt32, len(edges))
     scatters, grids = (edges.t > 0) & (dr.squared_norm(edges.n) == 0), fog.media.grids
-    nulls, ahead = mi.UInt32(0), mi.Float(0)
+    nulls, ahead = mi.UInt32(0), mi.Float(0)  # null collisions so far, and the optical depth to the next
     if dr.hint(grids, mode="scalar"):
         ahead = collisions.step(edges.key, nulls)
-    left = dr.select(scatters, dr.dot(edges.p - edges.o, edges.e), dr.inf)
+    left = dr.select(scatters, dr.dot(edges.p - edges.o, edges.e), dr.inf)  # of the edge, if it ends in a medium
     while dr.hint(alive, label="beams"):
+        # -------------- The piece: up to where, and how it falls --------------
         hit = scene.ray_intersect_preliminary(media.shortened(ray, left), active=alive)
         found, inside = alive & hit.is_valid(), alive & (medium != None)  # noqa: E711 - an array of pointers
         here = dr.zeros(mi.MediumInteraction3f, dr.width(edges.o))
@@ -109,18 +114,33 @@ def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, p
             σs, falls = dr.select(inside, mi.Spectrum(1), 0), dr.select(stop.grid, 0, falls)
             length, null = dr.select(skips, stop.t, length), stop.null
             found &= ~skips
+
+        # ------------------------------ Its parts ------------------------------
         parts_here = mi.UInt32(dr.minimum(dr.ceil(length * rate), 1 << 16))
         lit = inside & (dr.max(Φ * σs) > 0) & (length > 0) & dr.isfinite(length)
         parts_here = dr.select(lit, dr.maximum(parts_here, 1), 0)
         if dr.hint(parts is not None, mode="scalar"):
             k, half = mi.UInt32(0), 0.5 * length / parts_here
             while dr.hint(k < parts_here, label="parts of beams"):
-                at = number + k - low
+                place = number + k - low
                 s = (2 * k + 1) * half
-                there = ray(s), ray.d, half, s, length - s, Φ * σs * dr.exp(-falls * s), falls
-                put(parts, type(parts)(*there, medium, edges.bounce, edge), at, at < size)
+                part = type(parts)(
+                    p=ray(s),
+                    d=ray.d,
+                    half=half,
+                    before=s,
+                    after=length - s,
+                    Φ=Φ * σs * dr.exp(-falls * s),
+                    σ=falls,
+                    medium=medium,
+                    depth=edges.bounce,
+                    edge=edge,
+                )
+                put(parts, part, place, place < size)
                 k += 1
         number += parts_here
+
+        # ------------ Behind a boundary that bends nothing, or a null collision ------------
         Φ = dr.select(found, Φ * dr.exp(-media.depth(falls, hit.t)), dr.select(skips, Φ * null, 0))
         left -= length
         alive = (skips | found & fog.media.passes(hit.shape)) & (dr.max(Φ) > 0)
@@ -135,7 +155,7 @@ def cut(scene, fog: Fog, edges, rate: mi.Float, first: mi.UInt32, part: tuple, p
 
 @dataclass(init=False)
 class AlongBeams:
-    """Parts of beams, gathered within ``radius`` of rays; ``paths`` light paths have brought them."""
+    """Parts of the beams of a map, gathered beside rays; for paths of at most ``max_depth`` edges."""
 
     parts: Any
     grid: Grid
@@ -145,13 +165,13 @@ class AlongBeams:
     max_depth: mi.UInt32
     grids: bool
 
-    def __init__(self, parts, radius: float, paths: int, max_depth: int, grids: bool = False):
-        self.parts, self.grids = parts, grids
+    def __init__(self, parts, traced: Traced, max_depth: int, grids: bool = False):
+        self.parts, self.grids, radius = parts, grids, traced.radius(1)
         # What is near to a ray has its middle no further away.
         reach = radius * (1 + PART / 2)
         self.grid = Grid(parts.p, parts.half > 0, BALL * reach)
         self.radius, self.reach = dr.opaque(mi.Float, radius), dr.opaque(mi.Float, reach)
-        self.K = dr.opaque(mi.Float, 1 / (2 * radius * paths))
+        self.K = dr.opaque(mi.Float, 1 / (2 * radius * traced.paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def each(self, ray, length, active, visit, state: tuple) -> tuple:
@@ -210,7 +230,7 @@ def nearest(o, d, p, e) -> tuple:
     return (cos * along - back) / sin2, (along - cos * back) / sin2, dr.abs(dr.dot(to, n)) / sin, sin
 
 
-class BEAMS(BRE):
+class BEAMS(PhotonIntegrator):
     """Progressive photon beams in media, and photons on surfaces; no gradients.
 
     Plugin ``beams``. Parameters and what is not handled are those of ``vpm``. Biased, and consistent; in media the
@@ -218,32 +238,30 @@ class BEAMS(BRE):
     """
 
     name = "beams"
-    edges = True
+    sees_media, grids, edges = True, True, True
     map_bytes = BEAM_BYTES + PARTS * PART_BYTES
 
-    def gatherings(self, passes: Passes, keys, number: int):
-        if self.fog is None:
-            yield from super().gatherings(passes, keys, number)
-        elif passes.world.lights.emitters is not None and self.max_depth > 1:
-            paths = self.photons * dr.width(keys[0])
-            _, maps = self.photon_maps(passes, keys)
-            for photons in maps:
-                yield from self.of_map(passes, photons, number, paths)
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        media_pass(self, passes, camera, film, among_beams)
 
-    def of_map(self, passes: Passes, photons, number: int, paths: int) -> Iterator[Both]:
-        """What light is gathered from in one photon map of pass ``number``, with media."""
-        radius = self.radius * passes.width
-        on_surfaces = Gathering(photons, radius * shrunk(number), paths, self.max_depth)
-        for parts in parts_of(passes, self.fog, photons, radius * shrunk(number, 1), PARTS * paths):
-            beams = AlongBeams(parts, radius * shrunk(number, 1), paths, self.max_depth, self.fog.media.grids)
-            yield Both(on_surfaces, beams)
-            on_surfaces = None
+    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return by_pieces(self, *path)
 
 
-def parts_of(passes: Passes, fog: Fog, photons, radius: float, most: int) -> Iterator[Any]:
+def among_beams(passes: Passes, traced: Traced) -> Iterator[Along]:
+    """What is near in a photon map: photons on surfaces, and beams, some parts of them at a time."""
+    max_depth, fog = passes.integrator.limits.max_depth, passes.world.fog
+    on_surfaces: Gathering | None = Gathering(traced, max_depth)
+    for parts in parts_of(passes, traced, PARTS * traced.paths):
+        yield Along(on_surfaces, AlongBeams(parts, traced, max_depth, fog.media.grids))
+        on_surfaces = None
+
+
+def parts_of(passes: Passes, traced: Traced, most: int) -> Iterator[Any]:
     """The beams of a map in parts, at most so many at a time, and some that are empty if there are none."""
-    kind, rate = parts_class(mi.variant()), dr.opaque(mi.Float, 1 / (PART * radius))
-    count = passes.frozen(counted, passes.world.scene, fog, photons, rate)
+    kind, photons, frozen = parts_class(mi.variant()), traced.photons, passes.frozen
+    rate = dr.opaque(mi.Float, 1 / (PART * traced.radius(1)))
+    count = frozen(counted, passes.world, photons, rate)
     first = dr.prefix_sum(count)
     dr.eval(count, first)
     total = int(dr.sum(count)[0])
@@ -251,21 +269,21 @@ def parts_of(passes: Passes, fog: Fog, photons, radius: float, most: int) -> Ite
         size = max(min(most, total - low), 1)
         parts = kind(*(dr.zeros(t, size) for t in get_type_hints(kind).values()))
         dr.make_opaque(parts)
-        part = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
-        parts = passes.frozen(entered, passes.world.scene, fog, photons, rate, first, part, parts)
+        window = dr.opaque(mi.UInt32, low), dr.opaque(mi.UInt32, size)
+        parts = frozen(entered, passes.world, photons, rate, first, window, parts)
         dr.eval(parts)
         yield parts
 
 
-def counted(scene, fog: Fog, photons, rate) -> mi.UInt32:
+def counted(world: World, photons, rate) -> mi.UInt32:
     """How many parts each edge has."""
     none = mi.UInt32(0), mi.UInt32(0)
-    return cut(scene, fog, photons, rate, dr.zeros(mi.UInt32, len(photons)), none, None)
+    return cut(world, photons, rate, dr.zeros(mi.UInt32, len(photons)), none, None)
 
 
-def entered(scene, fog: Fog, photons, rate, first: mi.UInt32, part: tuple, parts):
+def entered(world: World, photons, rate, first: mi.UInt32, window: tuple, parts):
     """The ``parts`` of these numbers."""
-    cut(scene, fog, photons, rate, first, part, parts)
+    cut(world, photons, rate, first, window, parts)
     return parts
 
 

@@ -17,7 +17,7 @@ Beams, and Paths in Volumetric Light Transport Simulation", short beams; the rad
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,16 +25,21 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import collisions, media
-from data_gen.paths.vertex import NULL, SMOOTH, event_kind
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.vertex import SMOOTH, event_kind
+from data_gen.paths.walk import Sky, roulette
+from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.radius import shrunk
-from data_gen.samplers.photons.media.vpm import VPM
-from data_gen.samplers.photons.surfaces.ppm import Gathering
+from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.passes import Begun, Passes, Start
+from data_gen.samplers.photons.surfaces.ppm import Gathering, by_vertices, image_pass
 
 # Of the grid, what is gathered within one radius of a ray: in parts 3 radii long, each in a ball of this many radii.
 BALL = np.sqrt(1 + 1.5**2)
@@ -42,7 +47,7 @@ BALL = np.sqrt(1 + 1.5**2)
 
 @dataclass(init=False)
 class AlongRays:
-    """The photons of a map in media, gathered within ``radius`` of rays; ``paths`` light paths have brought them."""
+    """The photons of a map where they are gathered beside rays; for paths of at most ``max_depth`` edges."""
 
     photons: Any
     Φ: mi.Spectrum
@@ -52,13 +57,13 @@ class AlongRays:
     max_depth: mi.UInt32
     grids: bool
 
-    def __init__(self, fog: Fog, photons, radius: float, paths: int, max_depth: int):
-        self.photons, self.Φ, self.grids = photons, fog.power(photons), fog.media.grids
+    def __init__(self, fog: Fog, traced: Traced, max_depth: int):
+        self.photons, self.grids, radius = traced.photons, fog.media.grids, traced.radius()
+        self.Φ = fog.power(self.photons)
         dr.eval(self.Φ)
-        scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
-        self.grid = Grid(photons.p, scattered, BALL * radius)
+        self.grid = Grid(self.photons.p, in_media(self.photons), BALL * radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
-        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
+        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, ray, length, medium: mi.MediumPtr, σ: mi.Spectrum, depth: mi.UInt32, active) -> mi.Spectrum:
@@ -106,114 +111,132 @@ def scattering_along(ray, medium: mi.MediumPtr) -> Callable[[mi.Float, mi.Bool],
 
 
 @dataclass
-class Both:
-    """Photons on surfaces, and photons in media."""
+class Along:
+    """What is near to camera paths that go piece by piece."""
 
     on_surfaces: Gathering | None
-    in_media: Any
+    in_media: Any  # photons, beams or planes, with ``light`` (piece of a ray, length, medium, σ, depth, where)
 
 
-class BRE(VPM):
+class BRE(PhotonIntegrator):
     """Progressive photon mapping by the beam radiance estimate in media, and on surfaces; no gradients.
 
     Plugin ``bre``. Parameters, bias and what is not handled are those of ``vpm``.
     """
 
     name = "bre"
+    sees_media, grids, map_bytes = True, True, MEDIA_MAP_BYTES
 
-    def gathering(self, photons, width: float, number: int, paths: int):
-        if self.fog is None:
-            return super().gathering(photons, width, number, paths)
-        radius = self.radius * width * shrunk(number)
-        near = photons, radius, paths, self.max_depth
-        return Both(Gathering(*near), AlongRays(self.fog, *near))
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        media_pass(self, passes, camera, film, beside_rays)
 
-    def light(self, scene, materials, random, ray, importance, near, emission: bool):
-        if self.fog is None:
-            return super().light(scene, materials, random, ray, importance, near, emission)
-        parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
-        gather = (None if part is None else part.light for part in parts)
-        return self.path_in_media(scene, materials, random.clone(), ray, importance, *gather, emission)
+    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return by_pieces(self, *path)
 
-    @dr.syntax
-    def path_in_media(self, scene, materials, random, ray, importance, at_surface, along, emission: bool):
-        """``camera_path()`` through media, piece by piece from boundary to boundary.
 
-        ``along`` is called with (piece of a ray, length, medium, σ, depth, where), ``at_surface`` as there; or neither.
-        """
-        fog, ray, medium = self.fog, mi.Ray3f(ray), mi.MediumPtr(self.fog.within)
-        Le = importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, mi.UInt32(0))
-        L = dr.zeros(mi.Spectrum, dr.width(ray))
-        β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
-        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
-        sky_seen, active = mi.Bool(not self.hide_emitters), mi.Bool(True)
-        grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
-        shown = not self.hide_emitters and self.max_depth > 0
+def beside_rays(passes: Passes, traced: Traced) -> Iterator[Along]:
+    """What is near in a photon map: photons on surfaces, and beside rays."""
+    max_depth = passes.integrator.limits.max_depth
+    yield Along(Gathering(traced, max_depth), AlongRays(passes.world.fog, traced, max_depth))
+
+
+def media_pass(integrator, passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable) -> None:
+    """``image_pass()`` of what is ``near`` (passes, map), where there are media; else of photons on surfaces."""
+    begun = Begun.of(passes, camera)
+    maps = integrator.maps(passes, begun.keys, camera.first)
+    if passes.world.fog is None:
+        gathered = (Gathering(traced, integrator.limits.max_depth) for traced in maps)
+    else:
+        gathered = (one for traced in maps for one in near(passes, traced))
+    image_pass(passes, begun, gathered, integrator.light, film)
+
+
+def by_pieces(integrator: PhotonIntegrator, world: World, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """``by_vertices()``; through media piece by piece from boundary to boundary."""
+    return (by_vertices if world.fog is None else _by_pieces)(integrator, world, *path)
+
+
+@dr.syntax
+def _by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
+    scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
+    connectable = world.materials.connectable
+    parts = (near.on_surfaces, near.in_media) if near is not None else (None, None)
+    at_surface, along = (None if part is None else part.light for part in parts)
+    ray, medium = mi.Ray3f(start.ray), mi.MediumPtr(fog.within)  # a piece, and what it goes through
+    importance = start.importance
+    Le = importance * integrator.lamps_in_fog(scene, fog.media, ray, fog.within, mi.UInt32(0))
+    L = dr.zeros(mi.Spectrum, dr.width(ray))
+    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction, of the piece
+    depth = mi.UInt32(1)  # the number of the segment that it is of
+    sky, active = Sky.from_camera(limits.hide_emitters), mi.Bool(True)
+    # Of scenes with grids: whether the path has come through one, and goes on behind a null collision
+    grids, behind, skips = fog.media.grids, mi.Bool(False), mi.Bool(False)
+    if dr.hint(grids, mode="scalar"):
+        channel = media.choose_channel(random.next_1d())
+    while dr.hint(active, label="camera path"):
+        # ------------------ A piece of a segment ------------------
+        first = depth == 1
+        if dr.hint(limits.hide_emitters, mode="scalar"):
+            hit = integrator.first_surface(scene, ray, medium, active & first)
+            later = scene.ray_intersect_preliminary(ray, active=active & ~first)
+            hit = dr.select(first, hit, later)
+        else:
+            hit = scene.ray_intersect_preliminary(ray, active=active)
+        si = hit.compute_surface_interaction(ray, active=active)
+        σ, found = media.extinction(medium, ray), active & hit.is_valid()
+        length = dr.select(found, hit.t, dr.inf)
         if dr.hint(grids, mode="scalar"):
-            channel = media.choose_channel(random.next_1d())
-        while dr.hint(active, label="camera path"):
-            # ------------------ A piece of a segment ------------------
-            first = depth == 1
-            if dr.hint(self.hide_emitters, mode="scalar"):
-                hit = self.first_surface(scene, ray, medium, active & first)
-                later = scene.ray_intersect_preliminary(ray, active=active & ~first)
-                hit = dr.select(first, hit, later)
-            else:
-                hit = scene.ray_intersect_preliminary(ray, active=active)
-            si = hit.compute_surface_interaction(ray, active=active)
-            σ, found = media.extinction(medium, ray), active & hit.is_valid()
-            length = dr.select(found, hit.t, dr.inf)
-            if dr.hint(grids, mode="scalar"):
-                ahead, u_real = -dr.log(1 - random.next_1d()), random.next_1d()
-                stop = collisions.next_stop(ray, length, medium, channel, ahead, active)
-                σ, length = dr.select(stop.grid, 0, σ), stop.t
-            if dr.hint(along is not None, mode="scalar"):
-                inside = active & (medium != None)  # noqa: E711 - an array of pointers
-                L += β * along(ray, length, medium, σ, depth, inside)
-            β *= dr.exp(-media.depth(σ, length))
-            if dr.hint(grids, mode="scalar"):
-                real = stop.collides & (u_real < media.pick(stop.real, channel))
-                skips = stop.collides & ~real
-                β = dr.select(skips, β * stop.null, β)
-                active &= ~stop.collides
-                found &= active
-            if dr.hint(emission, mode="scalar"):
-                met = active & ~first & (found | sky_seen)
-                if dr.hint(grids and shown, mode="scalar"):
-                    # What comes through a grid is not in Le, nor is the sky: see ``behind_grids()``.
-                    behind |= stop.passed > 0
-                    met |= active & first & (behind | ~found)
-                L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
+            ahead, u_real = -dr.log(1 - random.next_1d()), random.next_1d()
+            stop = collisions.next_stop(ray, length, medium, channel, ahead, active)
+            σ, length = dr.select(stop.grid, 0, σ), stop.t
+        if dr.hint(along is not None, mode="scalar"):
+            inside = active & (medium != None)  # noqa: E711 - an array of pointers
+            L += β * along(ray, length, medium, σ, depth, inside)
+        β *= dr.exp(-media.depth(σ, length))
+        if dr.hint(grids, mode="scalar"):
+            real = stop.collides & (u_real < media.pick(stop.real, channel))
+            skips = stop.collides & ~real
+            β = dr.select(skips, β * stop.null, β)
+            active &= ~stop.collides
+            found &= active
+        if dr.hint(emission, mode="scalar"):
+            met = active & ~first & (found | sky.seen)
+            if dr.hint(grids and limits.shows, mode="scalar"):
+                # What comes through a grid is not in Le, nor is the sky: see ``behind_grids()``.
+                behind |= stop.passed > 0
+                met |= active & first & (behind | ~found)
+            L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
 
-            # ------------------ The vertex at its end -----------------
-            passes = found & fog.media.passes(hit.shape)
-            active = found & ~passes & (depth < self.max_depth)
-            bsdf = si.bsdf()
-            receives = active & materials.connectable(bsdf)
-            if dr.hint(at_surface is not None, mode="scalar"):
-                L += β * at_surface(si, None, bsdf, depth, receives)
-            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-            sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
-            kind = event_kind(sample.sampled_type)
-            active &= (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
-            sky_seen |= active & (kind != NULL)
-            η = dr.select(active, η * sample.eta, η)
-            straight = passes | skips
-            β = dr.select(straight, β, β * f_p)
-            # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
-            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
-            active &= (dr.max(β) > 0) & (u_survival < survival)
-            β = dr.select(straight, β, β / survival)
-            depth = dr.select(active, depth + 1, depth)
-            d = dr.select(passes, ray.d, si.to_world(sample.wo))
-            changes = found & si.is_medium_transition()
-            medium = dr.select(changes, si.target_medium(d), medium)
-            onward = si.spawn_ray(d)
-            if dr.hint(grids, mode="scalar"):
-                skips &= dr.max(β) > 0
-                onward = dr.select(skips, mi.Ray3f(ray(length), ray.d, ray.time, ray.wavelengths), onward)
-            ray, active = onward, active | passes | skips
-        return L, Le
+        # ------------------ The vertex at its end -----------------
+        passes = found & fog.media.passes(hit.shape)
+        active = found & ~passes & (depth < limits.max_depth)
+        bsdf = si.bsdf()
+        receives = active & connectable(bsdf)
+        if dr.hint(at_surface is not None, mode="scalar"):
+            L += β * at_surface(si, None, bsdf, depth, receives)
+
+        # ---------------- Where the path goes on ------------------
+        u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+        sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
+        kind = event_kind(sample.sampled_type)
+        active &= (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
+        sky = sky.behind(kind, active)
+        η = dr.select(active, η * sample.eta, η)
+        straight = passes | skips
+        β = dr.select(straight, β, β * f_p)
+        survival = roulette(dr.max(β), depth >= limits.rr_depth, η)
+        active &= (dr.max(β) > 0) & (u_survival < survival)
+        β = dr.select(straight, β, β / survival)
+        depth = dr.select(active, depth + 1, depth)
+        d = dr.select(passes, ray.d, si.to_world(sample.wo))
+        changes = found & si.is_medium_transition()
+        medium = dr.select(changes, si.target_medium(d), medium)
+        onward = si.spawn_ray(d)
+        if dr.hint(grids, mode="scalar"):
+            skips &= dr.max(β) > 0
+            onward = dr.select(skips, mi.Ray3f(ray(length), ray.d, ray.time, ray.wavelengths), onward)
+        ray, active = onward, active | passes | skips
+    return L, Le
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

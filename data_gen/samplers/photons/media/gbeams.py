@@ -22,44 +22,64 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import Piece
-from data_gen.samplers.photons.gradients.copies import let_through, redirected
-from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Near, difference
-from data_gen.samplers.photons.gradients.pairs import Pairs
+from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
+from data_gen.samplers.photons.gradients.copies import LightPaths, let_through, redirected
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, Gathered, gradient_pass
+from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.radius import shrunk
+from data_gen.samplers.photons.map.vertices import at
 from data_gen.samplers.photons.media.beams import BEAM_BYTES, PART_BYTES, AlongBeams, nearest, parts_of
-from data_gen.samplers.photons.media.gbre import GBRE, PATHS_BYTES, Beside, Both, beside_of
+from data_gen.samplers.photons.media.gbre import PATHS_BYTES, Beside, beside_of, inside_of
 from data_gen.samplers.photons.passes import Passes
+from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
 
 # Parts of beams, for each light path, and pairs of a ray and a beam, for each camera sample, in memory together
 PARTS = 16
 PAIRS = 8
+MAP_BYTES, CAMERA_BYTES = BEAM_BYTES + PARTS * PART_BYTES, PATHS_BYTES + PAIRS * PAIR_BYTES
+
+
+@dataclass
+class Line:
+    """The line of a beam: ``p`` is on it."""
+
+    p: mi.Point3f
+    d: mi.Vector3f
+    back: mi.Float  # from p to where the beam begins
+
+    def past(self, ray: Beside, radius: mi.Float) -> Meeting:
+        s, t, aside, sin = nearest(ray.o, ray.d, self.p, self.d)
+        near = ray.alive & (aside < radius) & (t > 0) & (t < ray.length) & (s > -self.back)
+        return Meeting(s, t, sin, near)
+
+
+@dataclass
+class Meeting:
+    """Where a beam passes a ray."""
+
+    s: mi.Float  # along the beam, from ``Line.p``
+    t: mi.Float
+    sin: mi.Float
+    near: mi.Bool  # to the ray, between the ends of the ray, and behind where the beam begins
 
 
 @dataclass
 class Beam:
-    """The line of a beam, ``p`` the middle of one of its parts; and where it passes a ray."""
+    """A beam, of which a ``part`` is near to a ray; p of its line is the middle of that."""
 
-    p: mi.Point3f
-    d: mi.Vector3f
-    back: mi.Float  # from there to where it begins
-    s: mi.Float
-    t: mi.Float
-    sin: mi.Float
-    passes: mi.Bool  # near to the ray, between the ends of the ray, and behind where the beam begins
+    line: Line
+    part: Any  # ``beams.parts_class``
 
-
-def beam_past(ray: Beside, p, d, back, radius: mi.Float) -> Beam:
-    s, t, aside, sin = nearest(ray.o, ray.d, p, d)
-    near = ray.alive & (aside < radius) & (t > 0) & (t < ray.length) & (s > -back)
-    return Beam(p, d, back, s, t, sin, near)
+    @property
+    def depth(self) -> mi.UInt32:
+        return self.part.depth
 
 
 @dataclass
@@ -79,121 +99,107 @@ class RaysAmongBeams:
 
 @dataclass
 class NearBeams:
-    """The beams of a map, where they are gathered along rays, and where their light paths start."""
+    """``Near``: the beams of a map beside rays, and where their light paths come from."""
 
-    starts: LightRay
-    photons: Any
+    paths: LightPaths
     beams: AlongBeams
     grid: Grid
     radius2: mi.Float
 
-    def where(self, materials, base: Piece) -> tuple[RaysAmongBeams, mi.Bool]:
-        """The pieces of base paths, and whether there is a medium."""
-        ray, inside = mi.Ray3f(base.ray.o, base.ray.d), base.medium != None  # noqa: E711 - an array of pointers
-        return RaysAmongBeams(ray, base.length(), self.beams), base.alive & inside
+    def where(self, world: World, base: Piece) -> tuple[RaysAmongBeams, mi.Bool]:
+        return RaysAmongBeams(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.beams), inside_of(base)
 
-    def of_pairs(self, materials, pairs: Pairs, base: Piece, offsets: list, longest: mi.UInt32) -> tuple:
-        """Of each pair C, four Δ with the beam for its copy, and counts; and where a copy is to be looked for."""
-        parts, radius, K = self.beams.parts, self.beams.radius, self.beams.K
-        j = dr.gather(mi.UInt32, self.grid.index, pairs.place)
-        edge, medium = dr.gather(mi.UInt32, parts.edge, j), dr.gather(mi.MediumPtr, parts.medium, j)
-        line = self.line(j, edge)
-        before, after = dr.gather(mi.Float, parts.before, j), dr.gather(mi.Float, parts.after, j)
-        Φ, falls = dr.gather(mi.Spectrum, parts.Φ, j), dr.gather(mi.Spectrum, parts.σ, j)
-        short = dr.gather(mi.UInt32, parts.depth, j) <= dr.gather(mi.UInt32, longest, pairs.point)
-        direct = dr.isfinite(dr.gather(mi.Float, self.photons.density, edge))
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
+        return beside_of(paths, which, index)
 
-        def light(ray: Beside, beam: Beam, active):
-            photon = Photon(beam.p, mi.Normal3f(0), beam.d, Φ * dr.exp(-falls * beam.s) / beam.sin)
-            return ray.light(photon, beam.t, active) * K
+    def thing(self, place: mi.UInt32) -> Beam:
+        j, parts = dr.gather(mi.UInt32, self.grid.index, place), self.beams.parts
 
-        A = beside_of([base], None, pairs.point)
-        beam = beam_past(A, *line, radius)
-        C = light(A, beam, beam.passes & short & (medium == A.medium))
-        lit = dr.max(C) > 0
-        Δ, apart = [], []
-        for offset in offsets:
-            B = beside_of([offset], None, pairs.point)
-            receives = lit & B.alive & (medium == B.medium)
-            other = beam_past(B, *line, radius)
-            # Where it passes, the beam must be in the medium, and must not have ended.
-            shared = receives & other.passes & (other.s >= -before) & (other.s < after)
-            Δ.append(difference(C, light(B, other, shared), mi.Float(1)))
-            apart.append(receives & ~other.passes & direct & (beam.t < B.length))
-        return [C, *Δ, mi.Point2f(dr.select(lit, len(SHIFTS), 0), 0)], apart
+        part = at(parts, j)
+        back = dr.dot(part.p - dr.gather(mi.Point3f, self.paths.photons.o, part.edge), part.d)
+        return Beam(Line(part.p, part.d, back), part)
 
-    def line(self, j: mi.UInt32, edge: mi.UInt32) -> tuple:
-        """A point and the direction of a beam, and how far behind the point it begins."""
-        p, d = dr.gather(mi.Point3f, self.beams.parts.p, j), dr.gather(mi.Vector3f, self.beams.parts.d, j)
-        return p, d, dr.dot(p - dr.gather(mi.Point3f, self.photons.o, edge), d)
+    def brought(self, beam: Beam, A: Beside, active: mi.Bool) -> tuple[mi.Spectrum, Meeting]:
+        met = beam.line.past(A, self.beams.radius)
+        return self.light(beam, met, A, met.near & active & (beam.part.medium == A.medium)), met
 
-    def of_copies(
-        self, scene, lights, materials, fog, pairs: Pairs, some: mi.UInt32, which: mi.UInt32, base, offsets: list, C
-    ) -> mi.Spectrum:
-        """Δ by the shift of number ``which`` of ``some`` pairs, whose beams are near to the base path alone."""
-        point, place = (dr.gather(mi.UInt32, index, some) for index in (pairs.point, pairs.place))
-        j, C = dr.gather(mi.UInt32, self.grid.index, place), dr.gather(mi.Spectrum, C, some)
-        edge, medium = (
-            dr.gather(mi.UInt32, self.beams.parts.edge, j),
-            dr.gather(mi.MediumPtr, self.beams.parts.medium, j),
-        )
-        A, B = beside_of([base], None, point), beside_of(offsets, which, point)
-        beam = beam_past(A, *self.line(j, edge), self.beams.radius)
-        ends = scene, fog, lights, self.starts, self.photons, edge, medium
-        moved, other, r, good = turned(*ends, beam, A, B, self.beams.radius)
-        C1 = B.light(moved, other.t, good & (medium == B.medium)) * self.beams.K
-        return difference(C, C1, r)
+    def shared(self, beam: Beam, met: Meeting, B: Beside, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        receives = lit & B.alive & (beam.part.medium == B.medium)
+        other = beam.line.past(B, self.beams.radius)
+        # Where it passes, the beam must be in the medium, and must not have ended.
+        shared = receives & other.near & (other.s >= -beam.part.before) & (other.s < beam.part.after)
+        apart = receives & ~other.near & self.paths.shifts(beam.part.edge) & (met.t < B.length)
+        return self.light(beam, other, B, shared), apart
+
+    def copied(self, world: World, beam: Beam, A: Beside, B: Beside) -> tuple[mi.Spectrum, mi.Float]:
+        moved, t, r, good = turned(world, self.paths, beam, A, B, self.beams.radius)
+        return B.light(moved, t, good & (beam.part.medium == B.medium)) * self.beams.K, r
+
+    def light(self, beam: Beam, met: Meeting, ray: Beside, active: mi.Bool) -> mi.Spectrum:
+        Φ = beam.part.Φ * dr.exp(-beam.part.σ * met.s) / met.sin
+        return ray.light(Photon(beam.line.p, mi.Normal3f(0), beam.line.d, Φ), met.t, active) * self.beams.K
 
 
-def turned(scene, fog, lights, starts: LightRay, photons, edge, medium, beam: Beam, A: Beside, B: Beside, radius):
-    """(copy, its beam, r, whether it exists) of the ``beam`` of an ``edge`` that is near to A and not to B.
+def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, radius: mi.Float) -> tuple:
+    """(copy, t', r, whether it exists) of the ``beam`` that is near to A and not to B.
 
     The copy is a photon where the beam passes B, of power 1 / sin θ' times as much.
     """
-    x, y = A.at(beam.t), B.at(beam.t)
-    met = beam.p + beam.d * beam.s
-    photon = Photon(met, mi.Normal3f(0), beam.d, mi.Spectrum(0), medium, dr.gather(mi.UInt32, photons.colour, edge))
-    u = dr.dot(met - x, dr.normalize(dr.cross(A.d, beam.d)))
+    photons, line, edge = paths.photons, beam.line, beam.part.edge
+    # ------------------- Where the beam passes A, and how far aside -------------------
+    met = line.past(A, radius)
+    x, y, foot = A.at(met.t), B.at(met.t), line.p + line.d * met.s
+    colour = dr.gather(mi.UInt32, photons.colour, edge)
+    photon = Photon(foot, mi.Normal3f(0), line.d, mi.Spectrum(0), place=edge, medium=beam.part.medium, channel=colour)
+    u = dr.dot(foot - x, dr.normalize(dr.cross(A.d, line.d)))
+
+    # ------------------- As far on the other side of B, from the same a ---------------
     start = dr.gather(mi.UInt32, photons.parent, edge)
     first = dr.gather(mi.Float, photons.density, edge) == 0
-    far = first & lights.far(dr.gather(mi.UInt32, starts.index, start, first))
-    target = shift.past(dr.gather(mi.Point3f, photons.o, edge), beam.d, y, B.d, -u, far)
-    way = redirected(scene, lights, starts, photons, edge, photon, met, target, True, fog)
+    far = first & world.lights.far(dr.gather(mi.UInt32, paths.starts.index, start, first))
+    target = shift.past(dr.gather(mi.Point3f, photons.o, edge), line.d, y, B.d, -u, far)
+    way = redirected(world, paths, photon, foot, target, True)
     reach = dr.dot(target - way.ray.o, way.ray.d)
-    other = beam_past(B, target, way.ray.d, reach, radius)
-    J = (other.sin / beam.sin) * shift.jacobian_in_medium(way.base_length2, way.length2)
+    copy = Line(target, way.ray.d, reach)
+    other = copy.past(B, radius)
+    J = (other.sin / met.sin) * shift.jacobian_in_medium(way.base_length2, way.length2)
     r = way.ratio * J
-    good = other.passes & (reach > 0) & (dr.max(way.Φ) > 0) & (r > 0) & dr.isfinite(r)
+    good = other.near & way.leads(target, r)
     # Past A it would be gathered as it is, not as a copy: the shift back would be another.
-    good &= ~beam_past(A, target, way.ray.d, reach, radius).passes
-    T, T_c, surface, _, there = let_through(scene, fog, way, reach, good)
-    good &= ~surface.is_valid() & (there == medium)
+    good &= ~copy.past(A, radius).near
+
+    # ------------------- What comes through, and is scattered there -------------------
+    passage = let_through(world, way, reach, good)
+    good &= ~passage.met.is_valid() & (passage.medium == beam.part.medium)
     here = dr.zeros(mi.MediumInteraction3f, dr.width(reach))
-    here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, there
-    σs, _, _ = there.get_scattering_coefficients(here, good)
-    Φ = dr.select(good, way.Φ * σs * (J * T) / other.sin, 0)
-    return Photon(target, mi.Normal3f(0), way.ray.d, Φ, medium, photon.channel), other, r * T_c, good
+    here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, passage.medium
+    σs, _, _ = passage.medium.get_scattering_coefficients(here, good)
+    Φ = dr.select(good, way.Φ * σs * (J * passage.T) / other.sin, 0)
+    return Photon(target, mi.Normal3f(0), way.ray.d, Φ), other.t, r * passage.T_c, good
 
 
-class GBEAMS(GBRE):
+class GBEAMS(PhotonIntegrator):
     """Gradients of photon beams in homogeneous media, and of photons on surfaces.
 
     Plugin ``gbeams``. Parameters are those of ``gpm``; bias and what is not handled are those of ``beams``.
     """
 
-    name = "gbeams"
-    edges, map_bytes = True, BEAM_BYTES + PARTS * PART_BYTES
-    pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
+    name, walk = "gbeams", PathsByPieces
+    sees_media, instead_of_media, edges = True, "gpm", True
+    map_bytes, camera_bytes = MAP_BYTES, CAMERA_BYTES
 
-    def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
-        radius = self.radius * passes.width
-        on_surfaces: Near | None = Near(starts, photons, radius * shrunk(number), paths)
-        radius *= shrunk(number, 1)
-        for parts in parts_of(passes, self.fog, photons, radius, PARTS * paths):
-            beams = AlongBeams(parts, radius, paths, self.max_depth)
-            near = NearBeams(starts, photons, beams, beams.grid, dr.opaque(mi.Float, radius**2))
-            yield Both(on_surfaces, near)
-            on_surfaces = None
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        gradient_pass(passes, camera, film, near_beams, PAIRS)
+
+
+def near_beams(passes: Passes, traced: Traced) -> Iterator[Gathered]:
+    """Photons on surfaces, and beams, some parts of them at a time."""
+    on_surfaces: OnSurfaces | None = OnSurfaces(traced)
+    radius2 = dr.opaque(mi.Float, traced.radius(1) ** 2)
+    for parts in parts_of(passes, traced, PARTS * traced.paths):
+        beams = AlongBeams(parts, traced, passes.integrator.limits.max_depth)
+        yield Gathered(on_surfaces, NearBeams(LightPaths(traced.starts, traced.photons), beams, beams.grid, radius2))
+        on_surfaces = None
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

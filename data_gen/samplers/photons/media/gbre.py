@@ -21,39 +21,28 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film import SHIFTS, GradientFilm
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera import Level
-from data_gen.samplers.photons.gradients.camera_in_media import Piece, ends, levels_in_media
-from data_gen.samplers.photons.gradients.copies import copy_in_medium
-from data_gen.samplers.photons.gradients.differences import (
-    PAIR_BYTES,
-    PAIRS,
-    Near,
-    add_to,
-    chosen,
-    difference,
-    differences,
-    emitted,
-    gradient_pass,
-)
-from data_gen.samplers.photons.gradients.pairs import Pairs, Rays
+from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
+from data_gen.samplers.photons.gradients.copies import LightPaths, copy_in_medium
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
+from data_gen.samplers.photons.gradients.pairs import Rays
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon, photon_of
-from data_gen.samplers.photons.map.radius import shrunk
-from data_gen.samplers.photons.media.bre import BALL, BRE, seen_along
+from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.media.bre import BALL, seen_along
 from data_gen.samplers.photons.passes import Passes
-from ngpt.errors import NgptError
+from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
 
 # Of a camera sample beside pairs: levels of five pieces of paths, what they end at, and as many sums
 PATHS_BYTES = 4096
@@ -109,148 +98,87 @@ def fields_of(piece: Piece, index: mi.UInt32) -> tuple:
     return o, d, length, *(dr.gather(type(value), value, index) for value in some)
 
 
-@dataclass(init=False)
-class AlongPieces:
-    """The photons of a map in media, where they are gathered along rays, and where their light paths start.
-
-    ``receivers`` (paths, which, index) are what photons are near to, of those paths.
-    """
-
-    starts: LightRay
-    photons: Any
-    Φ: mi.Spectrum
-    grid: Grid
-    radius2: mi.Float
-    K: mi.Float
-    receivers = staticmethod(beside_of)
-
-    def __init__(self, starts: LightRay, photons, radius: float, paths: int):
-        self.starts, self.photons, self.Φ = starts, photons, photons.β
-        reach, volume = self.kernel(radius)
-        scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
-        self.grid = Grid(photons.p, scattered, reach)
-        self.radius2 = dr.opaque(mi.Float, radius**2)
-        self.K = dr.opaque(mi.Float, 1 / (volume * paths))
-
-    @staticmethod
-    def kernel(radius: float) -> tuple[float, float]:
-        """The radius that the grid is for, and what photons are counted in: here a disk."""
-        return BALL * radius, np.pi * radius**2
-
-    def where(self, materials, base: Piece) -> tuple[Rays, mi.Bool]:
-        """The pieces of base paths, and whether there is a medium."""
-        ray, inside = mi.Ray3f(base.ray.o, base.ray.d), base.medium != None  # noqa: E711 - an array of pointers
-        return Rays(ray, base.length()), base.alive & inside
-
-    def of_pairs(self, materials, pairs: Pairs, base: Piece, offsets: list, longest: mi.UInt32) -> tuple:
-        """Of each pair C, four Δ with the photon for its copy, and counts; and where a copy is to be looked for."""
-        j = dr.gather(mi.UInt32, self.grid.index, pairs.place)
-        photon = photon_of(self.photons, j)
-        photon.Φ = dr.gather(mi.Spectrum, self.Φ, j)
-        short = dr.gather(mi.UInt32, self.photons.depth, j) <= dr.gather(mi.UInt32, longest, pairs.point)
-        direct = dr.isfinite(dr.gather(mi.Float, self.photons.density, j))
-        A = self.receivers([base], None, pairs.point)
-        t, near = A.near(photon.p, self.radius2)
-        C = A.light(photon, t, near & short & (photon.medium == A.medium)) * self.K
-        lit = dr.max(C) > 0
-        Δ, apart = [], []
-        for offset in offsets:
-            B = self.receivers([offset], None, pairs.point)
-            receives = lit & B.alive & (photon.medium == B.medium)
-            t1, shared = B.near(photon.p, self.radius2)
-            shared &= receives
-            Δ.append(difference(C, B.light(photon, t1, shared) * self.K, mi.Float(1)))
-            apart.append(receives & ~shared & direct & B.reaches(t))
-        return [C, *Δ, mi.Point2f(dr.select(lit, len(SHIFTS), 0), 0)], apart
-
-    def of_copies(
-        self, scene, lights, materials, fog, pairs: Pairs, some: mi.UInt32, which: mi.UInt32, base, offsets: list, C
-    ) -> mi.Spectrum:
-        """Δ by the shift of number ``which`` of ``some`` pairs, whose photons are beside the base path alone."""
-        point, place = (dr.gather(mi.UInt32, index, some) for index in (pairs.point, pairs.place))
-        j, C = dr.gather(mi.UInt32, self.grid.index, place), dr.gather(mi.Spectrum, C, some)
-        A, B = self.receivers([base], None, point), self.receivers(offsets, which, point)
-        photon = photon_of(self.photons, j)
-        moved, t, r, good = copy_beside(scene, fog, lights, self.starts, self.photons, j, photon, A, B, self.radius2)
-        return difference(C, B.light(moved, t, good) * self.K, r)
-
-
-def copy_beside(scene, fog, lights, starts: LightRay, photons, j, photon: Photon, A: Beside, B: Beside, radius2):
-    """(copy, t', r, whether it exists) of the ``photon`` of place ``j`` that is gathered at A and not at B."""
-    target = A.image(photon.p, B)
-    t1, there = B.near(target, radius2)
-    # At A it would be gathered as it is, not as a copy: the shift back would be another.
-    there &= ~A.near(target, radius2)[1]
-    moved, r, good = copy_in_medium(scene, fog, lights, starts, photons, j, photon, target, there)
-    return moved, t1, r, good & (photon.medium == B.medium)
+def inside_of(base: Piece) -> mi.Bool:
+    """Whether a piece goes through a medium."""
+    return base.alive & (base.medium != None)  # noqa: E711 - an array of pointers
 
 
 @dataclass
-class Both:
-    """Photons on surfaces, and photons in media."""
+class InMedia:
+    """``Near``, of photons in media where they are gathered near to points or beside rays: what both have in common.
 
-    on_surfaces: Near | None
-    in_media: Any
+    The receivers ``near()`` know whether a photon is near, and the ``image()`` of its place near to another.
+    """
+
+    paths: LightPaths
+    Φ: mi.Spectrum  # what counts of each photon's power
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float  # of the kernel, over N
+
+    def thing(self, place: mi.UInt32) -> Photon:
+        photon = photon_of(self.paths.photons, dr.gather(mi.UInt32, self.grid.index, place))
+        photon.Φ = dr.gather(mi.Spectrum, self.Φ, photon.place)
+        return photon
+
+    def brought(self, photon: Photon, A, active: mi.Bool) -> tuple[mi.Spectrum, mi.Float]:
+        t, near = A.near(photon.p, self.radius2)
+        return A.light(photon, t, near & active & (photon.medium == A.medium)) * self.K, t
+
+    def shared(self, photon: Photon, met: mi.Float, B, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        receives = lit & B.alive & (photon.medium == B.medium)
+        t, shared = B.near(photon.p, self.radius2)
+        shared &= receives
+        apart = receives & ~shared & self.paths.shifts(photon.place) & B.reaches(met)
+        return B.light(photon, t, shared) * self.K, apart
+
+    def copied(self, world: World, photon: Photon, A, B) -> tuple[mi.Spectrum, mi.Float]:
+        moved, t, r, good = copy_beside(world, self.paths, photon, A, B, self.radius2)
+        return B.light(moved, t, good) * self.K, r
 
 
-class GBRE(BRE):
+def copy_beside(world: World, paths: LightPaths, photon: Photon, A, B, radius2: mi.Float) -> tuple:
+    """(copy, t', r, whether it exists) of the ``photon`` that is gathered at A and not at B."""
+    target = A.image(photon.p, B)
+    t, there = B.near(target, radius2)
+    # At A it would be gathered as it is, not as a copy: the shift back would be another.
+    there &= ~A.near(target, radius2)[1]
+    moved, r, good = copy_in_medium(world, paths, photon, target, there)
+    return moved, t, r, good & (photon.medium == B.medium)
+
+
+class AlongPieces(InMedia):
+    """``Near``: the photons of a map in media, beside rays."""
+
+    def __init__(self, traced: Traced):
+        photons, radius = traced.photons, traced.radius()
+        grid = Grid(photons.p, in_media(photons), BALL * radius)
+        K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
+        super().__init__(LightPaths(traced.starts, photons), photons.β, grid, dr.opaque(mi.Float, radius**2), K)
+
+    def where(self, world: World, base: Piece) -> tuple[Rays, mi.Bool]:
+        return Rays(mi.Ray3f(base.ray.o, base.ray.d), base.length()), inside_of(base)
+
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
+        return beside_of(paths, which, index)
+
+
+class GBRE(PhotonIntegrator):
     """Gradients of the beam radiance estimate in homogeneous media, and of photons on surfaces.
 
     Plugin ``gbre``. Parameters are those of ``gpm``; bias and what is not handled are those of ``bre``.
     """
 
-    name = "gbre"
-    grids = False
-    pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
-
-    def prepare(self, scene) -> SamplePass:
-        return with_media(super().prepare(scene), self)
+    name, walk = "gbre", PathsByPieces
+    sees_media, instead_of_media, map_bytes = True, "gpm", MEDIA_MAP_BYTES
+    camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(self, passes, camera, film)
-
-    def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
-        near = starts, photons, self.radius * passes.width * shrunk(number), paths
-        yield Both(Near(*near), AlongPieces(*near))
-
-    def levels(self, passes: Passes, random, rays: list) -> Iterator:
-        paths = passes.world.materials, random, rays, self.first_surface, self.hide_emitters
-        return levels_in_media(passes.world.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
-
-    def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
-        if not level.first:
-            pieces = level.depth, level.base, level.offsets
-            add_to(sums, level.lanes, passes.frozen(emitted_later, passes.world.scene, self.fog, *pieces))
-            return mi.Spectrum(0)
-        return passes.frozen(self.seen_directly, passes.world.scene, level.base, fixed=True)
-
-    def seen_directly(self, scene, base: Piece) -> mi.Spectrum:
-        """Lamps as seen through media."""
-        ray = mi.Ray3f(base.ray)
-        return base.β * self.lamps_in_fog(scene, self.fog.media, ray, self.fog.within, mi.UInt32(0))
-
-    def parts(self, passes: Passes, near, level: Level, most: int) -> Iterator[list]:
-        longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
-        base, *offsets = passes.frozen(ends, self.fog, level.base, level.offsets)
-        dr.eval(longest, base, offsets)
-        if near.on_surfaces is not None:
-            yield from differences(passes, near.on_surfaces, base, offsets, longest, most)
-        yield from differences(passes, near.in_media, level.base, level.offsets, longest, most)
+        gradient_pass(passes, camera, film, near_pieces, PAIRS)
 
 
-def with_media(passes: Passes, integrator) -> Passes:
-    """The ``passes``; raises NgptError where there are no media."""
-    if integrator.fog is None:
-        raise NgptError(f"sampler '{integrator.name}' cannot render this scene: there are no media; use --sampler gpm")
-    return passes
-
-
-def emitted_later(scene, fog, depth: mi.UInt32, base: Piece, offsets: list) -> list:
-    """What ``emitted`` has, of paths that have met a vertex."""
-    paths = ends(fog, base, offsets)
-    for path in paths:
-        path.alive &= depth > 1
-    return emitted(scene, paths[0], paths[1:])
+def near_pieces(passes: Passes, traced: Traced) -> Iterator[Gathered]:
+    yield Gathered(OnSurfaces(traced), AlongPieces(traced))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

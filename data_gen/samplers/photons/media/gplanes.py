@@ -19,25 +19,27 @@ of the plane, and is not J: J is checked by finite differences]
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera_in_media import Piece
-from data_gen.samplers.photons.gradients.differences import difference
-from data_gen.samplers.photons.gradients.pairs import Pairs
+from data_gen.samplers.photons.gradients.camera_in_media import PathsByPieces, Piece
+from data_gen.samplers.photons.gradients.differences import Gathered, gradient_pass
+from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
 from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbeams import GBEAMS
-from data_gen.samplers.photons.media.gbre import Beside, Both, beside_of
+from data_gen.samplers.photons.media.gbeams import CAMERA_BYTES, MAP_BYTES, PAIRS, near_beams
+from data_gen.samplers.photons.media.gbre import Beside, beside_of, inside_of
 from data_gen.samplers.photons.media.planes import (
     PLANE_BYTES,
     AcrossPlanes,
@@ -67,40 +69,35 @@ class RaysAcrossPlanes:
 
 @dataclass
 class NearPlanes:
-    """The planes of a map, each of which may be met by each ray: no grid, no radius."""
+    """``Near``: the planes of a map, each of which may be met by each ray: no grid, no radius."""
 
     planes: AcrossPlanes
     grid: None = None
     radius2: None = None
 
-    def where(self, materials, base: Piece) -> tuple[RaysAcrossPlanes, mi.Bool]:
-        """The pieces of base paths, and whether there is a medium."""
-        ray, inside = mi.Ray3f(base.ray.o, base.ray.d), base.medium != None  # noqa: E711 - an array of pointers
-        return RaysAcrossPlanes(ray, base.length(), self.planes), base.alive & inside
+    def where(self, world: World, base: Piece) -> tuple[RaysAcrossPlanes, mi.Bool]:
+        return RaysAcrossPlanes(mi.Ray3f(base.ray.o, base.ray.d), base.length(), self.planes), inside_of(base)
 
-    def of_pairs(self, materials, pairs: Pairs, base: Piece, offsets: list, longest: mi.UInt32) -> tuple:
-        """Of each pair C, four Δ without a copy, and counts; and where a copy is to be looked for."""
-        A, plane = beside_of([base], None, pairs.point), self.planes.plane(pairs.place)
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> Beside:
+        return beside_of(paths, which, index)
+
+    def thing(self, place: mi.UInt32) -> Any:
+        return self.planes.plane(place)
+
+    def brought(self, plane, A: Beside, active: mi.Bool) -> tuple[mi.Spectrum, Crossing]:
         at = crossing(plane.a, plane.d, plane.e, A.o, A.d)
-        short = plane.depth <= dr.gather(mi.UInt32, longest, pairs.point)
-        C = self.light(plane, at, A, A.alive & short) / dr.abs(at.volume)
-        C = dr.select(dr.isfinite(dr.sum(C)), C, 0)
-        lit, none = dr.max(C) > 0, mi.Spectrum(0)
-        Δ = [difference(C, none, mi.Float(1)) for _ in offsets]
-        others = [beside_of([offset], None, pairs.point) for offset in offsets]
-        apart = [lit & B.alive & (B.medium != None) & (at.u < B.length) for B in others]  # noqa: E711
-        return [C, *Δ, mi.Point2f(dr.select(lit, len(SHIFTS), 0), 0)], apart
+        C = self.light(plane, at, A, A.alive & active) / dr.abs(at.volume)
+        return dr.select(dr.isfinite(dr.sum(C)), C, 0), at
 
-    def of_copies(
-        self, scene, lights, materials, fog, pairs: Pairs, some: mi.UInt32, which: mi.UInt32, base, offsets: list, C
-    ) -> mi.Spectrum:
-        """Δ by the shift of number ``which`` of ``some`` pairs."""
-        point, place = (dr.gather(mi.UInt32, index, some) for index in (pairs.point, pairs.place))
-        A, B, plane = beside_of([base], None, point), beside_of(offsets, which, point), self.planes.plane(place)
+    def shared(self, plane, met: Crossing, B: Beside, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        """No plane is its own copy."""
+        inside = B.medium != None  # noqa: E711 - an array of pointers
+        return mi.Spectrum(0), lit & B.alive & inside & (met.u < B.length)
+
+    def copied(self, world: World, plane, A: Beside, B: Beside) -> tuple[mi.Spectrum, mi.Float]:
         at = crossing(plane.a, plane.d, plane.e, A.o, A.d)
         moved, there, per_volume, r, good = copied(plane, at, B)
-        C1 = self.light(moved, there, B, good) * per_volume
-        return difference(dr.gather(mi.Spectrum, C, some), C1, r)
+        return self.light(moved, there, B, good) * per_volume, r
 
     def light(self, plane, at: Crossing, ray: Beside, active) -> mi.Spectrum:
         """What a plane brings to a ray, times |d · (e × w)|."""
@@ -121,27 +118,27 @@ def copied(plane, at: Crossing, B: Beside) -> tuple:
     # The phase function where the edge scatters, from either direction to the other
     phase, seen = plane.medium.phase_function(), seen_along(mi.Ray3f(plane.a, plane.d), plane.medium)
     (f, p), (f1, p1) = (phase.eval_pdf(mi.PhaseFunctionContext(), seen, to) for to in (plane.e, e))
-    known = plane.a, plane.d, e, plane.length, plane.Φ * (f1 / f), plane.σ, plane.medium, plane.depth
     good = B.alive & (at.u < B.length) & (s > 0) & (s < plane.length) & (t > 0)
-    return type(plane)(*known), there, J / dr.abs(there.volume), J * p1 / p, good
+    return replace(plane, e=e, Φ=plane.Φ * (f1 / f)), there, J / dr.abs(there.volume), J * p1 / p, good
 
 
-class GPLANES(GBEAMS):
+class GPLANES(PhotonIntegrator):
     """Gradients of photon planes in homogeneous media, and of beams and photons on surfaces.
 
     Plugin ``gplanes``. Parameters are those of ``gpm``, and ``planes``; see there for bias and what is not handled.
     """
 
-    name = "gplanes"
-    map_bytes = GBEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
+    name, walk = "gplanes", PathsByPieces
+    sees_media, instead_of_media, edges = True, "gpm", True
+    map_bytes, camera_bytes = MAP_BYTES + VERTICES_PER_PATH * PLANE_BYTES, CAMERA_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.planes = self.options["planes"]
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        gradient_pass(passes, camera, film, near_planes, PAIRS)
 
-    def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
-        yield from super().gathered(passes, starts, only_beams(photons), number, paths)
-        yield Both(None, NearPlanes(planes_of(passes, photons, paths)))
+
+def near_planes(passes: Passes, traced: Traced) -> Iterator[Gathered]:
+    yield from near_beams(passes, only_beams(traced))
+    yield Gathered(None, NearPlanes(planes_of(passes, traced)))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

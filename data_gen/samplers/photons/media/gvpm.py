@@ -28,30 +28,22 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightRay
-from data_gen.paths.shift import gradient_weight
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.gradients import shift
-from data_gen.samplers.photons.gradients.camera import Path
-from data_gen.samplers.photons.gradients.camera_segments import Flight, FlightLevel, levels_by_segments
-from data_gen.samplers.photons.gradients.differences import (
-    PAIR_BYTES,
-    PAIRS,
-    Near,
-    add_to,
-    chosen,
-    differences,
-    emitted,
-    gradient_pass,
-)
+from data_gen.samplers.photons.gradients.camera_segments import Flight, PathsBySegments
+from data_gen.samplers.photons.gradients.copies import LightPaths
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
 from data_gen.samplers.photons.gradients.pairs import Points
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon
-from data_gen.samplers.photons.map.radius import shrunk
+from data_gen.samplers.photons.map.vertices import in_media
 from data_gen.samplers.photons.media.bre import seen_along
-from data_gen.samplers.photons.media.gbre import PATHS_BYTES, AlongPieces, Both, with_media
-from data_gen.samplers.photons.media.vpm import VPM
+from data_gen.samplers.photons.media.gbre import PATHS_BYTES, InMedia
 from data_gen.samplers.photons.passes import Passes
+from data_gen.samplers.photons.surfaces.gpm import OnSurfaces
 
 
 @dataclass
@@ -96,78 +88,39 @@ def fields_of(path: Flight, index: mi.UInt32) -> tuple:
     return o + d * dr.gather(mi.Float, path.hit.t, index), d, *known
 
 
-class InBalls(AlongPieces):
-    """The photons of a map in media, where they are gathered near to points, and where their light paths start."""
+class InBalls(InMedia):
+    """``Near``: the photons of a map in media, near to points."""
 
-    receivers = staticmethod(ball_of)
+    def __init__(self, fog: Fog, traced: Traced):
+        photons, radius, Φ = traced.photons, traced.radius(3), fog.power(traced.photons)
+        dr.eval(Φ)
+        K = dr.opaque(mi.Float, 1 / (4 / 3 * np.pi * radius**3 * traced.paths))
+        grid = Grid(photons.p, in_media(photons), radius)
+        super().__init__(LightPaths(traced.starts, photons), Φ, grid, dr.opaque(mi.Float, radius**2), K)
 
-    def __init__(self, fog: Fog, starts: LightRay, photons, radius: float, paths: int):
-        super().__init__(starts, photons, radius, paths)
-        self.Φ = fog.power(photons)
-        dr.eval(self.Φ)
-
-    @staticmethod
-    def kernel(radius: float) -> tuple[float, float]:
-        return radius, 4 / 3 * np.pi * radius**3
-
-    def where(self, materials, base: Flight) -> tuple[Points, mi.Bool]:
-        """Where base paths scatter, and whether they do."""
+    def where(self, world: World, base: Flight) -> tuple[Points, mi.Bool]:
         return Points(base.ray(base.hit.t)), base.alive & base.scatters
 
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> InBall:
+        return ball_of(paths, which, index)
 
-class GVPM(VPM):
+
+class GVPM(PhotonIntegrator):
     """Gradients of photons in media and on surfaces.
 
     Plugin ``gvpm``. Parameters are those of ``gpm``; bias and what is not handled are those of ``vpm``.
     """
 
-    name = "gvpm"
-    pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
-
-    def prepare(self, scene) -> SamplePass:
-        return with_media(super().prepare(scene), self)
+    name, walk = "gvpm", PathsBySegments
+    sees_media, grids, instead_of_media, map_bytes = True, True, "gpm", MEDIA_MAP_BYTES
+    camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        gradient_pass(self, passes, camera, film)
-
-    def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
-        radius = self.radius * passes.width
-        on_surfaces = Near(starts, photons, radius * shrunk(number), paths)
-        yield Both(on_surfaces, InBalls(self.fog, starts, photons, radius * shrunk(number, 3), paths))
-
-    def levels(self, passes: Passes, random, rays: list) -> Iterator:
-        paths = passes.world.materials, random, rays, self.first_surface, self.behind_grids, self.hide_emitters
-        return levels_by_segments(passes.world.scene, self.fog, *paths, self.max_depth, self.rr_depth, passes.frozen)
-
-    def met(self, passes: Passes, level: FlightLevel, sums: list) -> mi.Spectrum:
-        if not level.first:
-            add_to(sums, level.lanes, passes.frozen(emitted, passes.world.scene, level.base, level.offsets))
-            return mi.Spectrum(0)
-        if level.behind:
-            add_to(sums, level.lanes, passes.frozen(differences_behind, level.behind, level.offsets))
-        return passes.frozen(self.seen_directly, passes.world.scene, *level.camera, fixed=True)
-
-    def seen_directly(self, scene, ray: mi.Ray3f, importance) -> mi.Spectrum:
-        """Lamps as seen through media."""
-        return importance * self.lamps_in_fog(scene, self.fog.media, ray, self.fog.within, mi.UInt32(0))
-
-    def parts(self, passes: Passes, near: Both, level: FlightLevel, most: int) -> Iterator[list]:
-        longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
-        base, *offsets = passes.frozen(ends, level.base, level.offsets)
-        dr.eval(longest, base, offsets)
-        yield from differences(passes, near.on_surfaces, base, offsets, longest, most)
-        yield from differences(passes, near.in_media, level.base, level.offsets, longest, most)
+        gradient_pass(passes, camera, film, near_points, PAIRS)
 
 
-def differences_behind(behind: list, offsets: list[Flight]) -> list:
-    """Of what paths have seen behind grids, that of base paths and its four Δ."""
-    C, *others = behind
-    return [C, *(gradient_weight(mi.Float(1), y.alive) * (C1 - C) for y, C1 in zip(offsets, others, strict=True))]
-
-
-def ends(base: Flight, offsets: list[Flight]) -> list[Path]:
-    """All paths where they end at a surface, or nowhere."""
-    return [path.on_surface() for path in (base, *offsets)]
+def near_points(passes: Passes, traced: Traced) -> Iterator[Gathered]:
+    yield Gathered(OnSurfaces(traced), InBalls(passes.world.fog, traced))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

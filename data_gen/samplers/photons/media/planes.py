@@ -32,13 +32,16 @@ from typing import Any, get_type_hints
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import media, segments
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.trace import VERTICES_PER_PATH
-from data_gen.samplers.photons.media.beams import BEAMS
-from data_gen.samplers.photons.media.bre import Both, seen_along
+from data_gen.samplers.photons.media.beams import BEAMS, among_beams
+from data_gen.samplers.photons.media.bre import Along, by_pieces, media_pass, seen_along
 from data_gen.samplers.photons.passes import Passes
 
 # Of a plane, and of the edge of a map that it may be swept from
@@ -90,8 +93,7 @@ def crossing(a, d, e, o, w) -> Crossing:
 class AcrossPlanes:
     """Photon planes, where rays meet them."""
 
-    scene: mi.Scene
-    fog: Fog
+    world: World
     planes: Any
     number: mi.UInt32
     max_depth: mi.UInt32
@@ -139,8 +141,8 @@ class AcrossPlanes:
     def transmitted(self, plane, at: Crossing, medium: mi.MediumPtr, active) -> mi.Spectrum:
         """T(s) T(t) of planes; 0 where anything is in the way, or x would be in another ``medium``."""
         ray = media.shortened(mi.Ray3f(plane.a + plane.d * at.s, plane.e), at.t)
-        trace = segments.next_surface(self.scene)
-        τ, met, _, there = segments.cross(self.fog.media.passes, trace, ray, plane.medium, at.t, active)
+        trace = segments.next_surface(self.world.scene)
+        τ, met, _, there = segments.cross(self.world.fog.media.passes, trace, ray, plane.medium, at.t, active)
         return dr.select(active & ~met.is_valid() & (there == medium), dr.exp(-plane.σ * at.s - τ), 0)
 
 
@@ -158,34 +160,35 @@ def after_scattering(photons) -> mi.Bool:
     return later & (dr.squared_norm(parent) == 0)
 
 
-def only_beams(photons):
+def only_beams(traced: Traced) -> Traced:
     """The map, whose edges are those alone that no plane ends with."""
+    photons = traced.photons
     others = replace(photons, bounce=dr.select(after_scattering(photons), 0, photons.bounce))
     dr.eval(others.bounce)
-    return others
+    return replace(traced, photons=others)
 
 
-def planes_of(passes: Passes, photons, paths: int) -> AcrossPlanes:
-    """Those of some light paths of a map, of a pass of so many ``paths``; and one that nothing meets if there is none.
+def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
+    """Those of some light paths of a map; and one that nothing meets if there is none.
 
     Paths are as good as each other, so every k-th stands for k. Further maps are of fewer paths.
     """
-    integrator, kind = passes.integrator, planes_class(mi.variant())
-    lanes = len(photons) // VERTICES_PER_PATH
-    k = (lanes + integrator.planes - 1) // integrator.planes
+    integrator, photons, kind = passes.integrator, traced.photons, planes_class(mi.variant())
+    lanes, most = len(photons) // VERTICES_PER_PATH, integrator.options["planes"]
+    k = (lanes + most - 1) // most
     taken = (lanes + k - 1) // k
     slot = dr.arange(mi.UInt32, taken * VERTICES_PER_PATH)
     slot += (slot // VERTICES_PER_PATH) * ((k - 1) * VERTICES_PER_PATH)
     edges = dr.gather(mi.UInt32, slot, dr.compress(dr.gather(mi.Bool, after_scattering(photons), slot)))
     number = dr.width(edges)
     if number:
-        weight = dr.opaque(mi.Float, lanes / (taken * paths))
+        weight = dr.opaque(mi.Float, lanes / (taken * traced.paths))
         planes = passes.frozen(swept, passes.world.scene, photons, edges, weight)
     else:
         planes = kind(*(dr.zeros(t, 1) for t in get_type_hints(kind).values()))
     dr.eval(planes)
-    counts = dr.opaque(mi.UInt32, number), dr.opaque(mi.UInt32, integrator.max_depth)
-    return AcrossPlanes(passes.world.scene, integrator.fog, planes, *counts)
+    counts = dr.opaque(mi.UInt32, number), dr.opaque(mi.UInt32, integrator.limits.max_depth)
+    return AcrossPlanes(passes.world, planes, *counts)
 
 
 def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
@@ -208,7 +211,7 @@ def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
     )
 
 
-class PLANES(BEAMS):
+class PLANES(PhotonIntegrator):
     """Photon planes for light scattered in homogeneous media twice or more, beams and photons for the rest.
 
     Plugin ``planes``, without gradients. Parameters, and what is not handled, are those of ``beams``, and
@@ -219,16 +222,20 @@ class PLANES(BEAMS):
     """
 
     name = "planes"
-    grids = False
+    sees_media, edges = True, True
     map_bytes = BEAMS.map_bytes + VERTICES_PER_PATH * PLANE_BYTES
 
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        self.planes = self.options["planes"]
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        media_pass(self, passes, camera, film, among_planes)
 
-    def of_map(self, passes: Passes, photons, number: int, paths: int) -> Iterator[Both]:
-        yield from super().of_map(passes, only_beams(photons), number, paths)
-        yield Both(None, planes_of(passes, photons, paths))
+    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return by_pieces(self, *path)
+
+
+def among_planes(passes: Passes, traced: Traced) -> Iterator[Along]:
+    """What is near in a photon map: what ``among_beams`` has of other edges, and planes."""
+    yield from among_beams(passes, only_beams(traced))
+    yield Along(None, planes_of(passes, traced))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

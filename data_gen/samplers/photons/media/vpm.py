@@ -24,24 +24,22 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import media
-from data_gen.paths.light_ends import LightEnds
-from data_gen.paths.vertex import Materials
-from data_gen.paths.world import World
+from data_gen.paths.camera import CameraSamples
 from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.grid import Grid
-from data_gen.samplers.photons.map.radius import pixel_width, shrunk
-from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH
-from data_gen.samplers.photons.passes import Passes, refuse_variants
-from data_gen.samplers.photons.surfaces.ppm import PPM, Gathering
-from data_gen.scenes.facts import media_of
+from data_gen.samplers.photons.map.vertices import in_media
+from data_gen.samplers.photons.passes import Begun, Passes
+from data_gen.samplers.photons.surfaces.ppm import Gathering, by_vertices, image_pass
 
 
 @dataclass(init=False)
 class GatheringInMedia:
-    """The photons of a map in media, gathered within ``radius``; ``paths`` light paths have brought them."""
+    """The photons of a map where they are gathered in media; for paths of at most ``max_depth`` edges."""
 
     photons: Any
     Φ: mi.Spectrum
@@ -50,13 +48,13 @@ class GatheringInMedia:
     K: mi.Float
     max_depth: mi.UInt32
 
-    def __init__(self, fog: Fog, photons, radius: float, paths: int, max_depth: int):
-        self.photons, self.Φ = photons, fog.power(photons)
+    def __init__(self, fog: Fog, traced: Traced, max_depth: int):
+        self.photons, radius = traced.photons, traced.radius(3)
+        self.Φ = fog.power(self.photons)
         dr.eval(self.Φ)
-        scattered = (photons.depth > 0) & (dr.squared_norm(photons.n) == 0)
-        self.grid = Grid(photons.p, scattered, radius)
+        self.grid = Grid(self.photons.p, in_media(self.photons), radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
-        self.K = dr.opaque(mi.Float, 1 / (4 / 3 * np.pi * radius**3 * paths))
+        self.K = dr.opaque(mi.Float, 1 / (4 / 3 * np.pi * radius**3 * traced.paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, x: mi.SurfaceInteraction3f, place: media.Place, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
@@ -77,7 +75,7 @@ class GatheringInMedia:
 
 
 @dataclass
-class Both:
+class InBoth:
     """Photons on surfaces, and photons in media."""
 
     on_surfaces: Gathering
@@ -89,7 +87,7 @@ class Both:
         return L + self.on_surfaces.light(x, place, bsdf, depth, active & ~place.scatters)
 
 
-class VPM(PPM):
+class VPM(PhotonIntegrator):
     """Progressive photon mapping in media and on surfaces; no gradients.
 
     Plugin ``vpm``. Parameters are those of ``ppm``; the ``radius`` of the first pass is that of photons in media, too.
@@ -100,27 +98,19 @@ class VPM(PPM):
     """
 
     name = "vpm"
-    grids = True  # whether media may have a density that varies
-    # Two words more for each vertex; and two for each light path
-    map_bytes = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
+    sees_media, grids, map_bytes = True, True, MEDIA_MAP_BYTES
 
-    def prepare(self, scene) -> SamplePass:
-        refuse_variants(self.name)
-        lights = LightEnds(scene, self.name)
-        self.fog = Fog(scene, lights, self.name, self.grids) if media_of(scene) else None
-        if self.fog and self.fog.media.grids:
-            # Null collisions of each vertex, twice; and Φ / σs
-            self.map_bytes = type(self).map_bytes + VERTICES_PER_PATH * (3 + 3 + 3) * 4
-        passed = media.index_matched if self.fog else lambda shape: False
-        materials = Materials(scene, self.threshold, passed, media=self.fog is not None)
-        return Passes(self, World(scene, lights, materials, self.fog), pixel_width(scene))
+    def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
+        begun = Begun.of(passes, camera)
+        maps = self.maps(passes, begun.keys, camera.first)
+        image_pass(passes, begun, (self.near(passes.world.fog, traced) for traced in maps), self.light, film)
 
-    def gathering(self, photons, width: float, number: int, paths: int):
-        on_surfaces = super().gathering(photons, width, number, paths)
-        if self.fog is None:
-            return on_surfaces
-        radius = self.radius * width * shrunk(number, 3)
-        return Both(on_surfaces, GatheringInMedia(self.fog, photons, radius, paths, self.max_depth))
+    def near(self, fog: Fog | None, traced: Traced) -> Gathering | InBoth:
+        on_surfaces = Gathering(traced, self.limits.max_depth)
+        return InBoth(on_surfaces, GatheringInMedia(fog, traced, self.limits.max_depth)) if fog else on_surfaces
+
+    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return by_vertices(self, *path)
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

@@ -20,35 +20,91 @@ section 4.3; Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Esti
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightRay
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
-from data_gen.samplers.photons.gradients.camera import Level, levels
-from data_gen.samplers.photons.gradients.camera import Path as CameraPath
-from data_gen.samplers.photons.gradients.differences import (
-    PAIR_BYTES,
-    PAIRS,
-    Near,
-    add_to,
-    differences,
-    emitted,
-    gradient_pass,
-)
-from data_gen.samplers.photons.map.radius import shrunk
+from data_gen.samplers.photons.gradients.camera import CameraPaths, Path
+from data_gen.samplers.photons.gradients.copies import LightPaths, copy
+from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
+from data_gen.samplers.photons.gradients.pairs import Points
+from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.map.grid import Grid
+from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_of
+from data_gen.samplers.photons.map.vertices import on_surfaces
 from data_gen.samplers.photons.passes import Passes
-from data_gen.samplers.photons.surfaces.ppm import PPM
 
 # Of a camera sample beside that: levels of five paths with their rays, hits and throughputs, and as many sums
 PATHS_BYTES = 3072
 
 
-class GPM(PPM):
+@dataclass
+class AtVertex:
+    """A vertex of a camera path."""
+
+    x: mi.SurfaceInteraction3f
+    β: mi.Spectrum
+    receives: mi.Bool  # photons
+
+
+@dataclass(init=False)
+class OnSurfaces:
+    """``Near``: the photons of a map on surfaces, and where their light paths come from."""
+
+    paths: LightPaths
+    grid: Grid
+    radius2: mi.Float
+    K: mi.Float  # of the kernel, over N
+
+    def __init__(self, traced: Traced):
+        self.paths, radius = LightPaths(traced.starts, traced.photons), traced.radius()
+        self.grid = Grid(traced.photons.p, on_surfaces(traced.photons), radius)
+        self.radius2 = dr.opaque(mi.Float, radius**2)
+        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
+
+    def where(self, world: World, base: Path) -> tuple[Points, mi.Bool]:
+        x = base.vertex()
+        return Points(mi.Point3f(x.p)), base.alive & x.is_valid() & world.materials.connectable(x.bsdf())
+
+    def receiver(self, world: World, paths: list, which: mi.UInt32 | None, index: mi.UInt32) -> AtVertex:
+        o, d, hit, β, alive = chosen(fields_of, paths, which, index)
+        x = hit.compute_surface_interaction(mi.Ray3f(o, d))
+        return AtVertex(x, β, alive & x.is_valid() & world.materials.connectable(x.bsdf()))
+
+    def thing(self, place: mi.UInt32) -> Photon:
+        return photon_of(self.paths.photons, dr.gather(mi.UInt32, self.grid.index, place))
+
+    def brought(self, photon: Photon, A: AtVertex, active: mi.Bool) -> tuple[mi.Spectrum, None]:
+        return self.light(photon, A, active & is_near(photon, A.x, self.radius2)), None
+
+    def shared(self, photon: Photon, met: None, B: AtVertex, lit: mi.Bool) -> tuple[mi.Spectrum, mi.Bool]:
+        receives = lit & B.receives
+        shared = receives & is_near(photon, B.x, self.radius2)
+        return self.light(photon, B, shared), receives & ~shared & self.paths.shifts(photon.place)
+
+    def copied(self, world: World, photon: Photon, A: AtVertex, B: AtVertex) -> tuple[mi.Spectrum, mi.Float]:
+        everywhere = dr.full(mi.Bool, True, dr.width(photon.place))
+        moved, r, good = copy(world, self.paths, photon, (A.x, B.x), self.radius2, everywhere)
+        return self.light(moved, B, good), r
+
+    def light(self, photon: Photon, at: AtVertex, active: mi.Bool) -> mi.Spectrum:
+        return at.β * light(photon, at.x, at.x.bsdf(), active) * self.K
+
+
+def fields_of(path: Path, index: mi.UInt32) -> tuple:
+    o, d = dr.gather(mi.Point3f, path.ray.o, index), dr.gather(mi.Vector3f, path.ray.d, index)
+    hit, β = dr.gather(mi.PreliminaryIntersection3f, path.hit, index), dr.gather(mi.Spectrum, path.β, index)
+    return o, d, hit, β, dr.gather(mi.Bool, path.alive, index)
+
+
+class GPM(PhotonIntegrator):
     """Gradient-domain photon mapping on surfaces.
 
     Plugin ``gpm``. Parameters are those of ``ppm``, and
@@ -59,35 +115,15 @@ class GPM(PPM):
     Not handled: what ``ppm`` does not handle. Photons that come through glass have no copies but themselves.
     """
 
-    name = "gpm"
-    pairs, camera_bytes = PAIRS, PATHS_BYTES + PAIRS * PAIR_BYTES
-
-    def gathered(self, passes: Passes, starts: LightRay, photons, number: int, paths: int) -> Iterator:
-        """What is near in the map ``photons`` of pass ``number``, of so many light paths that begin at ``starts``."""
-        yield Near(starts, photons, self.radius * passes.width * shrunk(number), paths)
+    name, walk = "gpm", CameraPaths
+    camera_bytes = PATHS_BYTES + PAIRS * PAIR_BYTES
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """One photon map, and one camera path and its four shifts for each camera sample, of which a pixel has one."""
-        gradient_pass(self, passes, camera, film)
+        gradient_pass(passes, camera, film, near_surfaces, PAIRS)
 
-    def levels(self, passes: Passes, random, rays: list) -> Iterator[Level]:
-        """The camera paths that begin with ``rays``, level after level."""
-        paths = passes.world.materials, random, rays, self.first_hit, self.hide_emitters
-        return levels(passes.world.scene, *paths, self.max_depth, self.rr_depth, passes.frozen)
 
-    def met(self, passes: Passes, level: Level, sums: list) -> mi.Spectrum:
-        """What is seen directly, at the first level; emission that paths meet at others is added to the ``sums``."""
-        if not level.first:
-            add_to(sums, level.lanes, passes.frozen(emitted, passes.world.scene, level.base, level.offsets))
-        elif self.max_depth > 0:
-            return passes.frozen(CameraPath.emission, level.base, passes.world.scene, fixed=True)
-        return mi.Spectrum(0)
-
-    def parts(self, passes: Passes, near, level: Level, most: int) -> Iterator[list]:
-        """Of the photons ``near`` a level's paths, the differences."""
-        longest = dr.opaque(mi.UInt32, self.max_depth) - level.depth
-        dr.eval(longest)
-        yield from differences(passes, near, level.base, level.offsets, longest, most)
+def near_surfaces(passes: Passes, traced: Traced) -> Iterator[Gathered]:
+    yield Gathered(OnSurfaces(traced))
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

@@ -30,60 +30,50 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.segments import next_surface
 from data_gen.paths.spectrum import to_rgb
-from data_gen.paths.streams import sample_streams
-from data_gen.paths.vertex import NULL, SMOOTH, Materials, event_kind
+from data_gen.paths.vertex import SMOOTH, event_kind
+from data_gen.paths.walk import Sky, roulette
 from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
-from data_gen.samplers.common import GradientIntegrator, like_path
-from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import faces, light, photon_of
-from data_gen.samplers.photons.map.radius import pixel_width, shrunk
-from data_gen.samplers.photons.map.trace import MAP_BYTES, trace
-from data_gen.samplers.photons.passes import Passes, begin, refuse_variants
-
-# Of a camera sample and its features, beside the maps
-CAMERA_BYTES = 256
-# The streams of light paths are made from random numbers of the camera's samples and this.
-_LIGHT_PATHS = 0x9807
+from data_gen.samplers.photons.map.vertices import on_surfaces
+from data_gen.samplers.photons.passes import Begun, Passes, Start
 
 
 @dataclass(init=False)
 class Gathering:
-    """The photons of a map, where they are gathered within ``radius``; ``paths`` light paths have brought them."""
+    """The photons of a map, where they are gathered on surfaces; for paths of at most ``max_depth`` edges."""
 
     photons: Any
     grid: Grid
     radius2: mi.Float
-    K: mi.Float
+    K: mi.Float  # of the kernel, over N
     max_depth: mi.UInt32
 
-    def __init__(self, photons, radius: float, paths: int, max_depth: int):
-        self.photons = photons
-        on_surfaces = (photons.depth > 0) & (dr.squared_norm(photons.n) > 0)
-        self.grid = Grid(photons.p, on_surfaces, radius)
+    def __init__(self, traced: Traced, max_depth: int):
+        self.photons, radius = traced.photons, traced.radius()
+        self.grid = Grid(self.photons.p, on_surfaces(self.photons), radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
-        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * paths))
+        self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
         self.max_depth = dr.opaque(mi.UInt32, max_depth)
 
     def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
-        photons, longest = self.photons, self.max_depth - depth
+        longest = self.max_depth - depth
 
         def one(i, near):
-            j = dr.gather(mi.UInt32, self.grid.index, i, near)
-            photon = photon_of(photons, j, near)
-            near = near & faces(photon, si) & (dr.gather(mi.UInt32, photons.depth, j, near) <= longest)
-            return light(photon, si, bsdf, near)
+            photon = photon_of(self.photons, dr.gather(mi.UInt32, self.grid.index, i, near), near)
+            return light(photon, si, bsdf, near & faces(photon, si) & (photon.depth <= longest))
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         return self.K * self.grid.gather(si.p, self.radius2, active, one, zero)
 
 
-class PPM(GradientIntegrator):
+class PPM(PhotonIntegrator):
     """Progressive photon mapping on surfaces; no gradients.
 
     Plugin ``ppm``. Parameters, the first three as for Mitsuba's ``path``:
@@ -103,128 +93,93 @@ class PPM(GradientIntegrator):
     """
 
     name = "ppm"
-    camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
-    fog: Fog | None = None
-    edges = False  # whether photon maps have the edges of light paths, too
-
-    def __init__(self, props: mi.Properties):
-        super().__init__(props)
-        max_depth = props.get("max_depth", -1)
-        self.max_depth = max_depth if 0 <= max_depth < 0xFFFFFFFF else 0xFFFFFFFF
-        self.rr_depth = props.get("rr_depth", 5)
-        self.radius, self.photons = self.options["radius"], self.options["photons"]
-        self.threshold = self.options["roughness_threshold"]
-
-    @property
-    def lane_bytes(self) -> int:
-        """Of a camera sample, with all that its light paths may leave in a map."""
-        return self.camera_bytes + self.photons * self.map_bytes
-
-    def instead(self, lane_bytes: int) -> str:
-        """What else than a smaller image would fit into so many bytes for each camera sample."""
-        fits = (lane_bytes - self.camera_bytes) // self.map_bytes
-        return f", or no more than -O photons={fits}" if fits > 0 else ""
-
-    def prepare(self, scene) -> SamplePass:
-        refuse_variants(self.name)
-        world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
-        return Passes(self, world, pixel_width(scene))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
-        """One photon map, and one camera path for each camera sample, of which a pixel has one."""
-        ray, importance, random, keys, values = begin(passes, camera)
-        near = self.gatherings(passes, keys, camera.first)
-        # Emission that camera paths meet is counted with the first map, or without any.
-        paths = passes.world.scene, passes.world.materials, random, ray, importance
-        L, Le = passes.frozen(self.light, *paths, next(near, None), True, fixed=True)
-        values |= {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
-        dr.eval(values)
-        for scattered in near:
-            L, _ = passes.frozen(self.light, *paths, scattered, False, fixed=True)
-            values["primal"] += to_rgb(L, ray.wavelengths)
-            dr.eval(values["primal"])
-        film.put_all(values)
+        begun = Begun.of(passes, camera)
+        near = (Gathering(traced, self.limits.max_depth) for traced in self.maps(passes, begun.keys, camera.first))
+        image_pass(passes, begun, near, self.light, film)
 
-    def gatherings(self, passes: Passes, keys, number: int):
-        """What light is gathered from in each of the photon maps of pass ``number``."""
-        if passes.world.lights.emitters is not None and self.max_depth > 1:
-            _, maps = self.photon_maps(passes, keys)
-            for photons in maps:
-                yield self.gathering(photons, passes.width, number, self.photons * dr.width(keys[0]))
+    def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
+        return by_vertices(self, *path)
 
-    def gathering(self, photons, width: float, number: int, paths: int):
-        """The ``photons`` of pass ``number`` where they are gathered, of so many light paths."""
-        return Gathering(photons, self.radius * width * shrunk(number), paths, self.max_depth)
 
-    def photon_maps(self, passes: Passes, keys):
-        """The light's ends and the maps of a pass: of ``photons`` light paths for each lane of the ``keys``."""
-        n = dr.width(keys[0]) * self.photons
-        lane = dr.arange(mi.UInt32, n)
-        sample = lane // dr.opaque(mi.UInt32, self.photons)
-        key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
-        random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
-        receives, depths = passes.world.materials.connectable, (self.max_depth - 1, self.rr_depth)
-        edges = self.edges and self.fog is not None
-        return trace(passes.world.scene, passes.world.lights, random, receives, *depths, self.fog, passes.frozen, edges)
+def image_pass(passes: Passes, begun: Begun, near, light, film: GradientFilm) -> None:
+    """One photon map, of which ``near`` has what is gathered from, and one camera path for each camera sample.
 
-    def light(self, scene, materials, random, ray, importance, near, emission: bool):
-        """L and Le of camera paths, with what is gathered from photons ``near``, and with ``emission`` or without."""
-        scattered = near.light if near is not None else None
-        return self.camera_path(scene, materials, random.clone(), ray, importance, scattered, emission)
+    ``light`` (world, start, near, emission) is L and Le of camera paths, with what is gathered from
+    ``near``, and with the emission that they meet or without.
+    """
+    near, values, wavelengths = iter(near), begun.features, begun.start.ray.wavelengths
+    # Emission that camera paths meet is counted with the first map, or without any.
+    L, Le = passes.frozen(light, passes.world, begun.start, next(near, None), True, fixed=True)
+    values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
+    dr.eval(values)
+    for more in near:
+        L, _ = passes.frozen(light, passes.world, begun.start, more, False, fixed=True)
+        values["primal"] += to_rgb(L, wavelengths)
+        dr.eval(values["primal"])
+    film.put_all(values)
 
-    @dr.syntax
-    def camera_path(self, scene, materials, random, ray, importance, scattered, emission: bool):
-        """L of camera paths: where light is ``scattered``, and ``emission`` that they meet; and Le, seen directly.
 
-        ``scattered`` is called with (vertex, its place, its material, depth, where), unless it is None.
-        """
-        ray, fog = mi.Ray3f(ray), self.fog
-        # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
-        sky_seen = mi.Bool(not self.hide_emitters)
-        shown = mi.Bool(not self.hide_emitters and self.max_depth > 0)
-        β, η, depth = mi.Spectrum(importance), mi.Float(1), mi.UInt32(1)
+@dr.syntax
+def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, emission: bool) -> tuple:
+    """L of camera paths from vertex to vertex: what is gathered ``near``, ``emission`` that they meet; and Le.
+
+    ``near.light`` is called with (vertex, its place, its material, depth, where); or there is nothing near.
+    """
+    scene, fog, limits, random = world.scene, world.fog, integrator.limits, start.random.clone()
+    ray, importance = mi.Ray3f(start.ray), start.importance
+    connectable, gathered = world.materials.connectable, near.light if near is not None else None
+    sky = Sky.from_camera(limits.hide_emitters)
+    β, η = mi.Spectrum(importance), mi.Float(1)  # throughput, and the relative index of refraction up to the vertex
+    depth = mi.UInt32(1)  # edges up to the vertex si
+    # ------------------------- The first vertex --------------------------
+    if dr.hint(fog is not None, mode="scalar"):
+        channel, first = media.choose_channel(random.next_1d()), partial(integrator.first_surface, scene)
+        segment, si = fog.fly(first, ray, fog.within, channel, random, mi.Bool(True))
+        place, Le = segment.place, importance * integrator.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
+        β *= fog.brought(segment, channel)
+        L_first = β * integrator.behind_grids(scene, fog.media, segment)
+    else:
+        si, place, channel = integrator.first_hit(scene, ray).compute_surface_interaction(ray), None, None
+        Le, L_first = importance * si.emitter(scene).eval(si, mi.Bool(limits.shows)), 0
+    L = dr.zeros(mi.Spectrum, dr.width(ray)) + (L_first if emission else 0)
+    active = si.is_valid() & (depth < limits.max_depth)
+    while dr.hint(active, label="camera path"):
+        # ------------------ What is gathered at a vertex ------------------
+        bsdf = si.bsdf()
+        receives = active & connectable(bsdf)
         if dr.hint(fog is not None, mode="scalar"):
-            channel, first = media.choose_channel(random.next_1d()), partial(self.first_surface, scene)
-            segment, si = fog.fly(first, ray, fog.within, channel, random, mi.Bool(True))
-            place, Le = segment.place, importance * self.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
-            β *= fog.brought(segment, channel)
-            L_first = β * self.behind_grids(scene, fog.media, segment)
+            receives |= active & place.scatters
+        if dr.hint(gathered is not None, mode="scalar"):
+            L += β * gathered(si, place, bsdf, depth, receives)
+
+        # ------- The next direction: what scatters widely is gathered ------
+        u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
+        sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
+        kind = event_kind(sample.sampled_type)
+        found = active & (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
+        sky = sky.behind(kind, found)
+        η = dr.select(found, η * sample.eta, η)
+        β *= f_p
+        survival = roulette(dr.max(β), depth >= limits.rr_depth, η)
+        active = found & (dr.max(β) > 0) & (u_survival < survival)
+        β /= survival
+        depth += 1
+
+        # ------------------- The next vertex, its emission ----------------
+        onward = si.spawn_ray(si.to_world(sample.wo))
+        if dr.hint(fog is not None, mode="scalar"):
+            medium = place.toward(si, onward.d)
+            si, place, weight = fog.ahead(next_surface(scene), onward, medium, channel, random, active)
+            β *= weight
         else:
-            si, place, channel = self.first_hit(scene, ray).compute_surface_interaction(ray), None, None
-            Le, L_first = importance * si.emitter(scene).eval(si, shown), 0
-        L = dr.zeros(mi.Spectrum, dr.width(ray)) + (L_first if emission else 0)
-        active = si.is_valid() & (depth < self.max_depth)
-        while dr.hint(active, label="camera path"):
-            bsdf = si.bsdf()
-            receives = active & materials.connectable(bsdf)
-            if dr.hint(fog is not None, mode="scalar"):
-                receives |= active & place.scatters
-            if dr.hint(scattered is not None, mode="scalar"):
-                L += β * scattered(si, place, bsdf, depth, receives)
-            u_lobe, u_direction, u_survival = random.next_1d(), random.next_2d(), random.next_1d()
-            sample, f_p = bsdf.sample(context(RADIANCE), si, u_lobe, u_direction, active)
-            kind = event_kind(sample.sampled_type)
-            found = active & (sample.pdf > 0) & ((kind != SMOOTH) | ~receives)
-            sky_seen |= found & (kind != NULL)
-            η = dr.select(found, η * sample.eta, η)
-            β *= f_p
-            # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever.
-            survival = dr.select(depth < self.rr_depth, 1, dr.fmin(dr.max(β) * dr.square(η), 0.95))
-            active = found & (dr.max(β) > 0) & (u_survival < survival)
-            β /= survival
-            depth += 1
-            onward = si.spawn_ray(si.to_world(sample.wo))
-            if dr.hint(fog is not None, mode="scalar"):
-                medium = place.toward(si, onward.d)
-                si, place, weight = fog.ahead(next_surface(scene), onward, medium, channel, random, active)
-                β *= weight
-            else:
-                si = scene.ray_intersect(onward, active)
-            if dr.hint(emission, mode="scalar"):
-                met = active & (si.is_valid() | sky_seen)
-                L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
-            active &= si.is_valid() & (depth < self.max_depth)
-        return L, Le
+            si = scene.ray_intersect(onward, active)
+        if dr.hint(emission, mode="scalar"):
+            met = active & sky.meets(si)
+            L += dr.select(met, β * si.emitter(scene).eval(si, met), 0)
+        active &= si.is_valid() & (depth < limits.max_depth)
+    return L, Le
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

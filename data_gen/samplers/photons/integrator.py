@@ -1,0 +1,111 @@
+"""What all plugins by photons are: parameters, the world of a scene, and the photon maps of a pass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.passes import SamplePass
+from data_gen.paths import media
+from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.streams import sample_streams
+from data_gen.paths.vertex import Materials
+from data_gen.paths.world import World
+from data_gen.samplers.common import GradientIntegrator
+from data_gen.samplers.photons.map.fog import Fog
+from data_gen.samplers.photons.map.radius import pixel_width, shrunk
+from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, trace
+from data_gen.samplers.photons.passes import Passes, refuse_variants
+from data_gen.scenes.facts import media_of
+from ngpt.errors import NgptError
+
+# Of a camera sample and its features, beside the maps
+CAMERA_BYTES = 256
+# Of a map in media: two words more for each vertex, and two for each light path
+MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
+# More of it with grids: null collisions of each vertex, twice; and Φ / σs
+GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
+# The streams of light paths are made from random numbers of the camera's samples and this.
+_LIGHT_PATHS = 0x9807
+
+
+@dataclass
+class Traced:
+    """A photon map of a pass."""
+
+    photons: Any  # the record
+    starts: LightRay  # the light's end of each light path
+    paths: int  # light paths of the pass
+    number: int  # of the pass
+    first_radius: float  # that photons are gathered within in pass 0
+
+    def radius(self, dimension: int = 2) -> float:
+        """Of this pass, where photons are counted in so many dimensions."""
+        return self.first_radius * shrunk(self.number, dimension)
+
+
+class PhotonIntegrator(GradientIntegrator):
+    """Derived classes have ``sample_pass(passes, camera, film)``, and say what they need:
+
+    ``sees_media``    whether they render media, or surfaces alone
+    ``grids``         of media, also those whose density varies
+    ``edges``         photon maps have the edges of light paths, too, where there are media
+    ``camera_bytes``  that a camera sample takes
+    ``map_bytes``     that a map takes for each light path
+    ``instead_of_media``  the sampler to take where there are none, if those are not rendered
+    ``walk``          class of how camera paths go with those of the neighbours: ``gradients.camera.CameraPaths``
+    """
+
+    sees_media, grids, edges = False, False, False
+    camera_bytes, map_bytes = CAMERA_BYTES, MAP_BYTES
+    instead_of_media = ""
+    walk: type | None = None
+
+    def __init__(self, props: mi.Properties):
+        super().__init__(props)
+        self.photons = self.options["photons"]
+
+    @property
+    def lane_bytes(self) -> int:
+        """Of a camera sample, with all that its light paths may leave in a map."""
+        return self.camera_bytes + self.photons * self.map_bytes
+
+    def instead(self, lane_bytes: int) -> str:
+        """What else than a smaller image would fit into so many bytes for each camera sample."""
+        fits = (lane_bytes - self.camera_bytes) // self.map_bytes
+        return f", or no more than -O photons={fits}" if fits > 0 else ""
+
+    def prepare(self, scene) -> SamplePass:
+        refuse_variants(self.name)
+        lights = LightEnds(scene, self.name)
+        fog = Fog(scene, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
+        if fog is None and self.instead_of_media:
+            raise NgptError(
+                f"sampler '{self.name}' cannot render this scene: there are no media; "
+                f"use --sampler {self.instead_of_media}"
+            )
+        if fog and fog.media.grids:
+            self.map_bytes = type(self).map_bytes + GRID_BYTES
+        passed = {"passed": media.index_matched, "media": True} if fog else {}
+        materials = Materials(scene, self.options["roughness_threshold"], **passed)
+        world = World(scene, lights, materials, fog)
+        return Passes(self, world, pixel_width(scene), self.walk and self.walk(self, world))
+
+    def maps(self, passes: Passes, keys: tuple, number: int) -> Iterator[Traced]:
+        """The photon maps of pass ``number``: of ``photons`` light paths for each lane of the ``keys``."""
+        world, limits = passes.world, self.limits
+        if world.lights.emitters is None or limits.max_depth <= 1:
+            return
+        n = dr.width(keys[0]) * self.photons
+        lane = dr.arange(mi.UInt32, n)
+        sample = lane // dr.opaque(mi.UInt32, self.photons)
+        key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
+        random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
+        edges = self.edges and world.fog is not None
+        starts, maps = trace(world, random, limits.max_depth - 1, limits.rr_depth, frozen=passes.frozen, edges=edges)
+        for photons in maps:
+            yield Traced(photons, starts, n, number, self.options["radius"] * passes.width)
