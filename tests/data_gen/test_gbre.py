@@ -135,19 +135,21 @@ def assert_copies_are_light_paths(mi, name, receivers):
     from data_gen.paths.light_ends import LightEnds, LightRay
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
+    from data_gen.paths.world import World
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.gradients.copies import start_of
+    from data_gen.samplers.photons.gradients.copies import LightPaths, start_of
     from data_gen.samplers.photons.map.fog import Fog
     from data_gen.samplers.photons.map.photon import Photon, photon_of
-    from data_gen.samplers.photons.map.trace import trace, vertex_in_media_of
+    from data_gen.samplers.photons.map.trace import trace
+    from data_gen.samplers.photons.map.vertices import vertex_in_media_of
     from data_gen.samplers.photons.media.gbre import copy_beside
 
     scene = load(mi, getattr(media_scenes, name), (8, 8))
     lights, n = LightEnds(scene), 1 << 14
     ways = Fog(scene, lights, "gbre")
     random = sample_streams(0, dr.arange(mi.UInt32, n), mi.UInt32(0))
-    receives = Materials(scene, 0.05, media.index_matched, media=True).connectable
-    starts, maps = trace(scene, lights, random, receives, 6, 4, ways)
+    world = World(scene, lights, Materials(scene, 0.05, media.index_matched, media=True), ways)
+    starts, maps = trace(world, random, 6, 4)
     photons = next(maps)
     inside = (np.array(photons.depth) > 0) & (np.abs(np.array(photons.n)).sum(axis=0) == 0)
     rng = np.random.default_rng(0)
@@ -155,7 +157,7 @@ def assert_copies_are_light_paths(mi, name, receivers):
     photon = photon_of(photons, j)
     A, B, r2 = receivers(np.array(ways.eye), np.array(photon.p), dr.gather(mi.MediumPtr, photons.medium, j), rng)
     apart = A.near(photon.p, r2)[1] & ~B.near(photon.p, r2)[1]
-    moved, _, r, good = copy_beside(scene, ways, lights, starts, photons, j, photon, A, B, r2)
+    moved, _, r, good = copy_beside(world, LightPaths(starts, photons), photon, A, B, r2)
     good &= apart
 
     # The copy as a photon of its own, with what its predecessor has to say of it
@@ -188,10 +190,9 @@ def assert_copies_are_light_paths(mi, name, receivers):
     β = both(starts.β, dr.select(ratio > 0, turned.β / ratio, 0))
     kinds = (both(getattr(starts, field), getattr(start, field)) for field in ("emitter", "index"))
     more_starts = LightRay(way, β, *kinds, end, both(starts.delta, start.delta))
-    copied = Photon(moved.p, moved.n, moved.d, moved.Φ, photon.medium, photon.channel)
-    back, _, r_back, good_back = copy_beside(
-        scene, ways, lights, more_starts, more, lane + len(photons), copied, B, A, r2
-    )
+    place, of_media = lane + len(photons), {"medium": photon.medium, "channel": photon.channel}
+    copied = Photon(moved.p, moved.n, moved.d, moved.Φ, place, **of_media)
+    back, _, r_back, good_back = copy_beside(world, LightPaths(more_starts, more), copied, B, A, r2)
     # Of as many as may have one: light from mirrors is not here, walls and boundaries may be in the way.
     assert np.array(good).sum() > (0.7 if name == "nested" else 0.9) * np.array(apart).sum() > 300
     good, good_back = np.array(good), np.array(good_back)

@@ -83,10 +83,10 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
     made = find("gplanes").make(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
     lane = dr.arange(mi.UInt32, n)
     random = sample_streams(0, lane, mi.UInt32(0))
-    _, maps = made.integrator.photon_maps(made, (random.next_key(), random.next_key()))
-    planes = planes_of(made, next(maps), n).planes
+    traced = next(made.integrator.maps(made, (random.next_key(), random.next_key()), 0))
+    planes = planes_of(made, traced).planes
     k = len(planes)
-    eye = mi.Point3f(made.integrator.fog.eye)
+    eye = mi.Point3f(made.world.fog.eye)
     middle = rng.normal(size=(3, k)) * 0.4 - np.array(eye)
 
     def ray(spread):
@@ -114,13 +114,13 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
     assert np.allclose(np.array(back.Φ)[:, good], np.array(planes.Φ)[:, good], rtol=1e-2)
 
 
-def by_planes_alone(self, passes, starts, photons, number, paths):
-    """For ``GPLANES.gathered``."""
-    from data_gen.samplers.photons.media.gbre import Both
+def by_planes_alone(passes, traced):
+    """For ``near_planes``."""
+    from data_gen.samplers.photons.gradients.differences import Gathered
     from data_gen.samplers.photons.media.gplanes import NearPlanes
     from data_gen.samplers.photons.media.planes import planes_of
 
-    yield Both(None, NearPlanes(planes_of(passes, photons, paths)))
+    yield Gathered(None, NearPlanes(planes_of(passes, traced)))
 
 
 CASES = [("colours", 4), ("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
@@ -140,7 +140,7 @@ def test_differences_by_planes_are_those_of_the_image(renderer, name, pixels):
 def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
     from data_gen.samplers.photons.media import gplanes
 
-    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    monkeypatch.setattr(gplanes, "near_planes", by_planes_alone)
     stacks = passes(load(renderer, media_scenes.colours, (12, 12)), 32, 4, "gplanes", planes=144)
     assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
     assert_no_bias(stacks, 4)
@@ -155,7 +155,7 @@ def test_a_wrong_jacobian_of_planes_is_found(renderer, monkeypatch, wrong):
 
     if wrong:
         monkeypatch.setattr(shift, "jacobian_of_planes", lambda t, volume, t1, volume1: shift.dr.abs(volume1 / volume))
-    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    monkeypatch.setattr(gplanes, "near_planes", by_planes_alone)
     stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 64, 4, "gplanes", planes=144)
     if not wrong:
         assert_no_bias(stacks, 4)
@@ -193,7 +193,7 @@ def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):
     from data_gen.samplers.photons.media import gplanes
     from ngpt.io.exr import pass_through
 
-    monkeypatch.setattr(gplanes.GPLANES, "gathered", by_planes_alone)
+    monkeypatch.setattr(gplanes, "near_planes", by_planes_alone)
     scene = load(renderer, media_scenes.haze, (32, 32))
     failed = pass_through(render_stack(scene, 2, 0, "gplanes", diagnostics=True))["diagnostics.shiftFailures"]
     mean, median = gain(passes(scene, 8, 1, "gplanes"))

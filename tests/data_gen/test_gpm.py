@@ -121,15 +121,17 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
 
     from data_gen.paths.light_ends import LightEnds, LightRay
     from data_gen.paths.vertex import Materials
+    from data_gen.paths.world import World
     from data_gen.samplers.bdpt.vertex import IMPORTANCE, evaluate
-    from data_gen.samplers.photons.gradients.copies import copy, start_of
+    from data_gen.samplers.photons.gradients.copies import LightPaths, copy, start_of
     from data_gen.samplers.photons.map.photon import Photon, is_near, photon_of
-    from data_gen.samplers.photons.map.trace import vertex_of
+    from data_gen.samplers.photons.map.vertices import vertex_of
 
     mi = renderer
     scene = load(mi, SCENES[name], (8, 8))
     starts, (photons,) = maps_of(mi, scene, 1 << 14)
-    lights, connectable = LightEnds(scene), Materials(scene, 0.05).connectable
+    lights = LightEnds(scene)
+    world = World(scene, lights, Materials(scene, 0.05))
     # Points where photons are gathered: beside photons, on the surfaces where other photons are.
     some = np.flatnonzero((np.array(photons.depth) > 0) & np.isfinite(np.array(photons.density)))
     rng = np.random.default_rng(0)
@@ -140,8 +142,7 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     j, beside, other = (some[near[place, k]] for k in (0, 2, 8))
     j, x, y = mi.UInt32(j), vertex_of(photons, mi.UInt32(beside)), vertex_of(photons, mi.UInt32(other))
     photon, r2 = photon_of(photons, j), mi.Float(radius**2)
-    ends = (lights, connectable)
-    moved, r, good = copy(scene, *ends, starts, photons, j, photon, x, y, r2, ~is_near(photon, y, r2))
+    moved, r, good = copy(world, LightPaths(starts, photons), photon, (x, y), r2, ~is_near(photon, y, r2))
 
     # The copy as a photon of its own, with what its predecessor has to say of it
     parent, first = dr.gather(mi.UInt32, photons.parent, j), dr.gather(mi.Float, photons.density, j) == 0
@@ -176,8 +177,8 @@ def test_copies_of_photons_are_light_paths_and_their_copies_are_the_photons(rend
     β = both(starts.β, dr.select(ratio > 0, turned.β / ratio, 0))
     kinds = (both(getattr(starts, name), getattr(start, name)) for name in ("emitter", "index"))
     more_starts = LightRay(ray, β, *kinds, end, both(starts.delta, start.delta))
-    copied = Photon(moved.p, moved.n, moved.d, moved.Φ)
-    back, r_back, good_back = copy(scene, *ends, more_starts, more, lane + n, copied, y, x, r2, good)
+    copied = Photon(moved.p, moved.n, moved.d, moved.Φ, lane + n)
+    back, r_back, good_back = copy(world, LightPaths(more_starts, more), copied, (y, x), r2, good)
     good, good_back = np.array(good), np.array(good_back)
     assert good.sum() > 100 and (good & good_back).sum() > 0.97 * good.sum()
     good &= good_back

@@ -54,10 +54,11 @@ def maps_of(mi, scene, paths=4096, max_depth=6):
     from data_gen.paths.light_ends import LightEnds
     from data_gen.paths.streams import sample_streams
     from data_gen.paths.vertex import Materials
+    from data_gen.paths.world import World
     from data_gen.samplers.photons.map.trace import trace
 
     random = sample_streams(0, dr.arange(mi.UInt32, paths), mi.UInt32(0))
-    start, maps = trace(scene, LightEnds(scene), random, Materials(scene, 0.05).connectable, max_depth, 4)
+    start, maps = trace(World(scene, LightEnds(scene), Materials(scene, 0.05)), random, max_depth, 4)
     return start, list(maps)
 
 
@@ -84,7 +85,7 @@ def test_vertices_know_their_parents(renderer):
     known = ~first & (depth > 0) & (depth[parent] > 0)
     assert known.any() and (depth[known] == depth[parent[known]] + 1).all()
     assert (depth == 0).mean() > 0.05  # on glass
-    from data_gen.samplers.photons.map.trace import vertex_of
+    from data_gen.samplers.photons.map.vertices import vertex_of
 
     si = vertex_of(photons, mi.UInt32(np.flatnonzero(np.array(photons.t) > 0)))
     assert np.abs(np.array(si.p).T - p).max() < 1e-4
