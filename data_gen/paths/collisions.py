@@ -194,10 +194,10 @@ def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active
     scale = M / base.M
     moved = active & (base.n > 0) & (to_surface | ~hit.is_valid())
 
-    def place(N):
+    def placed():
         return cross(passes, trace, ray, medium, reach, channel, base.key, scale, base.n, mi.Bool(True))[-1]
 
-    (N,) = dr.if_stmt((N,), moved, lambda N: (place(N),), lambda N: (N,))
+    (N,) = dr.if_stmt((N,), moved, lambda N: (placed(),), lambda N: (N,))
     N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c
     return τ, hit, last, end, N, pick(N, channel)
 

@@ -124,7 +124,7 @@ def cross(passes, trace, ray, medium, reach, active):
     return τ, hit, ray, medium
 
 
-def see(scene, media: Media, trace, ray, medium, reach, channel, key, active) -> tuple:
+def see(media: Media, trace, ray, medium, reach, channel, key, active) -> tuple:
     """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
 
     Returns T, that surface, and the last piece of the ray.
@@ -159,7 +159,7 @@ def transmittance(
     medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
     if not media.boundaries and not media.grids:
         return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(extinction(medium, ray), reach)))
-    T, hit, _ = see(scene, media, next_surface(scene), ray, medium, reach, channel, key, active)
+    T, hit, _ = see(media, next_surface(scene), ray, medium, reach, channel, key, active)
     return dr.select(active & hit.is_valid(), 0, T)
 
 

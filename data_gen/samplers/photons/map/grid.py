@@ -90,7 +90,7 @@ class Grid:
             return dr.squared_norm(q - p) < radius2
 
         none = dr.zeros(mi.UInt32, dr.width(p))
-        return self.rows(none, none + 4, lambda k: p, nearer, active, visit, state)
+        return self.rows((none, none + 4), lambda k: p, nearer, active, visit, state)
 
     def along(self, ray: mi.Ray3f, length: mi.Float, radius2: mi.Float, active: mi.Bool, visit, state: tuple) -> tuple:
         """The same for the points nearer than that to a piece of a ray, each where it is beside the ray, not its ends.
@@ -120,14 +120,16 @@ class Grid:
             here = (t > 0) & (t < length) & (mi.UInt32(dr.maximum(t, 0) * rate) == (k >> 2))
             return here & (dr.squared_norm(to - ray.d * t) < radius2)
 
-        return self.rows(4 * first, 4 * last, middle, beside, crosses, visit, state)
+        return self.rows((4 * first, 4 * last), middle, beside, crosses, visit, state)
 
-    def rows(self, first: mi.UInt32, last: mi.UInt32, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
-        """``state`` after visits to all points in the rows from ``first`` to ``last``: number k has row k % 4.
+    def rows(self, numbers: tuple, center, is_near, active: mi.Bool, visit, state: tuple) -> tuple:
+        """``state`` after visits to all points in the rows of these ``numbers`` (from, to): number k has row k % 4.
 
         ``center`` (k) is what the row is near to, and ``is_near`` (point, k) whether a point of it is.
         """
+        first, last = numbers
 
+        # k - 1 is the number of the row, i the place of the point in the list, end that behind the row's last.
         def step(k, i, end, state):
             at = i < end
             near = at & is_near(dr.gather(mi.Point3f, self.p, i, at), k - 1)

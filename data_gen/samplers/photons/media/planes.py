@@ -187,8 +187,8 @@ def planes_of(passes: Passes, traced: Traced) -> AcrossPlanes:
     else:
         planes = kind(*(dr.zeros(t, 1) for t in get_type_hints(kind).values()))
     dr.eval(planes)
-    counts = dr.opaque(mi.UInt32, number), dr.opaque(mi.UInt32, integrator.limits.max_depth)
-    return AcrossPlanes(passes.world, planes, *counts)
+    number, longest = dr.opaque(mi.UInt32, number), dr.opaque(mi.UInt32, integrator.limits.max_depth)
+    return AcrossPlanes(passes.world, planes, number, longest)
 
 
 def swept(scene, photons, edges: mi.UInt32, weight: mi.Float):
