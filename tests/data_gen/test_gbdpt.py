@@ -628,7 +628,7 @@ def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monk
 
     followed = noise()
 
-    def reject(scene, plan, step, y, none, si, bsdf):
+    def reject(plan, step, y, none, si, bsdf):
         return none, renderer.Spectrum(0), renderer.Float(0)
 
     monkeypatch.setattr(offset_path, "replay", reject)
