@@ -87,9 +87,10 @@ class Temporal:
         self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
         before = self._history
         if previous is not None:
-            if before is None:
-                before = _History(previous, np.zeros_like(previous), np.ones(previous.shape[:2], np.float32), {})
-            before = replace(before, light=(previous - before.direct).astype(np.float32))
+            given = repair(GradientStack({"primal": previous}), gradients=False).image
+            if before is None or before.light.shape != given.shape:
+                before = _History(given, np.zeros_like(given), np.ones(given.shape[:2], np.float32), {})
+            before = replace(before, light=given - before.direct)
         if before is not None and _follows(stack, before):
             motion = stack["motion"]
             history, found = warped(before.light, motion, sharp=True)
