@@ -16,8 +16,10 @@ from ngpt.errors import NgptError
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.run import OPTIONS, Shipped
+from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
+from ngpt.studies import bcd, guided, norms, patches
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,8 @@ class Method:
     ``summary``  one line for the user
     ``needs``    layers of the stack it cannot do without
     ``run``      Repaired, options -> (H, W, 3) float32 of the light that Repaired's ``image`` is of
-    ``options``  the options it takes, with their defaults
+    ``options``  the options it takes
+    ``standing`` one of ``ngpt.options.STANDINGS``: which methods help shows first
     ``missing``  why it cannot be used here ("" if it can): the package or file that is not installed
     ``uses``     layers that it takes where the stack has them
     ``estimates``  layers that it estimates from the others where the stack lacks them
@@ -37,7 +40,8 @@ class Method:
     summary: str
     needs: tuple[str, ...]
     run: Callable[..., np.ndarray]
-    options: dict[str, Any]
+    options: dict[str, Option]
+    standing: str = "niche"
     missing: Callable[[], str] = lambda: ""
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
@@ -76,7 +80,7 @@ class Result:
         if self.weights:
             made["ngpt:weights"] = str(self.weights)
         if self.options:
-            made["ngpt:options"] = ", ".join(f"{name}={value}" for name, value in self.options.items())
+            made["ngpt:options"] = as_text(self.options)
         if self.estimated:
             made["ngpt:estimated"] = ", ".join(self.estimated)
         return made
@@ -87,41 +91,53 @@ def _primal(data: Repaired) -> np.ndarray:
 
 
 def _nfor(data: Repaired) -> np.ndarray:
+    noise = nfor.estimated_variance(data.image) if data.noise is None else data.noise
+    return nfor.nfor(data.image, noise, [data.features[name] for name in _FEATURES if name in data.features])
+
+
+def _bcd(data: Repaired) -> np.ndarray:
     assert data.noise is not None
-    return nfor.nfor(data.image, data.noise, [data.features[name] for name in _FEATURES])
+    return bcd.collaborative(data.image, data.noise)
 
 
-def _classical(name: str, summary: str) -> Method:
+def _study(summary: str, needs: tuple[str, ...], run: Callable[..., np.ndarray]) -> Method:
+    return Method(summary, needs, run, {}, "study")
+
+
+def _classical(name: str, summary: str, standing: str = "niche") -> Method:
     entry = CLASSICAL[name]
-    return Method(summary, entry.needs, entry.solve, entry.options)
+    return Method(summary, entry.needs, entry.solve, entry.options, standing)
 
 
 def _network(
     name: str,
     summary: str,
     needs: tuple[str, ...],
+    standing: str = "use",
     also_missing: Callable[[], str] = lambda: "",
-    uses: tuple[str, ...] = (),
     estimates: tuple[str, ...] = (),
 ) -> Method:
     network = Shipped(name, also_missing)
-    return Method(summary, needs, network.run, OPTIONS, network.missing, uses, estimates)
+    return Method(summary, needs, network.run, OPTIONS, standing, network.missing, estimates=estimates)
 
 
 def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method:
     """The method with other defaults, under a name of its own: rows of tables are names that can be asked for."""
-    return replace(entry, summary=summary, options=entry.options | options, variant=method)
+    other = {name: replace(entry.options[name], default=value) for name, value in options.items()}
+    return replace(entry, summary=summary, options=entry.options | other, variant=method)
 
 
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
+_VARIANCES = (*_GRADIENTS, "primal_var", "dx_var", "dy_var")
+_ALL = (*_VARIANCES, *_FEATURES)
 
 METHODS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
     "l2": _classical("l2", "screened Poisson, least squares: unbiased, fast"),
-    "l1": _classical("l1", "screened Poisson, least norms: robust to outliers"),
+    "l1": _classical("l1", "screened Poisson, least norms: robust to outliers", "use"),
     "cv": _classical("cv", "uniform control variates: close to l2, unbiased"),
-    "wcv": _classical("wcv", "control variates weighted by variance: the best of these"),
+    "wcv": _classical("wcv", "control variates weighted by variance: the best of these", "use"),
     "wl2": _classical("wl2", "least squares weighted by variance"),
     "ngpt-fast": _network(
         "ngpt-fast", "small neural network, quick on a CPU", (*_GRADIENTS, *_FEATURES), estimates=ESTIMATED
@@ -130,39 +146,55 @@ METHODS = {
         "ngpt-combine",
         "OIDN's images and the gradients, weighed and corrected by a small network",
         (*_GRADIENTS, *_FEATURES),
-        oidn.missing,
+        also_missing=oidn.missing,
         estimates=ESTIMATED,
     ),
     "ngpt-primal": _network(
         "ngpt-primal",
         "the same without gradients: OIDN's image, corrected by a small network that knows the noise",
         ("primal", *_FEATURES, "primal_var"),
-        oidn.missing,
+        also_missing=oidn.missing,
     ),
-    "ngpt-colour": _network(
-        "ngpt-colour",
-        "small neural network for any image: colour alone, or with albedo and normal",
-        ("primal",),
-        uses=("albedo", "normal"),
-    ),
-    "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES)),
+    "ngpt": _network("ngpt", "neural network of the paper's size", (*_GRADIENTS, *_FEATURES), "niche"),
     # Those below see no gradients.
     "nlm": Method(
         "peer: joint non-local means of scikit-image",
         ("primal", "albedo", "normal", "primal_var"),
         nlm.nlm,
         {},
+        "study",
         nlm.missing,
     ),
-    "nfor": Method("peer: first-order regression on features", ("primal", *_FEATURES, "primal_var"), _nfor, {}),
+    "nfor": Method(
+        "peer: first-order regression on features, for machines without OIDN",
+        ("primal",),
+        _nfor,
+        {},
+        "use",
+        uses=_FEATURES,
+        estimates=("primal_var",),
+    ),
     "oidn": Method(
         "peer: Intel Open Image Denoise, of colour alone, with albedo, or with albedo and normal",
         ("primal",),
         oidn.oidn,
-        {"auxiliary": "prefiltered", "quality": "high"},
+        oidn.OPTIONS,
+        "use",
         oidn.missing,
-        ("albedo", "normal"),
+        uses=("albedo", "normal"),
     ),
+}
+# Section 5 of the survey: docs/methods/reconstructions.md
+METHODS |= {
+    "irls": _study("least norms by reweighting: what l1 solves", _GRADIENTS, norms.irls),
+    "wl1": _study("least norms in units of standard deviations", _VARIANCES, norms.wl1),
+    "patches": _study("wl2 and windows that are linear in features", _ALL, patches.patches),
+    "nfor-wcv": _study("nfor, wcv one feature more", _ALL, guided.nfor_with("wcv", _FEATURES)),
+    "nfor-l1": _study("nfor, l1 one feature more", _ALL, guided.nfor_with("l1", _FEATURES)),
+    "nfor-wcv-alone": _study("nfor, wcv its only feature", _VARIANCES, guided.nfor_with("wcv", ())),
+    "bcd": _study("collaborative denoising of the primal", ("primal", "primal_var"), _bcd),
+    "bcd-wl2": _study("wl2 of denoised gradients", _VARIANCES, guided.of_denoised_gradients("wl2")),
+    "bcd-l1": _study("l1 of denoised gradients", _VARIANCES, guided.of_denoised_gradients("l1")),
 }
 METHODS |= {
     "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
@@ -177,9 +209,14 @@ METHODS |= {
 }
 
 
+def by_standing(*standings: str) -> dict[str, Method]:
+    """The methods of these standings, by name, without those that are others with options of their own."""
+    return {name: entry for name, entry in METHODS.items() if entry.standing in standings and not entry.variant}
+
+
 # The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
 # OIDN's mean error it leaves 0.79 to 0.94 times in rooms, but up to 1.16 times elsewhere, and single scenes more.
-ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor", "ngpt-colour")
+ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
 def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) -> str:
@@ -190,7 +227,7 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
 
     The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is
     better than `wcv` and `l1` in the mean up to 16 spp, and by far on what they cannot clean; from 64 spp on they are
-    better on diffuse scenes. The identity is left for a machine without ONNX Runtime.
+    better on diffuse scenes.
     """
     usable = usable or (lambda name: not METHODS[name].missing())
     for name in ORDER:
@@ -213,26 +250,22 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         # Weights say themselves what they need: any method that runs them will do.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
-        raise NgptError(f"unknown method '{name}'; choose one of: auto, {', '.join(METHODS)}")
+        raise NgptError(f"unknown method '{name}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
     entry = METHODS[name]
     if method == "auto":
         # Where and in how much memory concerns only some of those it may stand for.
         idle = {"device", "memory"} - entry.options.keys()
         options = {option: value for option, value in options.items() if option not in idle}
-    for option, value in options.items():
-        if option not in entry.options:
-            raise NgptError(f"method '{name}' has no option '{option}'; it has: {', '.join(entry.options) or 'none'}")
-        if isinstance(entry.options[option], int) and not isinstance(value, int):
-            raise NgptError(f"method '{name}': {option} is {value!r}; it must be a whole number")
+    values = settings(f"method '{name}'", entry.options, options)
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
-    reads = Shipped(name).reads(**(entry.options | options)) if "weights" in entry.options else entry.needs
+    reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
     data = repair(stack, gradients="dx" in reads)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
-        image = entry.run(data, **(entry.options | options)) + data.direct
+        image = entry.run(data, **values) + data.direct
         if data.caustic is not None:
             image += caustic.denoised(data, by_oidn="denoised" in reads)
     seconds = time.perf_counter() - start
@@ -251,7 +284,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         data.pixels,
         data.gradients,
         weights,
-        {key: value for key, value in options.items() if key != "weights" and value != entry.options[key]},
+        unusual(entry.options, {key: value for key, value in values.items() if key != "weights"}),
         () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
 

@@ -81,7 +81,10 @@ class Option:
 
 def written(value: Any) -> str:
     """A value of an option as users write it."""
-    return str(value).lower() if isinstance(value, bool) else f"{value:g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        short = f"{value:g}"
+        return short if float(short) == value else repr(value)
+    return str(value).lower() if isinstance(value, bool) else str(value)
 
 
 def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
@@ -103,7 +106,11 @@ def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]
     return found
 
 
-def unusual(options: Mapping[str, Option], settings: Mapping[str, Any]) -> str:
-    """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
-    other = {name: value for name, value in settings.items() if value != options[name].default}
-    return ", ".join(f"{name}={written(value)}" for name, value in other.items())
+def unusual(options: Mapping[str, Option], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the ``values`` that are not defaults."""
+    return {name: value for name, value in values.items() if value != options[name].default}
+
+
+def as_text(values: Mapping[str, Any]) -> str:
+    """Options as ``-O`` takes them, with commas between."""
+    return ", ".join(f"{name}={written(value)}" for name, value in values.items())

@@ -14,7 +14,7 @@ import ngpt
 SOURCE = Path(__file__).parents[1] / "export" / "capi"
 HEADER = SOURCE / "ngpt.h"
 WEIGHTS = Path(ngpt.__file__).parent / "weights"
-FAST, COLOUR = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-colour.onnx"
+FAST, PRIMAL = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-primal.onnx"
 OK, BAD_ARGUMENT, MISSING_LAYER, BAD_NETWORK, OUT_OF_MEMORY, CANCELLED = range(6)
 FORMATS = {np.dtype(np.float32): 0, np.dtype(np.float16): 1}
 PROGRESS = CFUNCTYPE(c_int, c_void_p, c_double)

@@ -142,7 +142,7 @@ def test_arrays_take_it():
     assert np.array_equal(ngpt.denoise(stack["primal"], "wcv", **layers), ngpt.denoise(stack, "wcv"))
 
 
-@pytest.mark.parametrize("method", ["ngpt-fast", "ngpt-combine", "ngpt-colour", "ngpt-primal", "nfor", "oidn"])
+@pytest.mark.parametrize("method", ["ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn"])
 def test_who_takes_it_out(method, monkeypatch):
     """Networks with gradients, by OIDN those that call it; a network of one's own by what its file says."""
     if METHODS[method].missing():

@@ -213,9 +213,10 @@ def test_the_example_of_rendering_runs(renderer, tmp_path, monkeypatch):
 def test_the_example_of_a_method_runs(monkeypatch, noisy_stack):
     import ngpt
     from ngpt.methods import METHODS, Method
+    from ngpt.options import Option
 
     blocks = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "methods" / "add-a-method.md").read_text(), re.S)
-    made: dict = {"Method": Method}
+    made: dict = {"Method": Method, "Option": Option}
     exec(blocks[0] + blocks[1], made)
     monkeypatch.setitem(METHODS, "median", made["METHODS"]["median"])
     stack, _ = noisy_stack

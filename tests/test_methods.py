@@ -26,9 +26,9 @@ FEATURES = ("albedo", "normal", "depth")
 @pytest.mark.parametrize(
     ("layers", "with_oidn", "without"),
     [
-        ((), "oidn", "ngpt-colour"),
-        (("albedo",), "oidn", "ngpt-colour"),
-        (("albedo", "normal"), "oidn", "ngpt-colour"),
+        ((), "oidn", "nfor"),
+        (("albedo",), "oidn", "nfor"),
+        (("albedo", "normal"), "oidn", "nfor"),
         ((*FEATURES, "primal_var"), "oidn", "nfor"),
         (("dx", "dy"), "oidn", "l1"),
         (("dx", "dy", "primal_var", "dx_var", "dy_var"), "oidn", "wcv"),

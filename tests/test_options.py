@@ -5,7 +5,7 @@ import math
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.options import Option, settings, unusual
+from ngpt.options import Option, as_text, settings, unusual
 
 OPTIONS = {
     "depth": Option(10, "how deep", range=(1, 64)),
@@ -63,6 +63,5 @@ def test_what_is_not_allowed_is_said_in_one_line(name, given, complaint):
 
 
 def test_what_is_not_the_default_is_written_as_it_is_given():
-    assert unusual(OPTIONS, settings("method 'x'", OPTIONS, {"caustic": False, "radius": 0.25})) == (
-        "radius=0.25, caustic=false"
-    )
+    found = settings("method 'x'", OPTIONS, {"caustic": False, "radius": 0.1 + 0.2})
+    assert as_text(unusual(OPTIONS, found)) == f"radius={0.1 + 0.2}, caustic=false"

@@ -22,7 +22,8 @@ ngpt.stack
 ngpt.renderer ngpt.repair ngpt.io
 ngpt.merging
 ngpt.classical
-ngpt.studies ngpt.denoisers ngpt.sequence.wcv_frames
+ngpt.denoisers ngpt.sequence.wcv_frames
+ngpt.studies
 ngpt.network
 ngpt.methods
 ngpt.sequence.evidence

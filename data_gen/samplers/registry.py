@@ -13,7 +13,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ngpt.errors import NgptError
-from ngpt.options import STANDINGS, Option, settings, unusual
+from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -77,7 +77,7 @@ class Entry:
 
     def unusual(self, settings: Mapping[str, Any]) -> str:
         """Those of the ``settings`` that are not defaults, as ``-O`` takes them, with commas between."""
-        return unusual(self.options, settings)
+        return as_text(unusual(self.options, settings))
 
     def made(self, *args: Any, **options: Any) -> Any:
         """What ``make`` makes, with ``options`` that may be texts, and the others' defaults; raises NgptError."""

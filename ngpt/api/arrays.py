@@ -15,7 +15,7 @@ import numpy as np
 from ngpt.api.tensors import is_bitmap, layer, like, to_numpy
 from ngpt.errors import NgptError
 from ngpt.io.aliases import resolve
-from ngpt.methods import METHODS, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct
 from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
 
@@ -31,13 +31,13 @@ _TO_CAMERA = np.array([-1, 1, -1], np.float32)
 
 
 def methods_in_words() -> str:
-    """All methods: what they are, what they need beside the image, and their options with defaults."""
+    """The methods: what they are, what they need beside the image, and their options with defaults."""
     lines = []
-    for name, method in METHODS.items():
+    for name, method in by_standing("use", "niche").items():
         beside = [layer for layer in method.needs if layer != "primal"]
         told = f"needs {', '.join(beside)}" if beside else "needs the image alone"
         told += f"; uses {', '.join(method.uses)}" if method.uses else ""
-        options = ", ".join(f"{option}={default!r}" for option, default in method.options.items())
+        options = ", ".join(f"{name}={option.default!r}" for name, option in method.options.items())
         lines += [f"{name:<14}{method.summary}", f"{'':<14}{told}", f"{'':<14}options: {options or 'none'}"]
     return "\n".join(f"    {line}" for line in lines)
 
@@ -135,7 +135,7 @@ class Denoiser:
         except (TypeError, ValueError, NgptError):
             raise NgptError(f"Denoiser: input_size is {input_size!r}; it must be (width, height)") from None
         if method not in ("auto", *METHODS):
-            raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(METHODS)}")
+            raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
         _check_options("Denoiser", method, options, ())
         self.announced = {"albedo": albedo, "normals": normals, "temporal": temporal}
         self._temporal = Temporal() if temporal else None

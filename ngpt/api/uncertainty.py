@@ -28,7 +28,6 @@ FACTORS = {
     "cv": 0.85,
     "wcv": 1.1,
     "wl2": 1.4,
-    "ngpt-colour": 1.4,
 }
 FACTOR = 1.2
 

@@ -5,14 +5,13 @@ The solvers beside this file know arrays only. Here is what they are given of a 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from ngpt.classical import controlvariates, poisson, weighted
 from ngpt.classical.energy import keep_energy
 from ngpt.classical.variances import auto_alpha
-from ngpt.errors import NgptError
+from ngpt.options import Option
 from ngpt.repair import Repaired
 
 
@@ -22,16 +21,16 @@ class Classical:
 
     ``needs``    layers of the stack it cannot do without
     ``solve``    Repaired, options -> (H, W, 3) float32 without direct emission
-    ``options``  the options it takes, with their defaults
+    ``options``  the options it takes
     """
 
     needs: tuple[str, ...]
     solve: Callable[..., np.ndarray]
-    options: dict[str, Any]
+    options: dict[str, Option]
 
     def __call__(self, data: Repaired) -> np.ndarray:
         """The reconstruction with default options."""
-        return self.solve(data, **self.options)
+        return self.solve(data, **{name: option.default for name, option in self.options.items()})
 
 
 def _l2(data: Repaired, alpha: float | str) -> np.ndarray:
@@ -59,8 +58,6 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
     """The number that alpha stands for: "auto" is derived from the variances, and the fixed default without them."""
     if not isinstance(alpha, str):
         return alpha
-    if alpha != "auto":
-        raise NgptError(f"alpha '{alpha}': must be a number, or 'auto' to derive it from the variances")
     if data.variances is None:
         return poisson.DEFAULT_ALPHA
     primal_var, dx_var, dy_var = data.variances
@@ -70,10 +67,17 @@ def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
 _GRADIENTS = ("primal", "dx", "dy")
 _ALL = (*_GRADIENTS, "primal_var", "dx_var", "dy_var")
 
+
+def weight_of_primal(default: float | str) -> Option:
+    """The option ``alpha``."""
+    meaning = "weight of the primal image beside the gradients; auto: by the variances"
+    return Option(default, meaning, choices=("auto",), range=(1e-15, 1e15))
+
+
 CLASSICAL = {
     # The derived alpha lowers the error of l2 by half, and is no better than the fixed one for l1.
-    "l2": Classical(_GRADIENTS, _l2, {"alpha": "auto"}),
-    "l1": Classical(_GRADIENTS, _l1, {"alpha": poisson.DEFAULT_ALPHA}),
+    "l2": Classical(_GRADIENTS, _l2, {"alpha": weight_of_primal("auto")}),
+    "l1": Classical(_GRADIENTS, _l1, {"alpha": weight_of_primal(poisson.DEFAULT_ALPHA)}),
     "cv": Classical(_GRADIENTS, _cv, {}),
     "wcv": Classical(_ALL, _keeping_energy(controlvariates.wcv), {}),
     "wl2": Classical(_ALL, _keeping_energy(weighted.wl2), {}),

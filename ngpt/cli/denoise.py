@@ -30,7 +30,7 @@ from ngpt.cli.denoise_shot import way, windowed
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
-from ngpt.methods import METHODS, Result, reconstruct
+from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
 from ngpt.sequence.history import Temporal
@@ -41,14 +41,8 @@ from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
 
-# The options of methods that are numbers; they may be "auto" as well.
-NUMBERS = {
-    name for method in METHODS.values() for name, value in method.options.items() if isinstance(value, int | float)
-}
-
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    methods = "; ".join(f"{name}: {method.summary}" for name, method in METHODS.items())
     parser.add_argument("stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns")
     parser.add_argument(
         "-o",
@@ -56,8 +50,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT",
         help=f"file for one stack, folder for several (default: STACK{RESULT_SUFFIX}.exr beside each)",
     )
-    parser.add_argument("-m", "--method", default="auto", choices=["auto", *METHODS], help=f"default: auto. {methods}")
-    parser.add_argument("--alpha", type=alpha, help="weight of the primal image in l2 and l1: a number, or auto")
+    first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
+    parser.add_argument(
+        "-m",
+        "--method",
+        default="auto",
+        metavar="NAME",
+        choices=["auto", *METHODS],
+        help=f"auto: the best that layers and machine allow (default); {first}; for some stacks: "
+        f"{', '.join(by_standing('niche'))}. See `ngpt info`",
+    )
+    parser.add_argument("--alpha", help="weight of the primal image in l2 and l1: a number, or auto")
     parser.add_argument("--weights", metavar="FILE", help="a network (.onnx, .safetensors) instead of the one shipped")
     parser.add_argument(
         "--device", help="where networks run: cpu (default), cuda, tensorrt, openvino, directml, coreml"
@@ -72,7 +75,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=VALUE",
-        help=f"an option of the method; may be repeated. With their defaults: {_options()}",
+        help="an option of the method; may be repeated. See `ngpt info METHOD`",
     )
     parser.add_argument(
         "--error",
@@ -130,7 +133,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
-    options |= {name: number(text) if name in NUMBERS else text for name, text in args.option}
+    options |= dict(args.option)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
     overwrite = partial(write_frame, overwrite=args.force)
@@ -262,32 +265,6 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
     }
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     return report | ({"metrics": metrics} if metrics else {})
-
-
-def alpha(text: str) -> float | str:
-    """A number, or ``auto``."""
-    return text if text == "auto" else float(text)
-
-
-def number(text: str) -> int | float | str:
-    """A number where it is one; the method says what else it takes."""
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            continue
-    return text
-
-
-def _options() -> str:
-    """The options of methods that have no argument of their own: "oidn: auxiliary=prefiltered, quality=high"."""
-    own = {"alpha", "weights", "device", "memory"}
-    found = {
-        name: ", ".join(f"{option}={value}" for option, value in method.options.items() if option not in own)
-        for name, method in METHODS.items()
-        if not method.variant
-    }
-    return "; ".join(f"{name}: {options}" for name, options in found.items() if options)
 
 
 def describe(report: dict) -> str:

@@ -2,6 +2,7 @@
 
 import argparse
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -12,7 +13,7 @@ from ngpt.io.exr import pass_through, read
 from ngpt.layers import LAYERS
 from ngpt.measure.gains import Gain, gains
 from ngpt.merging import DIAGNOSTICS
-from ngpt.methods import METHODS, choose
+from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
 from ngpt.stack import GradientStack
@@ -64,22 +65,46 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def overview() -> dict:
     """What this installation offers."""
-    report = {
-        "version": __version__,
-        "methods": {name: method.missing() or method.summary for name, method in METHODS.items()},
-    }
+    titles = {"methods": "use", "methods for some stacks": "niche", "methods to compare with": "study"}
+    report: dict[str, Any] = {"version": __version__}
+    for title, standing in titles.items():
+        report[title] = {name: method.missing() or method.summary for name, method in by_standing(standing).items()}
     try:
         return report | find_renderer().overview()
     except NgptError as error:
         return report | {"rendering": f"not available: {error}"}
 
 
+def method(name: str) -> dict:
+    """What the registry says of a method; nothing where there is none of that name."""
+    if name not in METHODS:
+        return {}
+    entry = METHODS[name]
+    report: dict[str, Any] = {
+        "method": name,
+        "summary": entry.summary,
+        "standing": entry.standing,
+        "needs": entry.needs,
+    }
+    report |= {"uses": entry.uses} if entry.uses else {}
+    report["options"] = {option: str(value) for option, value in entry.options.items()}
+    return report
+
+
 def other(name: str, parameters: dict[str, str]) -> dict:
-    """What a name is that is no file of ours: a sampler, or a scene and how it would be rendered."""
+    """What a name is that is no file of ours: a method, a sampler, or a scene and how it would be rendered."""
     if Path(name).suffix.lower() in (".exr", *NETWORKS):
         raise NgptError(f"{name}: not found; check the name")
-    renderer = find_renderer()
-    if not Path(name).exists() and (found := renderer.describe_sampler(name)):
+    found = {} if Path(name).exists() else method(name)
+    try:
+        renderer = find_renderer()
+    except NgptError:
+        if found:
+            return found
+        raise
+    if not Path(name).exists():
+        found |= renderer.describe_sampler(name)
+    if found:
         return found
     return {"scene": name} | renderer.inspect(name, parameters)
 
@@ -130,7 +155,7 @@ def stack(stack: GradientStack) -> dict:
         ],
         "methods": [
             name
-            for name, method in METHODS.items()
+            for name, method in by_standing("use", "niche").items()
             if not method.missing() and all(layer in stack for layer in method.needs)
         ],
         "auto": choose(stack),

@@ -8,14 +8,20 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.options import Option
 from ngpt.repair import Repaired
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
 
+OPTIONS = {
+    "auxiliary": Option("prefiltered", "what OIDN is told of albedo and normal", choices=AUXILIARY),
+    "quality": Option("high", "of its network: less is quicker", choices=tuple(QUALITIES)),
+}
+
 
 def missing() -> str:
-    return "" if find_spec("mitsuba_oidn") else "OIDN (mitsuba-oidn) is not installed: pip install 'ngpt-recon[peers]'"
+    return "" if find_spec("mitsuba_oidn") else "OIDN is not installed: pip install mitsuba-oidn"
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
@@ -29,12 +35,8 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     ``quality``    "high", "balanced" or "fast"
     """
     require_oidn()
-    if auxiliary not in AUXILIARY:
-        raise NgptError(f"method 'oidn': auxiliary '{auxiliary}': choose one of: {', '.join(AUXILIARY)}")
     import mitsuba_oidn
 
-    if quality not in QUALITIES:
-        raise NgptError(f"method 'oidn': quality '{quality}': choose one of: {', '.join(QUALITIES)}")
     features = {}
     if auxiliary == "prefiltered":
         features = prefiltered(data.features, "high")

@@ -46,7 +46,7 @@ def _onnx(path: Path) -> dict[str, Any]:
     names = (*network.inputs, "base") if network.base else network.inputs
     return (
         _whose(path, claims)
-        | _reads(names, network.base, network.optional, "ONNX Runtime")
+        | _reads(names, network.base, "ONNX Runtime")
         | {
             "alignment": network.alignment,
             "overlap of tiles": network.overlap,
@@ -68,7 +68,7 @@ def _safetensors(path: Path) -> dict[str, Any]:
     version = training.get("version", "?") if isinstance(training, dict) else "?"
     return (
         _whose(path, f"weights, written by ngpt {version}")
-        | _reads(config.layers, config.base, config.optional, "PyTorch")
+        | _reads(config.layers, config.base, "PyTorch")
         | {"alignment": model.alignment, "training": _training(training)}
     )
 
@@ -84,11 +84,11 @@ def _whose(path: Path, claims: str) -> dict[str, Any]:
     }
 
 
-def _reads(names: Collection[str], base: str, optional: Collection[str], runtime: str) -> dict[str, Any]:
+def _reads(names: Collection[str], base: str, runtime: str) -> dict[str, Any]:
     oidn = ["OIDN"] if set(inputs.DENOISED) & set(names) else []
     return {
         "inputs": list(names),
-        "needs layers": list(inputs.needs(names, base, optional)),
+        "needs layers": list(inputs.needs(names, base)),
         "needs packages": [runtime, *oidn],
         "base": base or "none",
     }

@@ -25,7 +25,7 @@ base where "base" is among the inputs, the denoised image otherwise:
 
 [Kettunen et al. 2019, section 4.2 and their code; base and standard errors are ours.] Radiance is divided by the
 exposure before. What a configuration does not list, the network does not see: absent layers are never filled with
-zeros, but for those it says it can do without (``ModelConfig.optional``).
+zeros.
 """
 
 from collections.abc import Mapping

@@ -45,18 +45,13 @@ MADE = ("base", *DENOISED)
 # Estimated where a stack with gradients lacks them.
 ESTIMATED = ("primal_var", "dx_var", "dy_var")
 
-# The inputs that a network may do without, and their channels; what a network may read that sees emission, too.
-OPTIONAL = {"albedo": 3, "normal": 3, "depth": 1}
-WITH_EMISSION = ("primal", *OPTIONAL)
 
-
-def needs(names: Collection[str], base: str, optional: Collection[str] = ()) -> tuple[str, ...]:
+def needs(names: Collection[str], base: str) -> tuple[str, ...]:
     """The layers a stack must hold so that ``gather`` can give these inputs, in the order of ``LAYERS``.
 
-    Those in ``optional`` are left out, but for what OIDN reads. Names that no stack has come last, and so does "base"
-    where an input is made of it and there is none.
+    Names that no stack has come last, and so does "base" where an input is made of it and there is none.
     """
-    wanted = {"primal"} | {_layer(name) for name in names if name not in (*MADE, *optional)}
+    wanted = {"primal"} | {_layer(name) for name in names if name not in MADE}
     if set(DENOISED) & set(names):
         wanted |= {"albedo", "normal"}
     if base:
@@ -71,28 +66,22 @@ def gather(
     names: Collection[str],
     base: str,
     reader: str = "the network's settings",
-    optional: Collection[str] = (),
-    emission: bool = False,
     estimate: bool = False,
 ) -> dict:
     """The inputs ``names`` of a network that starts from ``base`` ("" for none): arrays (H, W, C) by name.
 
     ``reader``    what the message says needs the layers that lack
-    ``optional``  those of ``OPTIONAL`` that are zeros where the stack lacks them
-    ``emission``  whether the primal includes emission seen directly; its results then are for ``without_emission``
     ``estimate``  whether variances that a stack with gradients lacks are estimated, see ``ngpt.network.estimates``
 
     Raises NgptError where the stack lacks layers they are made of, and where OIDN is needed and not installed.
     """
-    wanted = needs(names, base, optional)
+    wanted = needs(names, base)
     by_oidn = Oidn(data)
     if estimate and data.dx is not None and set(ESTIMATED) & set(wanted) - data.known_variances().keys():
         # OIDN's image is the better guide, but is there only for networks that read it anyway.
         guide = by_oidn.of_primal if set(DENOISED) & set(names) else CLASSICAL["l1"](data)
         data = with_variances(data, guide)
-    primal = data.image + data.direct if emission else data.image
-    held = {name: np.zeros((*primal.shape[:2], OPTIONAL[name]), np.float32) for name in optional}
-    held |= {"primal": primal, **data.features, **data.parts, **data.known_variances()}
+    held = {"primal": data.image, **data.features, **data.parts, **data.known_variances()}
     if data.dx is not None:
         held |= {"dx": data.dx, "dy": data.dy}
     if lacking := [name for name in wanted if name not in held]:
@@ -102,11 +91,6 @@ def gather(
         made["base"] = base_image(data, base)
     arrays = held | made | denoised(by_oidn, made.get("base"), names)
     return {name: arrays[name] for name in names}
-
-
-def without_emission(image: np.ndarray, data: Repaired, emission: bool) -> np.ndarray:
-    """A network's result (H, W, 3) without direct emission; ``emission`` as of ``gather``."""
-    return image - data.direct if emission else image
 
 
 def base_image(data: Repaired, base: str) -> np.ndarray:

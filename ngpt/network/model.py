@@ -52,8 +52,6 @@ class ModelConfig:
                   and ``scales``
     ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
                   network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
-    ``optional``  those of its inputs albedo, normal and depth that a stack may lack: they are zeros then
-    ``emission``  whether the images it reads and predicts include emission seen directly, as other renderers' do
     ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
                   "average", "maximum" or "bilinear", see ``ngpt.network.unet``
     """
@@ -69,8 +67,6 @@ class ModelConfig:
     scales: int = 1
     demodulate: bool = False
     sweeps: int = 0
-    optional: tuple[str, ...] = ()
-    emission: bool = False
     pooling: str = "convolution"
 
     def __post_init__(self) -> None:
@@ -80,24 +76,13 @@ class ModelConfig:
             raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")
         if self.base and not self.start:
             object.__setattr__(self, "start", ("base",))
-        for name in ("channels", "units", "inputs", "start", "optional"):
+        for name in ("channels", "units", "inputs", "start"):
             object.__setattr__(self, name, tuple(getattr(self, name)))
         for name in self.inputs:
             if name not in features.CHANNELS:
                 raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
         if "primal" not in self.inputs or len(set(self.inputs)) < len(self.inputs):
             raise NgptError(f"inputs {', '.join(self.inputs)}: each once, and 'primal' among them")
-        if not set(self.optional) <= set(inputs.OPTIONAL) & set(self.inputs):
-            raise NgptError(
-                f"optional {', '.join(self.optional)}: must be inputs, and among {', '.join(inputs.OPTIONAL)}"
-            )
-        if type(self.emission) is not bool:
-            raise NgptError(f"emission = {self.emission!r}: must be true or false")
-        if self.emission and not set(self.inputs) <= set(inputs.WITH_EMISSION):
-            raise NgptError(
-                f"emission with inputs {', '.join(self.inputs)}: only {', '.join(inputs.WITH_EMISSION)} go with it; "
-                "the others are without emission"
-            )
         levels = len(self.channels)
         if not 1 <= levels <= MAX_LEVELS or not _whole(self.channels, MAX_CHANNELS):
             raise NgptError(
@@ -179,7 +164,7 @@ class ModelConfig:
     @property
     def needs(self) -> tuple[str, ...]:
         """The layers a stack must hold, by the names of the contract."""
-        return inputs.needs(self.layers, self.base, self.optional)
+        return inputs.needs(self.layers, self.base)
 
     @property
     def reads_gradients(self) -> bool:
@@ -196,7 +181,7 @@ def _whole(numbers: tuple[Any, ...], most: int) -> bool:
 
 
 class Reconstructor(nn.Module):
-    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear; see ``ModelConfig.emission``.
+    """Layers (N, C, H, W), scene-linear, to the image (N, 3, H, W), scene-linear.
 
         exposure, depth scale -> padding -> channels -> network -> head -> (quiet) -> crop -> bounds -> exp -> exposure
 

@@ -1,5 +1,6 @@
 """The networks that come with the package, as reconstructions of a repaired stack."""
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -10,12 +11,17 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.network import inputs, run_onnx
+from ngpt.options import Option
 from ngpt.repair import Repaired
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
-# The options of all networks, with their defaults.
-OPTIONS: dict[str, Any] = {"weights": "", "device": "auto", "memory": run_onnx.MEMORY}
+# The options of all networks
+OPTIONS = {
+    "weights": Option("", "a file, .onnx or .safetensors, instead of the network that is shipped"),
+    "device": Option("auto", f"where it runs: {', '.join(run_onnx.DEVICES)}, or PyTorch's names for .safetensors"),
+    "memory": Option(run_onnx.MEMORY, "MiB that its tiles may take", range=(1, math.inf)),
+}
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ class Shipped:
         path = Path(weights or self.path)
         if path.suffix != ".safetensors":
             network = run_onnx.Network(path, device)
-            return (*network.inputs, *inputs.needs(network.inputs, network.base, network.optional))
+            return (*network.inputs, *inputs.needs(network.inputs, network.base))
         config = self._torch(path).config_of(path, device)
         return (*config.layers, *config.needs)
 
@@ -62,8 +68,8 @@ class Shipped:
             # NumPy makes the base several times faster than the graph would.
             names = (*network.inputs, "base") if network.base else network.inputs
             reader = f"weights {path}"
-            layers = inputs.gather(data, names, network.base, reader, network.optional, network.emission, estimate=True)
-            return inputs.without_emission(network.reconstruct(layers, memory=memory), data, network.emission)
+            layers = inputs.gather(data, names, network.base, reader, estimate=True)
+            return network.reconstruct(layers, memory=memory)
         return self._torch(path).run(data, path, device)
 
     def _torch(self, path: Path) -> Any:

@@ -16,7 +16,6 @@ from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network import tiles
 from ngpt.network.exposure import statistics
-from ngpt.network.inputs import OPTIONAL, WITH_EMISSION
 from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers: 1280x720 in one tile, where two take a quarter longer.
@@ -62,9 +61,6 @@ class Network:
             self.base = metadata["ngpt.base"]
             self.overlap = int(metadata["ngpt.overlap with base" if self.base else "ngpt.overlap"])
             self.bytes = int(metadata["ngpt.bytes per pixel"])
-            # Files of earlier versions have neither.
-            optional = tuple(filter(None, metadata.get("ngpt.optional", "").split(", ")))
-            self.emission = metadata.get("ngpt.emission") == "true"
         except (KeyError, ValueError) as error:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
@@ -72,7 +68,9 @@ class Network:
         # Direct emission is taken out, and pixels are repaired, before layers come here: the graph, which does so for
         # other hosts, is told that there is none. Graphs of earlier versions do not ask.
         self.asks_for_direct = "direct" in names
-        self.inputs, self.optional = (tuple(n for n in listed if n != "direct") for listed in (names, optional))
+        self.inputs = tuple(name for name in names if name != "direct")
+        if metadata.get("ngpt.emission") == "true" or metadata.get("ngpt.optional", "direct") != "direct":
+            raise NgptError(f"{path}: a network of colour alone, as earlier versions had; use one of today")
         self._check()
 
     def _check(self) -> None:
@@ -82,10 +80,6 @@ class Network:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
         if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
-        if not set(self.optional) <= set(OPTIONAL) & set(self.inputs):
-            raise NgptError(f"{self.path}: its optional inputs are {', '.join(self.optional)}: export it anew")
-        if self.emission and (self.base or not set(self.inputs) <= set(WITH_EMISSION)):
-            raise NgptError(f"{self.path}: reads emission and {', '.join(self.inputs)}: export it anew")
         own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
         own |= {"direct"} if self.asks_for_direct else set()
         graph = {given.name for given in self.session.get_inputs()}

@@ -34,15 +34,14 @@ def run(data: Repaired, path: str | Path, device: str = "auto", tile: int = TILE
     model = _loaded(path, device)
     read = layers_of(data, model.config, f"weights {path}", estimate=True)
     layers = {name: layer[None] for name, layer in read.items()}
-    image = reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
-    return inputs.without_emission(image, data, model.config.emission)
+    return reconstruct(model, layers, tile)[0].permute(1, 2, 0).cpu().numpy()
 
 
 def layers_of(
     data: Repaired, config: ModelConfig, reader: str = "the network's settings", estimate: bool = False
 ) -> dict[str, Tensor]:
     """What a network of that configuration reads of a repaired stack, as tensors (C, H, W); see ``inputs.gather``."""
-    arrays = inputs.gather(data, config.layers, config.base, reader, config.optional, config.emission, estimate)
+    arrays = inputs.gather(data, config.layers, config.base, reader, estimate)
     return {name: torch.from_numpy(np.array(array.transpose(2, 0, 1), order="C")) for name, array in arrays.items()}
 
 

@@ -65,7 +65,10 @@ def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
     if header.get("kind") != "weights":
         raise NgptError(f"{path}: holds a {header.get('kind', 'something')}, not weights; pass weights.safetensors")
     try:
-        config = ModelConfig(**header["model"])
+        fields = dict(header["model"])
+        # Earlier versions had two fields more; shipped files have them, and say nothing by them.
+        fields = {name: value for name, value in fields.items() if value or name not in ("optional", "emission")}
+        config = ModelConfig(**fields)
     except (TypeError, KeyError, ValueError) as error:
         raise NgptError(f"{path}: its configuration cannot be read: {error}") from error
     # Memory is for what the file holds, not for what its header claims.

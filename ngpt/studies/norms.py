@@ -32,7 +32,8 @@ def irls(data: Repaired, alpha: float = DEFAULT_ALPHA) -> np.ndarray:
 
 def wl1(data: Repaired) -> np.ndarray:
     """The same, weighted by variances, with the energy of the primal; needs variances."""
-    p, d = smooth_variances(*data.variances, data.trusted)
+    of_primal, of_dx, of_dy = data.variances
+    p, d = smooth_variances(of_primal, of_dx, of_dy, data.trusted)
     return np.asarray(keep_energy(_solve(data, 1 / p, 1 / d), data.image))
 
 

@@ -42,7 +42,8 @@ def patches(data: Repaired) -> np.ndarray:
     r, scale = equations.scaled_residual()
     if scale == 0:
         return data.image
-    p_var, d_var = smooth_variances(*data.variances, data.trusted)
+    of_primal, of_dx, of_dy = data.variances
+    p_var, d_var = smooth_variances(of_primal, of_dx, of_dy, data.trusted)
     screen, weights = (np.asarray(cast(1 / v, r.dtype)) for v in (p_var, d_var))
     # Variances are relative; this is what they are relative to, in units of r.
     unit = _mean_variance(data) / scale**2

@@ -31,8 +31,6 @@ class Augmentation:
     ``colors``      permutation of RGB, and a factor for each of mean 1, 0..3, uniform on the simplex
     ``brightness``  standard deviation, in the logarithm, of a log-normal factor of mean 1 on radiance
     ``depth``       factor of depth, uniform between these
-    ``absent``      probability that albedo and normal are zeros, as a network sees them that is given neither; half as
-                    often normal alone is. For networks that can do without them (``ModelConfig.optional``)
     ``quieter``     factors of noise, log-uniform between these, one for each crop: shows its best input once more, with
                     so much less noise (``quieter``). Networks learn from it what to make of more samples than anyone
                     renders for training. [] for none
@@ -46,7 +44,6 @@ class Augmentation:
     brightness: float = 1.0
     depth: tuple[float, float] = (0.1, 1.1)
     quieter: tuple[float, ...] = ()
-    absent: float = 0.0
     rarer: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -58,8 +55,6 @@ class Augmentation:
             raise NgptError(
                 f"[augmentation]: quieter = {list(self.quieter)}: must be two factors, 0 < least <= most <= 1"
             )
-        if not 0 <= self.absent <= 1:
-            raise NgptError(f"[augmentation]: absent = {self.absent}: must be a probability, from 0 to 1")
 
     def __call__(self, layers: Mapping[str, Tensor], rng: np.random.Generator) -> Layers:
         result = dict(layers)
@@ -74,11 +69,6 @@ class Augmentation:
             result = scale(result, float(np.exp(self.brightness * rng.standard_normal() - self.brightness**2 / 2)))
         if "depth" in result:
             result["depth"] = result["depth"] * float(rng.uniform(*self.depth))
-        if self.absent:
-            chance = rng.random()
-            for name, limit in (("albedo", self.absent), ("normal", 1.5 * self.absent)):
-                if name in result and chance < limit:
-                    result[name] = torch.zeros_like(result[name])
         return result
 
 

@@ -257,14 +257,12 @@ def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
         return (target_of(crop, config),)
     # Halves have no image of the layer of their own; for networks without gradients that of all samples counts.
     beside = np.zeros_like(halves[0]) if config.reads_gradients else crop.reference_caustic
-    if config.emission:
-        beside = beside + crop.reference_direct
     return tuple(half + beside for half in halves)
 
 
 def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
     """What a network of that configuration is to make of a crop's stacks, (H, W, 3)."""
-    target = crop.reference if config.emission else crop.reference - crop.reference_direct
+    target = crop.reference - crop.reference_direct
     return target - crop.reference_caustic if config.reads_gradients else target
 
 

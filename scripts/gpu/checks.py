@@ -109,8 +109,8 @@ def arrays(recipe: Recipe) -> dict[str, Any]:
     layers = {name: stack[name] for name in stack.names}
     image = layers.pop("primal")
     told: dict[str, Any] = {}
-    for method in ("l2", "ngpt-colour"):
-        beside = {name: layers[name] for name in (("dx", "dy") if method == "l2" else ("albedo", "normal"))}
+    for method in ("l2", "ngpt-fast"):
+        beside = {name: layers[name] for name in ngpt.METHODS[method].needs if name != "primal"}
         here = ngpt.denoise(image, method, **beside)
         tensors = {name: _there(torch.from_numpy(layer), recipe) for name, layer in beside.items()}
         there = ngpt.denoise(_there(torch.from_numpy(image), recipe), method, **tensors)
@@ -155,13 +155,11 @@ def onnx(recipe: Recipe) -> dict[str, Any]:
         have = ", ".join(onnxruntime.get_available_providers())
         raise Unavailable(f"this build of ONNX Runtime has only {have}: onnxruntime-gpu has the other")
     stack, told = made_stack(64, seed=3), {}
-    for name in ("ngpt-fast", "ngpt-colour"):
+    for name in ("ngpt-fast",):
         networks = [Network(run.WEIGHTS / f"{name}.onnx", device) for device in ("cpu", recipe.device)]
         first = networks[0]
         inputs = (*first.inputs, "base") if first.base else first.inputs
-        layers = gather(
-            repair(stack, "dx" in first.inputs or bool(first.base)), inputs, first.base, emission=first.emission
-        )
+        layers = gather(repair(stack, "dx" in first.inputs or bool(first.base)), inputs, first.base)
         here, there = (network.reconstruct(layers) for network in networks)
         told[name] = _largest(there - here, here)
     return told | {"passed": max(told.values()) < 1e-2}

@@ -42,7 +42,7 @@ def total(path, *names):
     return sum(layers[name].astype(np.float64) for name in names)
 
 
-@pytest.mark.parametrize("method", ["auto", "ngpt-colour", "primal"])
+@pytest.mark.parametrize("method", ["auto", "nfor", "primal"])
 def test_groups_add_up_to_the_result(lights, tmp_path, method):
     clean, noisy = lights
     path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
@@ -63,7 +63,7 @@ def test_light_in_no_group_is_left_to_none(lights, tmp_path):
     path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
     stack = ngpt.read(path)
     groups = {"Key": noisy["Key"]}
-    parts = lightgroups.denoised(stack, groups, ngpt.denoise(stack, "ngpt-colour"), "ngpt-colour")
+    parts = lightgroups.denoised(stack, groups, ngpt.denoise(stack, "nfor"), "nfor")
     assert list(parts) == ["Key"]
     assert np.mean((parts["Key"] - clean["Key"]) ** 2) < 0.5 * np.mean((noisy["Key"] - clean["Key"]) ** 2)
     assert not out.exists()
@@ -108,7 +108,7 @@ def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
     _, noisy = lights
     mist = {"ViewLayer.Mist": noisy["Key"]}
     path, out = cycles(tmp_path / "half.exr", noisy, mist, type=np.float16), tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", "ngpt-colour", "--groups"]) == 0
+    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor", "--groups"]) == 0
     before, after = (ngpt.read(file) for file in (path, out))
     assert np.array_equal(*(lightgroups.layers_of_light(s)["ViewLayer.Mist"] for s in (before, after)))
     assert after.source.image.parts[0].channels["ViewLayer.Combined_Key.R"].dtype == np.float16
@@ -120,5 +120,5 @@ def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
 def test_without_being_asked_for_groups_pass_through(lights, tmp_path):
     _, noisy = lights
     path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", "ngpt-colour"]) == 0
+    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor"]) == 0
     assert np.array_equal(lightgroups.layers_of_light(ngpt.read(out))["ViewLayer.Combined_Key"], noisy["Key"])

@@ -41,7 +41,7 @@ def test_it_says_how_far_the_truth_is(stack):
     assert np.mean(result.error) < 0.5 * np.mean(np.sqrt(stack["primal_var"]))
 
 
-@pytest.mark.parametrize("method", ["wcv", "l1", "ngpt-colour"])
+@pytest.mark.parametrize("method", ["wcv", "l1", "nfor"])
 def test_it_scales_with_the_image_and_is_the_same_again(stack, method):
     error = ngpt.reconstruct_with_error(stack, method).error
     assert np.array_equal(error, ngpt.reconstruct_with_error(stack, method).error)

@@ -9,7 +9,7 @@ from full_stack import full_stack
 import ngpt
 from ngpt.cli import main
 from ngpt.denoisers import oidn
-from ngpt.methods import METHODS
+from ngpt.methods import METHODS, by_standing
 
 needs_oidn = pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
 
@@ -52,24 +52,45 @@ def test_quality_and_features_of_oidn(source):
 
 @needs_oidn
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.variant])
-def test_rows_of_tables_are_methods(source, name, capsys):
+def test_rows_of_tables_are_methods(source, name):
     image, header = denoise(source, "-m", name)
     entry = METHODS[name]
     assert header["ngpt:method"] == name and "ngpt:options" not in header
-    assert np.array_equal(image, ngpt.denoise(ngpt.read(source), entry.variant, **entry.options))
+    options = {option: value.default for option, value in entry.options.items()}
+    assert np.array_equal(image, ngpt.denoise(ngpt.read(source), entry.variant, **options))
+
+
+def test_help_and_lists_have_methods_by_standing(source, capsys):
+    """Those of standing "use" with a line each; rows of tables and studies are asked for by name."""
+    with pytest.raises(SystemExit):
+        main(["denoise", "--help"])
+    words = " ".join(capsys.readouterr().out.split())
+    assert all(f"{name}: {' '.join(entry.summary.split())}" in words for name, entry in by_standing("use").items())
+    assert all(f"{name}, " in words for name in ("primal", "l2", "cv", "wl2"))
+    assert "oidn-clean" not in words and "bcd" not in words
+    assert main(["info", "l1", "--json"]) == 0
+    about = json.loads(capsys.readouterr().out)
+    assert about["standing"] == "use" and "a number from 1e-15 to 1e+15, or auto" in about["options"]["alpha"]
     assert main(["info", source, "--json"]) == 0
-    assert name in json.loads(capsys.readouterr().out)["methods"]
+    able = json.loads(capsys.readouterr().out)["methods"]
+    assert {"l2", "wcv"} <= set(able) <= set(by_standing("use", "niche"))
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["-m", "oidn", "-O", "quality=best"], "quality 'best': choose one of: high, balanced, fast"),
-        (["-m", "oidn", "-O", "auxiliary=7"], "auxiliary '7': choose one of: prefiltered, clean"),
+        (
+            ["-m", "oidn", "-O", "quality=best"],
+            "option 'quality': 'best' is not allowed; it takes high, balanced, fast",
+        ),
+        (["-m", "oidn", "-O", "auxiliary=7"], "option 'auxiliary': '7' is not allowed; it takes prefiltered, clean"),
         (["-m", "oidn", "-O", "alpha=1"], "method 'oidn' has no option 'alpha'; it has: auxiliary, quality"),
         (["-m", "wcv", "-O", "alpha=1"], "method 'wcv' has no option 'alpha'; it has: none"),
-        (["-m", "l1", "-O", "alpha=much"], "alpha 'much': must be a number, or 'auto'"),
-        (["-m", "ngpt-fast", "-O", "memory=much"], "memory is 'much'; it must be a whole number"),
+        (
+            ["-m", "l1", "-O", "alpha=much"],
+            "method 'l1', option 'alpha': 'much' is not allowed; it takes a number from 1e-15 to 1e+15, or auto",
+        ),
+        (["-m", "ngpt-fast", "-O", "memory=much"], "option 'memory': 'much' is not allowed; it takes a whole number"),
     ],
 )
 def test_errors_are_those_of_the_method(source, arguments, message, capfd):

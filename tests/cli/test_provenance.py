@@ -47,7 +47,7 @@ def test_a_result_says_what_made_it(stack, tmp_path):
 
 
 def test_defaults_are_no_options(stack):
-    default = METHODS["ngpt-fast"].options["memory"]
+    default = METHODS["ngpt-fast"].options["memory"].default
     result = ngpt.reconstruct(stack, "ngpt-fast", memory=default)
     assert result.options == {} and "ngpt:options" not in result.attributes
     assert ngpt.reconstruct(stack, "ngpt-fast", memory=default - 1).options == {"memory": default - 1}

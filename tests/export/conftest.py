@@ -4,7 +4,7 @@ import os
 from pathlib import Path
 
 import pytest
-from capi import COLOUR, Network, install, load
+from capi import PRIMAL, Network, install, load
 
 
 @pytest.fixture(scope="session")
@@ -45,7 +45,7 @@ def fast(library):
 
 
 @pytest.fixture(scope="session")
-def colour(library):
-    network = Network(library, COLOUR)
+def primal(library):
+    network = Network(library, PRIMAL)
     yield network
     network.close()

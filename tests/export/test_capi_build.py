@@ -6,7 +6,7 @@ import subprocess
 import sys
 
 import pytest
-from capi import COLOUR, FAST, HEADER, SOURCE, Network, command, example, install, result, those, tool
+from capi import FAST, HEADER, PRIMAL, SOURCE, Network, command, example, install, result, those, tool
 
 import ngpt
 
@@ -102,10 +102,8 @@ def renderer_project(prefix, tmp_path_factory):
 
 @pytest.mark.parametrize("program", ["in-c", "in-cpp"])
 def test_the_program_of_the_docs(renderer_project, program):
-    networks = (renderer_project / "networks.txt").read_text()
-    outcome = subprocess.run(
-        [renderer_project / program, f"{networks}/ngpt-colour.onnx"], capture_output=True, text=True, timeout=100
-    )
+    network = (renderer_project / "networks.txt").read_text() + "/ngpt-fast.onnx"
+    outcome = subprocess.run([renderer_project / program, network], capture_output=True, text=True, timeout=100)
     assert outcome.returncode == 0, outcome.stderr
     assert 0.7 < float(outcome.stdout) < 1.3
     assert outcome.stderr.startswith("reads primal, 3 channels, always\nreads direct, 3 channels, if there is one")
@@ -140,7 +138,7 @@ def test_memory_stays_the_same(library):
 
     def work(turns):
         for _ in range(turns):
-            network = Network(library, COLOUR)
+            network = Network(library, PRIMAL)
             for _ in range(5):
                 result(network, those(network, layers))
             network.close()
@@ -165,7 +163,7 @@ def test_sanitized(runtime, tmp_path):
     command(
         tool("gcc", "clang"), *flags.split(), f"-I{prefix}/include", tmp_path / "stress.c", "-o", program, *libraries
     )
-    for network in (FAST, COLOUR):
+    for network in (FAST, PRIMAL):
         outcome = subprocess.run([program, network, "2"], capture_output=True, text=True, timeout=400)
         assert outcome.returncode == 0, outcome.stderr[-3000:]
         assert not outcome.stderr

@@ -12,12 +12,12 @@ from capi import (
     BAD_ARGUMENT,
     BAD_NETWORK,
     CANCELLED,
-    COLOUR,
     FAST,
     HEADER,
     MISSING_LAYER,
     OK,
     OUT_OF_MEMORY,
+    PRIMAL,
     PROGRESS,
     WEIGHTS,
     Job,
@@ -53,7 +53,7 @@ def test_null_everywhere(library, fast):
     library.ngpt_job_free(job)
 
 
-def test_the_network_is_described(library, fast, colour):
+def test_the_network_is_described(library, fast, primal):
     assert fast.names[:10] == [
         "primal",
         "direct",
@@ -72,8 +72,7 @@ def test_the_network_is_described(library, fast, colour):
     }
     assert about["primal"] == about["normal"] == (3, 1) and about["depth"] == (1, 1)
     assert about["direct"] == about["dx_var"] == about["base"] == (3, 0)
-    assert colour.names == ["primal", "direct", "albedo", "normal"]
-    assert [library.ngpt_layer_required(colour.handle, i) for i in range(4)] == [1, 0, 0, 0]
+    assert primal.names[:2] == ["primal", "direct"] and "dx" not in primal.names
     for index in (-1, fast.count()):
         assert library.ngpt_layer_name(fast.handle, index) is None
         assert library.ngpt_layer_channels(fast.handle, index) == library.ngpt_layer_required(fast.handle, index) == 0
@@ -179,11 +178,11 @@ def test_tiles_need_the_statistics(library, tmp_path):
     job.free()
     network.close()
     other = WEIGHTS / "ngpt-fast.statistics.onnx"
-    shutil.copy(COLOUR, tmp_path / "other.onnx")
+    shutil.copy(PRIMAL, tmp_path / "other.onnx")
     shutil.copy(other, tmp_path / "other.statistics.onnx")
     network = Network(library, tmp_path / "other.onnx")
-    job = Job(network, those(network, example(200, 500)))
-    refused(job.run(90), BAD_NETWORK, job, "belongs to another network, it reads dx")
+    job = Job(network, those(network, example(400, 900)))
+    refused(job.run(30), BAD_NETWORK, job, "belongs to another network, it reads dx")
     job.free()
     network.close()
 
@@ -191,7 +190,7 @@ def test_tiles_need_the_statistics(library, tmp_path):
 def test_paths_of_any_letters(library, tmp_path):
     folder = tmp_path / "Größe 大"
     folder.mkdir()
-    shutil.copy(COLOUR, folder / "network")
+    shutil.copy(PRIMAL, folder / "network")
     network = Network(library, folder / "network")
     assert network.handle, network.message
     network.close()
@@ -250,7 +249,7 @@ def test_threads_share_a_network(fast):
 
 def test_threads_open_networks(library):
     networks: list = []
-    threads = [threading.Thread(target=lambda: networks.append(Network(library, COLOUR))) for _ in range(4)]
+    threads = [threading.Thread(target=lambda: networks.append(Network(library, PRIMAL))) for _ in range(4)]
     for thread in threads:
         thread.start()
     for thread in threads:
@@ -261,7 +260,7 @@ def test_threads_open_networks(library):
 
 
 def test_a_job_outlives_its_network(library):
-    network = Network(library, COLOUR)
+    network = Network(library, PRIMAL)
     job = Job(network, those(network, example()))
     network.close()
     assert job.run() == OK and (job.image != -7).any()

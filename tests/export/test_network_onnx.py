@@ -22,7 +22,6 @@ from ngpt.export.network import metadata, network_body, network_model, statistic
 from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import reconstruct
 from ngpt.network import inputs
-from ngpt.network.describe import describe
 from ngpt.network.exposure import statistics
 from ngpt.network.features import SOURCES, exposure
 from ngpt.network.model import ModelConfig, Reconstructor
@@ -59,23 +58,15 @@ CONFIGS = {
     "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
     "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
     "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),
-    "of any image": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "albedo", "normal")),
-        start=("primal",),
-        optional=("albedo", "normal"),
-        emission=True,
-    ),
     "by a pyramid of kernels": ModelConfig(
         *("dense", (4, 6, 6), (1, 1, 1), ("primal", "albedo", "normal")),
         start=("primal",),
         kernel=3,
         scales=3,
         demodulate=True,
-        optional=("albedo", "normal"),
-        emission=True,
     ),
     "by a pyramid, colour alone": ModelConfig(
-        "dense", (4, 6), (1, 1), ("primal",), start=("primal",), kernel=5, scales=2, emission=True
+        "dense", (4, 6), (1, 1), ("primal",), start=("primal",), kernel=5, scales=2
     ),
     "primal alone": ModelConfig("plain", (4, 4, 4, 4, 4), (), ("primal",)),
 }
@@ -181,45 +172,6 @@ def test_a_combiner_is_the_same_by_either_runtime(tmp_path, weights, other_denoi
         reconstruct(stack_of(without), "ngpt", weights=str(tmp_path / "p.onnx"))
 
 
-@pytest.fixture(params=["onnx", "safetensors"])
-def of_any_image(request, tmp_path, weights):
-    """A function of layers (1, C, H, W): the image by a network that needs colour alone, in either runtime."""
-    path = weights / "of any image.safetensors"
-    if request.param == "onnx":
-        path, twin = tmp_path / "c.onnx", path
-        path.write_bytes(network_model(twin, "c").SerializeToString())
-    return lambda layers: reconstruct(stack_of(layers), "ngpt", weights=str(path)).image
-
-
-def test_layers_that_a_network_can_do_without_are_zeros(of_any_image, weights):
-    layers = noisy(19, 26)
-    names = ("albedo", "normal")
-    bare = {"primal": layers["primal"]}
-    zeros = bare | {name: np.zeros_like(layers[name]) for name in names}
-    assert np.array_equal(of_any_image(bare), of_any_image(zeros))
-    assert not np.allclose(of_any_image(bare), of_any_image(layers), rtol=0.01), "they are not used"
-    assert_close(of_any_image(bare), in_torch(bare, weights / "of any image.safetensors")[0].transpose(1, 2, 0))
-
-
-def test_info_does_not_ask_for_what_a_network_can_do_without(tmp_path, weights):
-    path = weights / "of any image.safetensors"
-    (tmp_path / "c.onnx").write_bytes(network_model(path, "c").SerializeToString())
-    for file in (path, tmp_path / "c.onnx"):
-        assert describe(file)["needs layers"] == ["primal"]
-        assert describe(file)["inputs"] == ["primal", "albedo", "normal"]
-
-
-def test_a_lamp_comes_through_whether_it_is_kept_aside_or_not(of_any_image, weights):
-    layers = noisy(19, 26)
-    lamp = np.zeros_like(layers["primal"])
-    lamp[..., 4:9, 5:12] = 50
-    whole = {"primal": layers["primal"] + lamp, "albedo": layers["albedo"]}
-    image = of_any_image(whole)
-    assert image[4:9, 5:12].mean() > 10 * image[12:].mean()
-    assert_close(of_any_image(whole | {"direct": lamp}), image)
-    assert_close(image, in_torch(whole, weights / "of any image.safetensors")[0].transpose(1, 2, 0))
-
-
 @pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
 def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
     layers = noisy(*size)
@@ -227,7 +179,7 @@ def test_the_shipped_file_is_that_of_the_shipped_weights(fast, size):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal", "ngpt-colour"])
+@pytest.mark.parametrize("name", ["ngpt-fast", "ngpt-combine", "ngpt-primal"])
 def test_an_export_of_today_gives_what_the_shipped_file_gives(name):
     layers = noisy(37, 53)
     layers |= {other: k * layers["primal"] for other, k in (("denoised", 0.98), ("denoised_base", 0.99))}

@@ -78,7 +78,7 @@ def test_info_says_it(tmp_path, capsys):
     with hidden_oidn():
         assert main(["info", path, "--json"]) == 0
         report = json.loads(capsys.readouterr().out)
-        assert report["auto"] == "ngpt-colour" and report["auto with more"]["OIDN"]["auto"] == "oidn"
+        assert report["auto"] == "nfor" and report["auto with more"]["OIDN"]["auto"] == "oidn"
         assert set(report["auto with more"]["OIDN"]["times the error at"]) == {"4 spp", "16 spp", "64 spp"}
         assert main(["info", path]) == 0
     line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("  OIDN"))

@@ -40,31 +40,6 @@ def test_what_a_stack_must_hold_is_listed_in_order():
     assert inputs.needs(("base",), "wcv") == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
 
 
-def test_what_a_network_can_do_without_is_not_needed_and_zeros_where_it_lacks():
-    names = ("primal", "albedo", "normal", "depth")
-    assert inputs.needs(names, "", ("albedo", "depth")) == ("primal", "normal")
-    assert inputs.needs(("primal", "denoised", "albedo"), "", ("albedo",)) == ("primal", "albedo", "normal")
-    stack = full_stack(7, 9)
-    bare = repair(without(stack, "albedo", "depth"))
-    given = inputs.gather(bare, names, "", optional=("albedo", "normal", "depth"))
-    assert given["albedo"].shape == (7, 9, 3) and given["depth"].shape == (7, 9, 1)
-    assert not given["albedo"].any() and not given["depth"].any() and given["albedo"].dtype == np.float32
-    # What there is, it gets.
-    assert np.array_equal(given["normal"], stack["normal"])
-
-
-def test_a_network_that_sees_emission_reads_the_image_as_it_was_written():
-    stack = full_stack(7, 9)
-    direct = np.zeros_like(stack["primal"])
-    direct[2:4, 3:5] = 8
-    data = repair(stack.replace(primal=stack["primal"] + direct, direct=direct))
-    seen = inputs.gather(data, ("primal",), "", emission=True)["primal"]
-    assert np.allclose(seen, stack["primal"] + direct)
-    assert np.allclose(inputs.gather(data, ("primal",), "")["primal"], stack["primal"], atol=1e-6)
-    assert np.allclose(inputs.without_emission(seen, data, True), stack["primal"], atol=1e-6)
-    assert inputs.without_emission(seen, data, False) is seen
-
-
 def test_standard_errors_are_roots_and_0_where_nothing_is_known():
     stack = full_stack(9, 8)
     variance = stack["primal_var"].copy()

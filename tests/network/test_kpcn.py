@@ -195,7 +195,6 @@ def test_what_it_reads_of_a_stack():
         ({"channels": (4, 4), "units": (1, 1)}, "'kpcn' has one level"),
         ({"units": ()}, "give a positive number, up to 32, for each of 1 levels"),
         ({"start": ("primal",)}, "network 'kpcn' goes without start"),
-        ({"optional": ("albedo",)}, "network 'kpcn' goes without optional"),
         ({"sweeps": 2, "quiet": 1.0}, "network 'kpcn' goes without quiet, sweeps"),
     ],
 )

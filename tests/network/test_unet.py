@@ -382,18 +382,10 @@ def test_errors_are_explained():
             ModelConfig("plain", (4,), (), ("primal", "base", "primal_se"), "wcv", quiet=quiet)
     with pytest.raises(NgptError, match="start 'denoised'"):
         ModelConfig("plain", (4,), (), ("primal",), start=("denoised",))
-    for optional in ("primal", "albedo"):
-        with pytest.raises(NgptError, match=f"optional {optional}: must be inputs, and among albedo, normal, depth"):
-            ModelConfig("plain", (4,), (), ("primal", "normal"), optional=(optional,))
-    with pytest.raises(NgptError, match="emission with inputs primal, dx: only primal, albedo, normal, depth go"):
-        ModelConfig("plain", (4,), (), ("primal", "dx"), emission=True)
-    with pytest.raises(NgptError, match="emission = 'false': must be true or false"):
-        ModelConfig("plain", (4,), (), ("primal",), emission="false")
 
 
 def test_what_a_stack_must_hold():
     assert ModelConfig("plain", (4,), (), ("primal", "albedo")).needs == ("primal", "albedo")
-    assert ModelConfig("plain", (4,), (), ("primal", "albedo"), optional=["albedo"]).needs == ("primal",)
     config = ModelConfig("plain", (4,), (), ("primal", "base", "dx_se"), "wcv")
     assert config.needs == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
     # The other denoiser wants features, though the network does not read them.

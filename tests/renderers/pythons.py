@@ -2,7 +2,7 @@
 project's files.
 
     python3.11 -m venv .renderers
-    .renderers/bin/pip install "bpy==5.0.*" pyluxcore onnxruntime
+    .renderers/bin/pip install "bpy==5.0.*" pyluxcore
 """
 
 import os

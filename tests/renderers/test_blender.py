@@ -1,10 +1,8 @@
-"""Files that Blender wrote: their layers, what `auto` makes of them, and the add-on in Blender itself."""
-
-import json
+"""Files that Blender wrote: their layers, and what `auto` makes of them."""
 
 import numpy as np
 import pytest
-from pythons import ROOT, python_with, run
+from pythons import run
 
 import ngpt
 from ngpt.denoisers import oidn
@@ -13,8 +11,6 @@ from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
 pytestmark = pytest.mark.slow
 
 SIZE = (256, 144)
-# `auto` where OIDN is not installed, over OIDN's error. ngpt-colour is what sets it: tighten it with every new one.
-WITHOUT_OIDN = 4.0
 
 
 def render(folder, *options, size=SIZE):
@@ -102,63 +98,10 @@ def test_what_cycles_denoised_is_not_denoised_again(tmp_path):
     assert np.abs(denoised - noisy["primal"]).mean() > 0.01
 
 
-def test_auto_leaves_no_more_than_oidn_and_is_near_it_without(scene, monkeypatch):
+def test_auto_leaves_no_more_than_oidn_and_denoises_without(scene, monkeypatch):
     stack, error = scene
     theirs, noisy = error(ngpt.denoise(stack, method="oidn")), error(stack["primal"])
     assert error(ngpt.denoise(stack)) <= 1.001 * theirs < 0.25 * noisy
     monkeypatch.setattr(oidn, "find_spec", lambda name: None)
     result = ngpt.reconstruct(stack)
-    assert result.method not in ("oidn", "primal")
-    ours = error(result.image)
-    print(f"{result.method} {ours:.5f}, OIDN {theirs:.5f}: {ours / theirs:.2f}; input {noisy:.5f}")
-    assert ours <= WITHOUT_OIDN * theirs
-
-
-# --- the add-on ------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def addon(tmp_path_factory):
-    """A folder with what the add-on did, and its report."""
-    folder = tmp_path_factory.mktemp("addon")
-    python_with("onnxruntime")
-    run("bpy", "blender_addon.py", ROOT / "export" / "hosts" / "blender" / "ngpt_denoise.py",
-        ROOT / "ngpt" / "weights", folder, BLENDER_USER_RESOURCES=str(folder / "user"))  # fmt: skip
-    said = json.loads((folder / "report.json").read_text())
-    assert "failed" not in said, said["failed"]
-    return folder, said
-
-
-@pytest.mark.parametrize("name", ["passes", "tiles", "colour"])
-def test_the_addons_pixels_are_ours(addon, name):
-    folder, said = addon
-    assert said.get(name, "") == ""
-    stack = ngpt.read(folder / f"{'colour' if name == 'colour' else 'passes'}.exr")
-    assert ("albedo" in stack) == (name != "colour")
-    expected = ngpt.denoise(stack, method="ngpt-colour")
-    image = np.load(folder / f"{name}.npy")
-    assert image.shape[:2] == expected.shape[:2]
-    assert np.abs(image[..., :3] - expected).max() <= 1e-4 * expected.max()
-    if name == "colour":
-        assert np.array_equal(image[..., 3:], stack["alpha"]) and stack["alpha"].min() == 0
-
-
-def test_the_addon_leaves_the_scene_as_it_was(addon):
-    _, said = addon
-    assert "scripts" in said["installed"] and said["settings stay"] and said["removed"]
-    assert said["image"] == [True, "Linear Rec.709", True]
-    assert said["panel"] == ["network", "denoising_store_passes", "render.ngpt_denoise"]
-
-
-@pytest.mark.parametrize(
-    ("case", "message"),
-    [
-        ("no render", "there is no render yet"),
-        ("no network", "there is no network at"),
-        ("needs gradients", "ngpt-fast.onnx needs dx, dy, "),
-        ("no onnxruntime", "-m pip install onnxruntime"),
-    ],
-)
-def test_the_addon_says_what_is_missing(addon, case, message):
-    said = addon[1][case]
-    assert message in said and "Traceback" not in said and "\n" not in said
+    assert result.method == "nfor" and error(result.image) < 0.5 * noisy

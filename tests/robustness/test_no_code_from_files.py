@@ -199,8 +199,8 @@ def test_networks_that_refer_to_other_files_are_refused(tmp_path, location):
         ("ngpt.base", "../x", r"base '\.\./x'"),
         ("ngpt.inputs", "primal, secret", "its metadata tell of base, primal, secret, statistics"),
         ("ngpt.alignment", "many", "lacks the metadata"),
-        ("ngpt.optional", "primal", "its optional inputs are primal"),
-        ("ngpt.emission", "true", "reads emission and primal, dx"),
+        ("ngpt.optional", "direct, albedo", "a network of colour alone, as earlier versions had"),
+        ("ngpt.emission", "true", "a network of colour alone, as earlier versions had"),
     ],
 )
 def test_networks_whose_metadata_lie_are_refused(tmp_path, key, value, message):

@@ -155,21 +155,6 @@ def test_factors_of_noise_are_checked(factors):
         Augmentation(quieter=factors)
 
 
-def test_features_are_absent_as_often_as_asked_for():
-    rng, shown = np.random.default_rng(4), []
-    for _ in range(1000):
-        after = Augmentation(absent=0.4)(example(), rng)
-        shown.append([bool(after[name].any()) for name in ("albedo", "normal")])
-        assert after["primal"].any() and after["depth"].any()
-    albedo, normal = np.array(shown).T
-    assert abs(albedo.mean() - 0.6) < 0.06 and abs(normal.mean() - 0.4) < 0.06
-    # Who knows the normal knows the albedo.
-    assert not (normal & ~albedo).any()
-    for probability in (-0.1, 1.1, float("nan")):
-        with pytest.raises(NgptError, match="absent"):
-            Augmentation(absent=probability)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 4), (16, 24)])
 def test_padding_reflects_and_keeps_the_differences(size):
     layers = {name: layer[None] for name, layer in example(*size).items()}

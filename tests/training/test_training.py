@@ -23,7 +23,6 @@ from ngpt.training.augment import Augmentation  # noqa: E402
 from ngpt.training.schedule import learning_rate  # noqa: E402
 from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
 from ngpt.training.trainer import Trainer, published  # noqa: E402
-from ngpt.training.validation import validate  # noqa: E402
 
 CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
 SETTINGS = {
@@ -185,40 +184,6 @@ def test_the_target_is_where_the_input_is():
     for i in range(5):
         example = drawn[i]
         assert torch.allclose(example["primal"][:, 15:-15, 15:-15], example["target"], rtol=1e-3, atol=1e-3)
-
-
-class LampCrop(SyntheticCrop):
-    """With a lamp in the picture; ``aside`` keeps it as a layer of its own, as our samplers do."""
-
-    def __init__(self, aside: bool):
-        super().__init__("lamp", 0)
-        self.aside, self.lamp = aside, np.zeros_like(self.reference)
-        self.lamp[10:20, 12:25] = 5
-        self.reference = self.reference + self.lamp
-        self.reference_direct = self.lamp if aside else 0 * self.lamp
-
-    def stack(self, k):
-        self.reference, whole = self.reference - self.lamp, self.reference
-        stack = super().stack(k)
-        self.reference = whole
-        stack = stack.replace(primal=stack["primal"] + self.lamp)
-        return stack.replace(direct=self.lamp) if self.aside else stack
-
-
-def test_a_network_that_sees_emission_learns_the_same_whether_it_is_kept_aside_or_not():
-    from ngpt.network.model import Reconstructor
-
-    model = {"network": "plain", "units": [], "inputs": ["primal", "albedo"], "start": ["primal"], "emission": True}
-    config = from_dict({"model": SETTINGS["model"] | model}, "test").model
-    augmentation = Augmentation(quieter=(0.1, 0.5))
-    aside, within = (examples.Examples([LampCrop(a)], config, augmentation, 32, seed=0) for a in (True, False))
-    for i in range(6):
-        for name, layer in aside[i].items():
-            assert torch.allclose(layer, within[i][name], rtol=1e-4, atol=1e-5), name
-    assert max(float(aside[i]["target"].max()) for i in range(6)) > 3
-    scores = [validate(Reconstructor(config), [(LampCrop(a), 0)]) for a in (True, False)]
-    assert np.allclose(scores[0].primal, scores[1].primal, rtol=1e-3)
-    assert np.allclose(scores[0].network, scores[1].network, rtol=1e-3)
 
 
 class CausticCrop(SyntheticCrop):

@@ -32,16 +32,11 @@ def layers(config: ModelConfig) -> tuple[str, ...]:
     return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *DENOISED) if name in needed)
 
 
-def optional(config: ModelConfig) -> tuple[str, ...]:
-    """Those of the inputs that may be zeros everywhere."""
-    return ("direct", *config.optional)
-
-
 def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto) -> Graph:
     """The graph around a network of that configuration, ``channels`` to ``prediction``."""
     graph = Graph("reconstruction")
     raw = _buffers(graph, layers(config))
-    data = _repaired(config, raw)
+    data = _repaired(raw)
     given = graph.input("statistics", (5,), np.zeros(5))
     is_given = op.Greater(op.ReduceMax(op.Slice(given, [0], [1]), keepdims=0), 0.0)
     shared = choose(is_given, lambda: op.Identity(given), lambda: _statistics(config, data), (5,))
@@ -74,7 +69,7 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
         logarithm = base + (logarithm - base) * share
     bounded = op.Min(op.Max(logarithm, signed_log(low / scale)), signed_log(high / scale))
     image = signed_exp(bounded) * scale
-    graph.output("image", image if config.emission else image + data.direct, IMAGE)
+    graph.output("image", image + data.direct, IMAGE)
     return graph
 
 
@@ -85,7 +80,7 @@ def statistics(config: ModelConfig) -> Graph:
     denoised = [name for name in DENOISED if name in config.layers]
     if denoised:
         used |= {"albedo", "normal"}
-    data = _repaired(config, _buffers(graph, tuple(name for name in layers(config) if name in used)))
+    data = _repaired(_buffers(graph, tuple(name for name in layers(config) if name in used)))
     shared = _statistics(config, data)
     graph.output("statistics", shared, (5,))
     if denoised:
@@ -102,11 +97,9 @@ def _buffers(graph: Graph, names: tuple[str, ...]) -> dict[str, Value]:
     return {name: graph.input(name, ("tiles", CHANNELS.get(name, 3), "height", "width")) for name in names}
 
 
-def _repaired(config: ModelConfig, raw: dict[str, Value]) -> Repaired:
-    """The layers as the network sees them: with emission seen directly if it does, and without otherwise."""
+def _repaired(raw: dict[str, Value]) -> Repaired:
+    """The layers as the network sees them: without emission seen directly."""
     data = repaired(raw)
-    if config.emission:
-        data.layers["primal"] = data.layers["primal"] + data.direct
     for name in DENOISED:
         if name in data.layers:
             data.layers[name] = clean(raw[name] - data.direct)

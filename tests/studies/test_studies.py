@@ -1,23 +1,28 @@
-"""Rows of section 5 of the survey that are in the bench: each against an independent solution, and laws of all."""
+"""Methods of section 5 of the survey: each against an independent solution, and laws of all."""
 
 import numpy as np
 import pytest
 from full_stack import full_stack
 from solvers import energy, l1_by_irls, noisy_stack, operator, right_hand_side, solve_sparse
 
-from bench.survey.graph import Edges, least_squares
-from bench.survey.rows import RESAMPLED, ROWS, image_of
+import ngpt
 from ngpt.classical.gradients import forward_differences
 from ngpt.classical.leastsquares import Equations
+from ngpt.methods import by_standing
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.studies import patches as patches_module
 from ngpt.studies.bcd import collaborative
 from ngpt.studies.norms import irls
-from ngpt.studies.patches import Windows, design, patches
+from ngpt.studies.patches import Windows, design
 from ngpt.studies.resampling import resampled
 
+ROWS = ("irls", "wl1", "patches", "nfor-wcv", "nfor-l1", "nfor-wcv-alone", "bcd", "bcd-wl2", "bcd-l1")
 every_row = pytest.mark.parametrize("name", ROWS)
+
+
+def image_of(name, stack):
+    return ngpt.denoise(stack, name)
 
 
 def window_matrix(f, radius, w):
@@ -74,7 +79,7 @@ def test_patches_know_what_features_tell(rng, monkeypatch):
     layers |= {f"{name}_var": np.full(albedo.shape, 0.04) for name in clean}
     features = {"albedo": albedo, "normal": np.zeros(albedo.shape), "depth": np.ones((32, 32, 1))}
     stack = GradientStack.from_arrays(**layers, **features)
-    error = {name: np.mean((image_of(name, stack, []) - albedo) ** 2) for name in ("wl2", "patches")}
+    error = {name: np.mean((image_of(name, stack) - albedo) ** 2) for name in ("wl2", "patches")}
     assert error["patches"] < 0.5 * error["wl2"]
 
 
@@ -101,6 +106,10 @@ def test_collaborative_denoising_lowers_noise_and_keeps_edges(rng):
     assert np.allclose(collaborative(detail, np.zeros_like(detail)), detail, atol=1e-4)
 
 
+def test_every_row_is_a_study():
+    assert {*ROWS, "nlm"} == set(by_standing("study"))
+
+
 def test_resampling_draws_each_pixel_from_its_runs_and_gradients_apart(rng):
     runs = [full_stack(40, 50, seed=i) for i in range(4)]
     merged = runs[0].replace(**{name: np.mean([run[name] for run in runs], axis=0) for name in ("primal", "dx", "dy")})
@@ -121,24 +130,9 @@ def test_resampling_draws_each_pixel_from_its_runs_and_gradients_apart(rng):
     assert np.allclose(same["primal"], runs[0]["primal"])
 
 
-def test_least_squares_take_a_graph(rng):
-    """Edges of neighbours give the sparse solution; one edge across the image ties its ends and nothing else."""
-    _, primal, dx, dy, _ = noisy_stack(6, 7, dtype=np.float64)
-    number = np.arange(42).reshape(6, 7)
-    x = Edges(number[:, :-1].ravel(), number[:, 1:].ravel(), dx[:, :-1].reshape(-1, 3), np.full(36, 2.0))
-    y = Edges(number[:-1].ravel(), number[1:].ravel(), dy[:-1].reshape(-1, 3), np.full(35, 3.0))
-    weights = np.concatenate([np.full(42, 0.5), x.weight, y.weight])
-    image = least_squares(primal, np.full((6, 7), 0.5), [x, y])
-    assert np.allclose(image, solve_sparse(primal, dx, dy, 1.0, weights))
-    far = Edges(np.array([0]), np.array([41]), np.full((1, 3), 9.0), np.array([1e9]))
-    tied = least_squares(primal, np.ones((6, 7)), [far])
-    assert np.allclose(tied[5, 6] - tied[0, 0], 9) and np.allclose(tied[5, 6] + tied[0, 0], primal[5, 6] + primal[0, 0])
-    assert np.allclose(tied.reshape(-1, 3)[1:-1], primal.reshape(-1, 3)[1:-1])
-
-
 @every_row
 def test_exposure_only_scales(name):
-    one, two = (image_of(name, full_stack(18, 26, scale), []) for scale in (1.0, 1024.0))
+    one, two = (image_of(name, full_stack(18, 26, scale)) for scale in (1.0, 1024.0))
     assert one.dtype == np.float32 and np.allclose(1024 * one, two, rtol=0.01, atol=0.01 * np.abs(two).max())
     assert np.abs(one - full_stack(18, 26)["primal"]).max() > 0.01
 
@@ -146,7 +140,7 @@ def test_exposure_only_scales(name):
 @every_row
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (9, 1), (2, 3)])
 def test_any_size(name, size):
-    assert np.isfinite(image_of(name, full_stack(*size), [])).all()
+    assert np.isfinite(image_of(name, full_stack(*size))).all()
 
 
 @every_row
@@ -155,7 +149,7 @@ def test_pixels_that_are_not_finite_do_not_spread(name):
     layers = {layer: stack[layer].copy() for layer in ("primal", "dx", "dy", "primal_var", "albedo")}
     for layer in layers.values():
         layer[5:8, 6:9], layer[12, 3, 1] = np.nan, np.inf
-    image = image_of(name, stack.replace(**layers), [])
+    image = image_of(name, stack.replace(**layers))
     assert np.isfinite(image).all() and image.max() < 3 * stack["primal"].max()
 
 
@@ -165,12 +159,5 @@ def test_exact_gradients_without_noise_return_the_image(name, rng):
     dx, dy = forward_differences(image)
     zero = {f"{layer}_var": np.zeros_like(image) for layer in ("primal", "dx", "dy")}
     features = {"albedo": image, "normal": np.zeros_like(image), "depth": np.ones((20, 30, 1), np.float32)}
-    result = image_of(name, GradientStack.from_arrays(primal=image, dx=dx, dy=dy, **zero, **features), [])
+    result = image_of(name, GradientStack.from_arrays(primal=image, dx=dx, dy=dy, **zero, **features))
     assert np.abs(result - image).max() < 2e-3
-
-
-def test_rows_of_runs(rng):
-    runs = [full_stack(18, 26, seed=i) for i in range(4)]
-    for name in RESAMPLED:
-        assert np.isfinite(image_of(name, runs[0], runs)).all()
-    assert patches(repair(runs[0])).shape == (18, 26, 3)
