@@ -70,17 +70,25 @@ def toy():
     del SAMPLERS["toy"]
 
 
-NAMES = [*SAMPLERS, "toy"]
+def cases(dear=lambda entry: entry.batch):
+    """(name, whether the law runs at full length) of every sampler.
+
+    Short for those that are ``dear``, since their passes take long to start, and at full length in the slow suite.
+    Studies run there alone, as the toy does, whose laws are those of a film with splats.
+    """
+    found = []
+    for name, entry in (SAMPLERS | {"toy": TOY}).items():
+        apart = entry.standing == "study" or name == "toy"
+        if not apart:
+            found.append(pytest.param(name, not dear(entry), id=name))
+        if apart or dear(entry):
+            found.append(pytest.param(name, True, id=f"{name}-long", marks=pytest.mark.slow))
+    return found
 
 
-# Passes of chains, of photons and of paths from both ends take long to start, and some laws take many. Of photons `ppm`
-# stands for all others; the toy's are those of a film with splats, which has tests, as tiles have of their bias.
-PHOTONS = ("gpm", "vpm", "gvpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes", "vcm", "gvcm")
-LONG = ("bdpt", "gbdpt", "gmlt", "gpt-tiles", "split", "toy", *PHOTONS)
-
-
-def long_slow(names):
-    return [pytest.param(name, marks=pytest.mark.slow) if name in LONG else name for name in names]
+def passes_of(name, few, many):
+    """So many samples per pixel as are ``few`` passes of a sampler with batches, and ``many`` samples of another."""
+    return few * SAMPLERS[name].batch or many
 
 
 def quick(renderer, name):
@@ -114,8 +122,8 @@ def references_of(mi, description, size):
 
 
 @pytest.mark.parametrize("pixels", DISTANCES)
-@pytest.mark.parametrize("name", long_slow(NAMES))
-def test_unbiased(renderer, name, pixels):
+@pytest.mark.parametrize(("name", "full"), cases())
+def test_unbiased(renderer, name, full, pixels):
     """Over one pixel, and over eight, where wrong densities and weights stand out of the noise."""
     if pixels > 1 and not SAMPLERS[name].gradients:
         pytest.skip("no gradients")
@@ -124,33 +132,33 @@ def test_unbiased(renderer, name, pixels):
     description = quick(renderer, name)
     references = references_of(renderer, description, (32, 32))
     assert references.mean() > 0.01  # black images agree all too well
-    stacks = render_ours(load(renderer, description, (32, 32)), name, pixels=pixels)
+    stacks = render_ours(load(renderer, description, (32, 32)), name, spp=64 if full else 16, pixels=pixels)
     assert ("dx" in stacks[0]) == SAMPLERS[name].gradients
     for layer, result in gradient_tests(stacks, references, pixels=pixels):
         assert result.passed, f"{layer}: {result}"
 
 
-@pytest.mark.parametrize("name", long_slow(NAMES))
-def test_unbiased_where_there_are_holes_and_no_environment(renderer, name):
+@pytest.mark.parametrize(("name", "full"), cases())
+def test_unbiased_where_there_are_holes_and_no_environment(renderer, name, full):
     """Where Mitsuba's ``path`` loses light (docs/use/rendering.md), and no sampler of ours may."""
     if SAMPLERS[name].biased:
         pytest.skip("biased, and says so")
     scene, references = load(renderer, leaf, (32, 32)), references_of(renderer, leaf, (32, 32))
     for pixels in DISTANCES:
         try:
-            stacks = render_ours(scene, name, spp=32, pixels=pixels)
+            stacks = render_ours(scene, name, *(16, 32) if full else (8, 16), pixels=pixels)
         except NgptError as error:
             pytest.skip(f"it refuses holes: {error}")
         for layer, result in gradient_tests(stacks, references, pixels=pixels):
             assert result.passed, f"{layer} over {pixels} pixels: {result}"
 
 
-def gains(renderer, name):
+def gains(renderer, name, full=True):
     """Variance of differences of independent pixels over that of dx and dy: in the mean, and in the median pixel."""
     from ngpt.evaluation.gradientmap import variances_of_differences
     from ngpt.stack import GradientStack
 
-    spp = 16 if SAMPLERS[name].batch == 1 else 256
+    spp = (16 if SAMPLERS[name].batch == 1 else 256) if full else passes_of(name, 8, 64)
     # In a ball there are few photons, and often none.
     options = {"photons": 8} if name == "gvpm" else {}
     layers = render_ours(load(renderer, quick(renderer, name), (48, 48)), name, batches=1, spp=spp, **options)[0]
@@ -169,16 +177,18 @@ FLOORS = (2.5, 4.0)
 FAILURES = 0.25
 
 
-@pytest.mark.parametrize("name", long_slow(name for name, s in SAMPLERS.items() if s.gradients))
-def test_gradients_have_less_noise_than_pixels(renderer, name):
+@pytest.mark.parametrize(("name", "full"), cases())
+def test_gradients_have_less_noise_than_pixels(renderer, name, full):
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
-    for layer, found in zip(("dx", "dy"), gains(renderer, name), strict=True):
+    if not SAMPLERS[name].gradients or name == "toy":  # whose samples of a pass are all one
+        pytest.skip("no gradients to judge")
+    for layer, found in zip(("dx", "dy"), gains(renderer, name, full), strict=True):
         assert all(np.greater(found, FLOORS)), f"{layer}: {found}"
     if SAMPLERS[name].diagnoses:
         from data_gen.render import render_stack
         from ngpt.io.exr import pass_through
 
-        stack = render_stack(scene_for(renderer, name, (32, 24)), 16, 0, name, diagnostics=True)
+        stack = render_stack(scene_for(renderer, name, (32, 24)), 16 if full else 4, 0, name, diagnostics=True)
         assert pass_through(stack)["diagnostics.shiftFailures"].mean() < FAILURES
 
 
@@ -193,17 +203,17 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
     assert not any(np.greater(found, FLOORS).any() for found in gains(renderer, "gpt"))
 
 
-# 64 renders of these take long. Their film is that of the others.
-DEAR = (*LONG, "ppm", "gpt-basic", "gpt-simple")
-SLOW = [pytest.param(name, marks=pytest.mark.slow) if name in DEAR else name for name in NAMES]
-
-
-@pytest.mark.parametrize("name", SLOW)
-def test_variances_are_those_over_seeds(renderer, name):
+@pytest.mark.parametrize(("name", "full"), cases(dear=lambda entry: True))
+def test_variances_are_those_over_seeds(renderer, name, full):
     """The law that every weight of a reconstruction rests on."""
+    from data_gen.passes import render_passes
+
+    scene, entry = scene_for(renderer, name, (24, 16)), SAMPLERS[name]
     # Where a sample is a pass, few of them: passes of one sample take long to start.
-    spp = 6 if SAMPLERS[name].batch == 1 else 16
-    stacks = render_ours(scene_for(renderer, name, (24, 16)), name, batches=64, spp=spp)
+    spp = (6 if entry.batch == 1 else 16) if full else passes_of(name, 3, 16)
+    sample, sensor, more = entry.made(scene), scene.sensors()[0], {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
+    stacks = [render_passes(sample, sensor, seed, spp, **more).develop() for seed in range(64 if full else 24)]
+    low, high = (0.88, 1.12) if full else (0.8, 1.25)
     for layer in ("primal", "dx", "dy"):
         if layer in stacks[0]:
             over_seeds = np.var([stack[layer] for stack in stacks], axis=0, ddof=1, dtype=np.float64)
@@ -212,18 +222,20 @@ def test_variances_are_those_over_seeds(renderer, name):
             most = np.argsort((over_seeds + told).ravel())[: int(0.98 * told.size)]
             ratio = told.ravel()[most].mean() / over_seeds.ravel()[most].mean()
             # Passes of a biased sampler drift, which counts as noise.
-            assert 0.88 < ratio < (1.3 if SAMPLERS[name].biased else 1.12), (layer, ratio)
+            assert low < ratio < high + 0.2 * entry.biased, (layer, ratio)
 
 
 @pytest.mark.parametrize("size", [(16, 12), (7, 5)])
-@pytest.mark.parametrize("name", long_slow(NAMES))
-def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, size):
+@pytest.mark.parametrize(("name", "full"), cases())
+def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, full, size):
     from data_gen import passes
     from data_gen.render import render_stack
 
+    if not full and size == (16, 12):
+        pytest.skip("in the slow suite")
     scene = scene_for(renderer, name, size)
     # Passes of one sample take long to start.
-    spp = 20 if SAMPLERS[name].batch == 1 else 150
+    spp = (20 if SAMPLERS[name].batch == 1 else 150) if full else 3 * SAMPLERS[name].batch + 1
     whole = render_stack(scene, spp, 7, name)
     same(whole, render_stack(scene, spp, 7, name))
     calls = []
@@ -239,14 +251,14 @@ def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeyp
     assert not np.array_equal(whole["primal"], render_stack(scene, spp, 8, name)["primal"])
 
 
-@pytest.mark.parametrize("name", long_slow(NAMES))
-def test_memory_stays_within_its_budget(renderer, name):
+@pytest.mark.parametrize(("name", "full"), cases())
+def test_memory_stays_within_its_budget(renderer, name, full):
     import drjit as dr
 
     from data_gen.render import render_stack
 
     scene = scene_for(renderer, name, (64, 48))
-    spp = 8 if SAMPLERS[name].batch == 1 else 100
+    spp = (8 if SAMPLERS[name].batch == 1 else 100) if full else 5 * SAMPLERS[name].batch
     # Photons with copies along rays need more for any pass at all.
     memory = 60 if SAMPLERS[name].batch == 1 else 40
     whole = render_stack(scene, spp, 1, name)
