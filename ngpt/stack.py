@@ -73,7 +73,7 @@ class GradientStack:
             if lacking := [channel for channel in channels if channel not in place]:
                 raise NgptError(f"AOVs: layer '{name}' lacks {', '.join(lacking)}")
             layers[name] = array[..., [place[channel] for channel in channels]]
-        return cls.from_arrays(attributes=attributes, **layers)
+        return cls(layers, dict(attributes or {}))
 
     @property
     def height(self) -> int:

@@ -166,7 +166,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
         expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
         short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
-    if interrupted := stop() and done != args.spp:
+    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
+    if interrupted := stop() and done != wanted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if "ngpt:for" in stack.attributes:
@@ -183,7 +184,7 @@ def shot(args: argparse.Namespace, console: Console) -> int:
     files = targets(args.output, args.scene, args.frames)
     more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
     more |= {"overwrite": args.force, "skip_existing": args.skip_existing, **asked(args)}
-    with console.progress(f"render {args.scene}", "frames") as progress, stop_on_ctrl_c(ending) as stop:
+    with console.progress(f"render {args.scene}", "frames") as progress:
         said = 0
 
         def made(written: Written, total: int) -> None:
@@ -199,8 +200,9 @@ def shot(args: argparse.Namespace, console: Console) -> int:
         if args.cluster:
             written = write_frames_on_cluster(args.cluster, args.scene, files, shard=args.shard, made=made, **more)
         else:
-            shard = args.shard or (0, 1)
-            written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
+            with stop_on_ctrl_c(ending) as stop:
+                shard = args.shard or (0, 1)
+                written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
     if written.interrupted is not None:
         console.error(f"interrupted: frame {written.interrupted} is left out; --skip-existing goes on with it")
         return 130

@@ -117,3 +117,17 @@ def test_a_configuration_that_is_not_there_is_told_what_there_is(verb, tmp_path,
     errors = capfd.readouterr().err
     assert errors.startswith("ngpt: error: nowhere: cannot be read: no such file; configurations that come with ngpt: ")
     assert "tiny" in errors and errors.count("\n") == 1 and not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments", [["render", "diffuse"], ["info", "diffuse"], ["evaluate", "--config", "eval-tiny"]]
+)
+def test_without_the_renderer_it_is_told_what_is_missing(arguments, tmp_path):
+    code = "import sys; sys.modules['data_gen'] = None; from ngpt.cli import main; sys.exit(main(sys.argv[1:]))"
+    out = ["--out", str(tmp_path / "out")] if arguments[0] == "evaluate" else []
+    run = run_python(code, *arguments, *out)
+    assert run.returncode == 2 and run.stderr.count("\n") == 1
+    assert run.stderr.endswith(
+        "rendering needs the package data_gen, which is not installed; `pip install 'ngpt-recon[render]'`\n"
+    )
+    assert run_python(code, "--help").returncode == 0

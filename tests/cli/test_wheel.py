@@ -75,6 +75,21 @@ def test_it_is_light_without_extras_and_whole_with_train(metadata):
     assert metadata["Description-Content-Type"] == "text/markdown" and "# ngpt" in metadata.get_payload()
 
 
+def test_what_renders_comes_by_entry_points(wheel, tmp_path):
+    """Of the wheel alone: not those of the checkout's installation."""
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(tmp_path / "site")
+    code = (
+        "from importlib.metadata import distributions; from ngpt.cli import all_verbs\n"
+        f"(own,) = [d for d in distributions(path=[{str(tmp_path / 'site')!r}])]\n"
+        "print(sorted((e.group, e.value) for e in own.entry_points), 'render' in all_verbs())"
+    )
+    environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
+    told = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, env=environment, text=True)
+    assert "('ngpt.verbs', 'data_gen.cli:VERBS')" in told and "('ngpt.renderers', 'data_gen.service')" in told
+    assert told.endswith("True\n")
+
+
 def test_its_configurations_are_found_by_name(wheel, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import signal
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled
 from ngpt.cli import main
 from ngpt.errors import NgptError
+from ngpt.system.console import Console
 
 
 def test_frames_are_ranges_lists_and_steps():
@@ -144,3 +146,33 @@ def test_one_pair_is_refused_and_two_are_rendered(renderer, tmp_path, capsys):
     assert main([*words, "--frames", "0:2", "--dt", "2"]) == 0
     stack = ngpt.read(tmp_path / "shot/diffuse.0001.exr")
     assert not stack["dt"].any() and stack["dt_var"].shape == stack["primal"].shape
+
+
+def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer, tmp_path, monkeypatch):
+    from contextlib import contextmanager
+
+    from data_gen.cli import render
+    from data_gen.shot_files import Written
+
+    before = signal.getsignal(signal.SIGINT)
+    seen = []
+    note = lambda *_, **__: seen.append(signal.getsignal(signal.SIGINT)) or Written()  # noqa: E731
+    monkeypatch.setattr(render, "write_frames_on_cluster", note)
+    words = ["render", "diffuse", "--frames", "0:2", "--cluster", "tcp://nowhere:1", "-o", str(tmp_path / "shot")]
+    args = parser_of(words)
+    assert render.run(args, Console(quiet=True)) == 0 and seen == [before]
+    pressed = contextmanager(lambda noted: iter([lambda: True]))
+    monkeypatch.setattr(render, "stop_on_ctrl_c", pressed)
+    one = ["render", "diffuse", "--size", "8x8", "-q", "--sampler", "primal", "-o", str(tmp_path / "a.exr")]
+    assert main(one) == 0 and ngpt.read(tmp_path / "a.exr").attributes["ngpt:spp"] == 32
+    assert main([*one, "--force", "--spp", "100000"]) == 130
+
+
+def parser_of(words):
+    import argparse
+
+    from data_gen.cli import render
+
+    parser = argparse.ArgumentParser()
+    render.add_arguments(parser)
+    return parser.parse_args(words[1:])
