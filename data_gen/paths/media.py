@@ -69,8 +69,15 @@ def dr_number(shape: mi.Shape) -> int:
 # ------------------------------ Vertices ------------------------------
 
 
-def vertex(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, place: Place) -> mi.SurfaceInteraction3f:
+def scatters(place: Place | None) -> mi.Bool:
+    """Whether a vertex is in a medium; ``place`` is None in scenes without media, here and below."""
+    return mi.Bool(False) if place is None else place.scatters
+
+
+def vertex(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, place: Place | None) -> mi.SurfaceInteraction3f:
     """The vertex at the end of a segment, of which ``ray`` and ``hit`` are the last piece."""
+    if place is None:
+        return hit.compute_surface_interaction(ray)
     on_surface = hit.compute_surface_interaction(ray, mi.RayFlags.All, ~place.scatters)
     inside = dr.zeros(mi.SurfaceInteraction3f, dr.width(hit.t))
     inside.t, inside.p, inside.time, inside.wavelengths = hit.t, ray(hit.t), ray.time, ray.wavelengths
@@ -94,7 +101,7 @@ def evaluate_vertex(
 ) -> tuple[mi.Spectrum, mi.Float]:
     """``evaluate()`` for a vertex of either kind: f, with the cosine of a surface, and the density of sampling ``wo``.
 
-    ``bsdf`` is the material of the vertex, null in a medium; ``place`` is None in scenes without media.
+    ``bsdf`` is the material of the vertex, null in a medium.
     """
     if place is None:
         return evaluate(bsdf, x, wo, active)

@@ -111,9 +111,9 @@ def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypat
         ω, shot, J, found = follow(*args)
         return ω, shot, J, found & False
 
-    def kept(scene, plan, first_hit, camera, shifts, chain, Δ):
+    def kept(plan, first_hit, camera, shifts, chain, Δ):
         before = [renderer.Color3f(d) for d in Δ]
-        after = manifold_shift.add_followed(scene, plan, first_hit, camera, shifts, chain, Δ)
+        after = manifold_shift.add_followed(plan, first_hit, camera, shifts, chain, Δ)
         light["recorded"] = np.array(chain.record) != 0
         light["samples"] = np.stack([np.array(b - a).T for a, b in zip(before, after, strict=True)])
         return after

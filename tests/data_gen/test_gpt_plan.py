@@ -9,11 +9,11 @@ from unbiased import gradient_tests, load, render_ours, render_references
 from ngpt.testing import z_test
 
 
-def make_plan(scene, **options):
+def make_plan(scene, *args, hide_emitters=False, **options):
+    from data_gen.paths.walk import Limits
     from data_gen.samplers.gpt import plan
 
-    defaults = {"roughness_threshold": 0.05, "max_depth": 8, "rr_depth": 5, "shift": "replay"}
-    return plan.make_plan(scene, **defaults | {"hide_emitters": False, "caustic": True} | options)
+    return plan.make_plan(scene, *(args or [Limits(8, hide_emitters=hide_emitters)]), **options)
 
 
 def render(scene, spp=16, size=None, **options):

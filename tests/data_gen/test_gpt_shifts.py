@@ -61,12 +61,13 @@ class Steps:
     def __init__(self, mi, shift, threshold=0.05, caustic=True):
         import drjit as dr
 
+        from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt import offset_path
         from data_gen.samplers.gpt.plan import make_plan
 
         self.mi, self.dr = mi, dr
         self.scene = mi.load_dict(museum())
-        self.plan = make_plan(self.scene, threshold, -1, 1000, shift, False, caustic)
+        self.plan = make_plan(self.scene, Limits(rr_depth=1000), threshold, shift, caustic=caustic)
         assert self.plan.replays
         self.random = mi.load_dict({"type": "independent"})
         self.random.seed(7, LANES)
@@ -87,20 +88,21 @@ class Steps:
         return mi.Ray3f(origin, self.dr.normalize(aim - origin))
 
     def base_step(self, x):
-        from data_gen.samplers.gpt.base_path import base_step
+        from data_gen.samplers.gpt.base_path import base_step, begin
 
-        mi, β = self.mi, self.mi.Spectrum(1)
-        state = (β, mi.Float(1), mi.UInt32(1), mi.Bool(True), mi.Bool(False), mi.Bool(False), None)
-        return base_step(self.scene, self.plan, self.u.clone(), x, None, None, *state, [])[0]
+        path = begin(self.plan, x, None, None, self.mi.Spectrum(1))
+        path.β = self.mi.Spectrum(1)
+        return base_step(self.scene, self.plan, self.u.clone(), path, [])[0]
 
     def offset_at(self, ray):
         """An offset path that has come along ``ray``."""
+        from data_gen.paths.space import straight
+        from data_gen.samplers.gpt.base_path import begin
         from data_gen.samplers.gpt.offset_path import start
 
-        mi = self.mi
-        x = self.dr.zeros(mi.SurfaceInteraction3f)
-        hit = self.scene.ray_intersect_preliminary(ray)
-        return start(self.plan, x, mi.Spectrum(1), ray, hit, mi.Spectrum(1), mi.Bool(True))
+        one = self.mi.Spectrum(1)
+        base = begin(self.plan, self.dr.zeros(self.mi.SurfaceInteraction3f), None, None, one)
+        return start(self.plan, base, straight(ray, self.scene.ray_intersect_preliminary(ray)), one, self.mi.Bool(True))
 
     def hits(self, offset):
         return offset.hit.compute_surface_interaction(offset.ray)

@@ -54,6 +54,7 @@ class Room:
 
     def stage(self, frame):
         from data_gen.frames.motion import snapshot
+        from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt.plan import make_plan
         from data_gen.samplers.restir.carry import Stage
 
@@ -62,7 +63,7 @@ class Room:
         self.change(self.mi, params, self.starts, frame)
         params["sensor.to_world"] = self.starts["sensor"] @ self.mi.Transform4f().translate([self.pan * frame, 0, 0])
         params.update()
-        plan = make_plan(scene, 0.05, **self.depths, shift="replay", hide_emitters=False, caustic=False)
+        plan = make_plan(scene, Limits(**self.depths), caustic=False)
         now = snapshot(scene)
         return Stage(scene, plan, scene.sensors()[0], now.shapes), now
 

@@ -17,6 +17,7 @@ class Room:
     """A scene, and a camera that turns and goes sideways from frame to frame: by 1.6 pixels."""
 
     def __init__(self, mi, name, step=0.12):
+        from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt.plan import make_plan
         from data_gen.scenes import builtin
 
@@ -24,7 +25,7 @@ class Room:
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         self.mi, self.step, self.scene = mi, step, mi.load_dict(description)
         depths = {key: description["integrator"].get(key, 5) for key in ("max_depth", "rr_depth")}
-        self.plan = make_plan(self.scene, 0.05, **depths, shift="replay", hide_emitters=False, caustic=False)
+        self.plan = make_plan(self.scene, Limits(**depths), caustic=False)
         self.sensor = self.scene.sensors()[0]
         self.start = np.array(mi.traverse(self.sensor)["to_world"].matrix, np.float64).reshape(4, 4, -1)[..., 0]
 

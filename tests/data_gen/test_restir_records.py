@@ -39,6 +39,7 @@ class Paths:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt.plan import make_plan
         from data_gen.samplers.restir import walk
 
@@ -46,7 +47,7 @@ class Paths:
         self.mi, self.walk = mi, walk
         self.scene = mi.load_dict(description)
         self.sensor = self.scene.sensors()[0]
-        self.plan = make_plan(self.scene, 0.05, 6, 3, "replay", False, False)
+        self.plan = make_plan(self.scene, Limits(6, 3), caustic=False)
         self.camera = CameraSamples(self.sensor, SEED, SPP)
         self.sample = mi.UInt32(np.arange(SIZE * SIZE * SPP) % SPP)
         choice = walk.choices(SEED, self.camera, self.sample)

@@ -7,31 +7,59 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, media, segments
+from data_gen.paths import caustic, media
 from data_gen.paths.lights import emission
+from data_gen.paths.segments import Segment
 from data_gen.paths.shift import mis_weight
-from data_gen.paths.vertex import DELTA, NULL, SMOOTH, event_kind
-from data_gen.samplers.gpt.manifold_shift import Chain, advance
+from data_gen.paths.space import Drawn
+from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
+from data_gen.paths.walk import Sky, roulette
+from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
 
 
 @dataclass
+class Path:
+    """A base path at its current vertex x: the state of the loop. Symbols as in ``gpt``."""
+
+    x: mi.SurfaceInteraction3f
+    place: media.Place | None  # where x is; None in scenes without media
+    channel: mi.UInt32 | None  # by which distances are sampled; None as well
+    β: mi.Spectrum  # throughput up to x; 0 of a ghost
+    η: mi.Float  # product of the relative indices of refraction up to x
+    depth: mi.UInt32  # number of x, from 1 on
+    sky: Sky  # whether an escape sees the environment
+    rough: mi.Bool  # has scattered smoothly at a connectable vertex: see data_gen.paths.caustic
+    late: mi.Bool  # and has later left a vertex by a mirror, glass or sharp gloss
+    chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
+    walks: mi.Bool  # some path of the five may go on from x
+
+    def goes_on(self, plan: Plan, offsets: list) -> mi.Bool:
+        """Whether there is another step: as long as the base path lives, or a ghost has company."""
+        company = dr.any([y.apart for y in offsets])
+        return self.walks & (self.x.is_valid() | company) & (self.depth < plan.limits.max_depth)
+
+
+@dataclass
 class Step:
-    """What the base path does at its current vertex x; x1 is the next one. Symbols as in ``gpt``."""
+    """What the base path does at its vertex x; x1 is the next one."""
 
     x: mi.SurfaceInteraction3f
     x_connectable: mi.Bool
+    place: media.Place | None
     β: mi.Spectrum
-    # Emitter sampling
+    # Random numbers, which offset paths replay
     u_light: mi.Point2f
+    u_lobe: mi.Float
+    u_direction: mi.Point2f
+    drawn: Drawn | None  # in media
+    # Emitter sampling
     light: mi.DirectionSample3f
     light_weight: mi.Spectrum  # Le / p
-    T_light: mi.Spectrum | None  # transmittance
+    T_light: mi.Spectrum | int  # transmittance
     lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
     # BSDF sampling
-    u_lobe: mi.Float
-    u_direction: mi.Point2f
     wo: mi.Vector3f
     η: mi.Float  # relative index of refraction along the sampled direction
     kind: mi.UInt32
@@ -40,8 +68,8 @@ class Step:
     survival: mi.Float  # 1 / probability to survive Russian roulette
     goes_on: mi.Bool  # there is a next vertex, or an escape
     walks: mi.Bool  # some path of the five may go on
-    seen: mi.Bool  # an escape sees the environment
     β1: mi.Spectrum
+    segment: Segment  # from x to x1
     x1: mi.SurfaceInteraction3f
     x1_connectable: mi.Bool
     Le: mi.Spectrum  # emitted at x1 toward x
@@ -49,115 +77,110 @@ class Step:
     L_bsdf: mi.Spectrum  # m Le
     # See data_gen.paths.caustic; L_light and L_bsdf hold nothing of that layer
     L_caustic: mi.Spectrum  # f m Le / p of both techniques
-    rough: mi.Bool  # behind x
-    late: mi.Bool  # behind x
-    ends_late: mi.Bool  # or behind x1 at the latest
+    ends_late: mi.Bool  # the path is late behind x, or behind x1 at the latest
     # See data_gen.samplers.gpt.manifold_shift; L_bsdf and L_caustic hold nothing of that light
     L_followed: mi.Spectrum  # m Le
-    chain: Chain | None  # behind x
-    # See data_gen.paths.media and segments; None in scenes without media
-    place: media.Place | None
-    channel: mi.UInt32 | None
-    numbers: segments.Numbers | None  # of the segment
-    light_key: mi.UInt32 | None  # of the random numbers on the way to the emitter
-    segment: segments.Segment | None
 
 
-def base_step(
-    scene, plan: Plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets
-) -> tuple[Step, mi.Float]:
-    """Samples an emitter and the next vertex from vertex x, the ``depth``-th; returns the step and the product of η.
+def begin(plan: Plan, x: mi.SurfaceInteraction3f, place, channel, β: mi.Spectrum) -> Path:
+    """A base path at its first vertex; one that finds nothing has no throughput, but may walk on as a ghost."""
+    return Path(
+        x=x,
+        place=place,
+        channel=channel,
+        β=dr.select(x.is_valid(), β, 0),
+        η=mi.Float(1),
+        depth=mi.UInt32(1),
+        sky=Sky.from_camera(plan.hides),
+        rough=mi.Bool(False),
+        late=mi.Bool(False),
+        chain=no_chain(dr.width(x.t)) if plan.manifold else None,
+        walks=mi.Bool(True),
+    )
+
+
+def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Step, Path]:
+    """Samples an emitter and the next vertex from the ``path``'s vertex; returns that step, and the path behind it.
 
     Random numbers are drawn whether used or not: a replay needs the same ones, whatever its path meets.
     """
+    x, place, space = path.x, path.place, plan.space
+
     # ---------------------- Random numbers -----------------------
     u_light, u_lobe, u_direction = random.next_2d(), random.next_1d(), random.next_2d()
     u_survival = random.next_1d()
-    numbers = segments.draw(random, plan.media) if plan.media else None
-    light_key = random.next_key() if plan.media and plan.media.grids else None
+    drawn = space.draw(random, path.channel)
 
     # --------------------- Emitter sampling ----------------------
     bsdf = x.bsdf()
-    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    if plan.media:
-        lit |= place.scatters
+    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(place)
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
     light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
     lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once
     f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
     # No shadow ray toward what lies behind the surface, but for those who arrive from elsewhere.
-    shadow_ray, T_light = x.spawn_ray_to(light.p), None
     asked = lit & ((dr.max(f) > 0) | dr.any([y.joined for y in offsets]))
-    if plan.media:
-        T_light = segments.transmittance(scene, plan.media, x, place, shadow_ray, light.p, channel, light_key, asked)
-        lit &= dr.max(T_light) > 0
-    else:
-        lit &= ~scene.ray_test(shadow_ray, asked)
+    T_light, visible = space.sees(x, place, light.p, drawn, asked)
+    lit &= visible
     # The sample's share of L (survey, eq. 2), weighted by m against the density p of finding it by BSDF sampling
-    L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0)
-    if plan.media:
-        L_light *= T_light
+    L_light = dr.select(lit, f * light_weight * light_mis(light.delta, light.pdf, p), 0) * T_light
 
     # ----------------------- BSDF sampling -----------------------
     found = sample.pdf > 0
     # At its end a base path reconnects to nothing: with DELTA its offset paths are sent to replay, beside a ghost.
     kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
-    # An environment that hides from the camera hides as well behind holes, where nothing has been scattered yet.
-    seen = seen | (kind != NULL)
-    η = dr.select(found, η * sample.eta, η)
+    sky = path.sky.behind(kind)
+    η = dr.select(found, path.η * sample.eta, path.η)
 
     # ---------------------- Russian roulette ---------------------
-    survival, walks = roulette(plan, depth, β * f_p, f_p, η, u_survival, offsets)
+    largest = brightest(path.β * f_p, f_p, offsets)
+    q = roulette(largest, path.depth >= plan.limits.rr_depth, η)
+    survival, walks = dr.rcp(q), (largest > 0) & (u_survival < q)
     goes_on = walks & found
     # All five paths survive together: 1 / q is a factor of each throughput, and cancels in r (survey, eq. 17).
     f_p = dr.select(goes_on, f_p * survival, 0)
 
     # ------------------- Next vertex, and Le there ---------------
-    ray, segment = x.spawn_ray(x.to_world(sample.wo)), None
-    if plan.media:
-        trace, medium = segments.next_surface(scene), place.toward(x, ray.d)
-        segment = segments.fly(plan.media, trace, ray, medium, channel, numbers, goes_on)
-        x1 = media.vertex(segment.ray, segment.hit, segment.place)
-        # Of the whole segment
-        x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
-        f_p *= segment.weight
-    else:
-        x1 = scene.ray_intersect(ray, goes_on)
-    x_connectable = plan.materials.connectable(bsdf)
-    if plan.media:
-        x_connectable |= place.scatters
+    ray = x.spawn_ray(x.to_world(sample.wo))
+    segment = space.fly(x, place, ray, drawn, goes_on)
+    x1 = space.end(x, segment)
+    f_p *= segment.weight
+    β1 = path.β * f_p
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
-    Le, p_light = emission(scene, x1, x, goes_on & (x1.is_valid() | seen), goes_on & (kind == SMOOTH))
-    L_bsdf, ends_late = Le * mis_weight(sample.pdf, p_light), mi.Bool(False)
-    L_caustic, L_followed = mi.Spectrum(0), mi.Spectrum(0)
+    Le, p_light = emission(scene, x1, x, goes_on & sky.meets(x1), goes_on & (kind == SMOOTH))
+    L_bsdf = Le * mis_weight(sample.pdf, p_light)
 
     # ------------------- The layer ``caustic`` -------------------
+    x_connectable = plan.materials.connectable(bsdf) | media.scatters(place)
+    rough, late, chain, ends_late = path.rough, path.late, path.chain, mi.Bool(False)
+    L_caustic, L_followed = mi.Spectrum(0), mi.Spectrum(0)
     if plan.caustic:
         L_light, caustic_light = caustic.split(caustic.lit_late(rough, late, x_connectable), L_light)
         rough, late = caustic.classes(rough, late, found, kind, x_connectable)
         L_bsdf, caustic_bsdf = caustic.split(late, L_bsdf)
         if plan.manifold:
-            event = sample.sampled_type
-            chain, follows = advance(chain, depth, event, goes_on, x_connectable, survival, late, x1, Le)
+            chain = advance(chain, sample.sampled_type, goes_on, x_connectable)
+            chain, follows = chain.end(path.depth, survival, late, x1, Le)
             caustic_bsdf, L_followed = caustic.split(follows, caustic_bsdf)
         L_caustic = caustic_light + f_p * caustic_bsdf
-        smooth, sharp = kind == SMOOTH, plan.materials.sharp(x1, scene)
-        if plan.media:
-            sharp &= ~segment.place.scatters
-        ends_late = late | caustic.ends_late(smooth, x_connectable, sharp)
+        sharp = plan.materials.sharp(x1, scene) & ~media.scatters(segment.place)
+        ends_late = late | caustic.ends_late(kind == SMOOTH, x_connectable, sharp)
+
     step = Step(
         x=x,
         x_connectable=x_connectable,
-        β=β,
+        place=place,
+        β=path.β,
         u_light=u_light,
+        u_lobe=u_lobe,
+        u_direction=u_direction,
+        drawn=drawn,
         light=light,
         light_weight=light_weight,
         T_light=T_light,
         lit=lit,
         L_light=L_light,
-        u_lobe=u_lobe,
-        u_direction=u_direction,
         wo=sample.wo,
         η=sample.eta,
         kind=kind,
@@ -166,45 +189,42 @@ def base_step(
         survival=survival,
         goes_on=goes_on,
         walks=walks,
-        seen=seen,
-        β1=β * f_p,
+        β1=β1,
+        segment=segment,
         x1=x1,
-        x1_connectable=~x1.is_valid() | plan.materials.connectable(x1.bsdf()),
+        x1_connectable=~x1.is_valid() | plan.materials.connectable(x1.bsdf()) | media.scatters(segment.place),
         Le=Le,
         p_light=p_light,
         L_bsdf=L_bsdf,
         L_caustic=L_caustic,
-        rough=rough,
-        late=late,
         ends_late=ends_late,
         L_followed=L_followed,
-        chain=chain,
-        place=place,
-        channel=channel,
-        numbers=numbers,
-        light_key=light_key,
-        segment=segment,
     )
-    if plan.media:
-        step.x1_connectable |= segment.place.scatters
-    return step, η
+    behind = Path(
+        x=x1,
+        place=segment.place,
+        channel=path.channel,
+        β=dr.select(x1.is_valid(), β1, 0),
+        η=η,
+        depth=path.depth + 1,
+        sky=sky,
+        rough=rough,
+        late=late,
+        chain=chain,
+        walks=walks,
+    )
+    return step, behind
 
 
-def roulette(plan: Plan, depth, β1, f_p, η, u, offsets) -> tuple[mi.Float, mi.Bool]:
-    """Russian roulette: 1 / probability to survive, and whether the path does.
-
-    By the throughput of the brightest of all five paths, so that none is starved.
-    """
+def brightest(β1: mi.Spectrum, f_p: mi.Spectrum, offsets: list) -> mi.Float:
+    """The throughput of the brightest of all five paths behind a step, by which they survive: so none is starved."""
     largest = dr.max(β1)
     for y in offsets:
         # What an offset path may yet bring to Δ / 2: w β' until it is settled, with its β' of before this step, since
         # its f is not known yet; then w |β' - β|, which is |a| / 2.
         ahead = dr.select(y.apart | y.joined, dr.max(y.β) / (1 + y.r), 0)
         largest = dr.fmax(largest, dr.fmax(ahead, dr.max(dr.abs(y.a * f_p)) / 2))
-    # As in ``path``: η² undoes what refraction does to radiance, and none survives for ever, were it a perfect mirror.
-    q = dr.fmin(largest * dr.square(η), 0.95)
-    plays = depth >= plan.rr_depth
-    return dr.select(plays, dr.rcp(q), 1), (largest > 0) & (~plays | (u < q))
+    return largest
 
 
 def light_mis(delta: mi.Bool, p_light: mi.Float, p: mi.Float) -> mi.Float:

@@ -39,6 +39,7 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
@@ -46,14 +47,14 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths import media, segments
+from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, like_path
-from data_gen.samplers.gpt.base_path import base_step
-from data_gen.samplers.gpt.manifold_shift import add_followed, no_chain
-from data_gen.samplers.gpt.offset_path import first_steps, later_steps, start
+from data_gen.samplers.gpt.base_path import Path, base_step, begin
+from data_gen.samplers.gpt.manifold_shift import Chain, add_followed
+from data_gen.samplers.gpt.offset_path import Offset, first_steps, later_steps, start
 from data_gen.samplers.gpt.plan import Plan, make_plan
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name, media_of
@@ -111,132 +112,111 @@ class GPT(GradientIntegrator):
                 f"sampler 'gpt' does not follow polarised light (variant '{mi.variant()}'); "
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
+        volumes = self.volumes and bool(media_of(scene))
         return make_plan(
-            scene,
-            roughness_threshold=self.roughness_threshold,
-            max_depth=self.limits.max_depth,
-            rr_depth=self.limits.rr_depth,
-            shift=self.shift,
-            hide_emitters=self.limits.hide_emitters,
-            caustic=self.caustic,
-            volumes=self.volumes and bool(media_of(scene)),
+            scene, self.limits, self.roughness_threshold, self.shift, caustic=self.caustic, volumes=volumes
         )
 
     def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
         # ------------------------- Paths -----------------------------
         ray, importance, _ = camera.rays()
-        within = mi.MediumPtr(camera.sensor.get_medium()) if plan.media else None
+        within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        random = camera.random.clone()
-        L, Le, L_caustic, offsets, chain = self.trace(scene, plan, random, ray, importance, shifted, within)
-        Le = self.emission_in_pixel(scene, camera, Le, plan.media, within)
-        L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (L, Le, L_caustic))
-        Δ = [to_rgb(y.Δ, ray.wavelengths) for y in offsets]
+        paths = self.trace(scene, plan, camera.random.clone(), (ray, importance), shifted, within)
+        Le = self.emission_in_pixel(scene, camera, paths.Le, plan.space.media, within)
+        L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (paths.L, Le, paths.L_caustic))
+        Δ = [to_rgb(y.Δ, ray.wavelengths) for y in paths.offsets]
 
         # ------------------------ Samples ----------------------------
         inside = [inside for _, _, inside in shifted]
         if self.reuse:
-            L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in offsets], Δ, inside)
+            L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in paths.offsets], Δ, inside)
         values = {"primal": L + Le, "direct": Le}
         if plan.caustic:
             values["caustic"] = L_caustic
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         if self.diagnostics:
-            values["shift_failures"] = count([y.failed for y in offsets]) / dr.fmax(count(inside), 1)
+            values["shift_failures"] = count([y.failed for y in paths.offsets]) / dr.fmax(count(inside), 1)
         # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside, chain)
+        dr.eval(values, Δ, inside, paths.chain)
         if plan.manifold:
-            Δ = add_followed(scene, plan, self.first_hit, camera, list(SHIFTS.values()), chain, Δ)
+            first_hit = partial(self.first_hit, scene)
+            Δ = add_followed(plan, first_hit, camera, list(SHIFTS.values()), paths.chain, Δ)
         for name, value in values.items():
             film.put(name, value)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
 
-    def trace(self, scene, plan: Plan, random, ray, importance, shifted, within):
-        """L, Le and the four offset paths at their ends, in the order of SHIFTS, of base paths that begin with ``ray``.
+    def trace(self, scene, plan: Plan, random, camera_ray: tuple, shifted: list, within=None) -> Traced:
+        """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
 
-        The camera is in the medium ``within``. At the first vertex all offset paths are apart, and few later on: that
-        step stands before the loop.
+        Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``.
+        At the first vertex all of them are apart, and few later on: that step stands before the loop.
         """
         # --------------------- First vertices ------------------------
-        seen = mi.Bool(not plan.hides)
-        if plan.media:
-            channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, plan.media)
-
-            def fly(ray, importance):
-                trace = partial(self.first_surface, scene)
-                segment = segments.fly(plan.media, trace, ray, within, channel, numbers, mi.Bool(True))
-                return segment, importance * segment.weight
-
-            first, β = fly(ray, importance)
-            hit, place = first.hit, first.place
-            x = media.vertex(first.ray, hit, place)
-            Le = importance * self.lamps_in_fog(scene, plan.media, ray, within, channel)
-            L_first = β * self.behind_grids(scene, plan.media, first)
-            offsets = []
-            for offset_ray, offset_importance, inside in shifted:
-                there, offset_β = fly(offset_ray, offset_importance)
-                y = start(plan, x, β, there.ray, there.hit, offset_β, inside, there.place)
-                if plan.media.grids:
-                    # Both paths replay the numbers of this segment: r = 1, w = 1/2.
-                    y.Δ = offset_β * self.behind_grids(scene, plan.media, there) - L_first
-                    y.A = dr.select(inside, 1, 2) * L_first
-                offsets.append(y)
+        (ray, importance), space = camera_ray, plan.space
+        drawn = space.begin(random)
+        first = space.first(self, ray, within, drawn)
+        x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
+        path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
+        # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
+        if space.media:
+            Le = importance * self.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
         else:
-            x, β = self.first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray)), importance
-            # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
-            Le = importance * x.emitter(scene).eval(x, (x.is_valid() | seen) & (plan.max_depth > 0))
-            offsets, place, channel, L_first = [], None, None, 0
-            for offset_ray, offset_importance, inside in shifted:
-                hit = self.first_hit(scene, offset_ray)
-                offsets.append(start(plan, x, β, offset_ray, hit, offset_importance, inside))
-        chain = no_chain(dr.width(hit.t)) if plan.manifold else None
-        if plan.max_depth < 2:
-            none = dr.zeros(mi.Spectrum, dr.width(hit.t))
-            return none + L_first, Le, none, offsets, chain
+            Le = importance * x.emitter(scene).eval(x, path.sky.meets(x) & (plan.limits.max_depth > 0))
+        L = L_first = β * self.behind_grids(scene, space.media, first) if space.grids else mi.Spectrum(0)
+        offsets = []
+        for offset_ray, offset_importance, inside in shifted:
+            there = space.first(self, offset_ray, within, drawn)
+            y = start(plan, path, there, offset_importance, inside)
+            if space.grids:
+                # Both paths replay the numbers of this segment: r = 1, w = 1/2.
+                y.Δ = y.β * self.behind_grids(scene, space.media, there) - L_first
+                y.A = dr.select(inside, 1, 2) * L_first
+            offsets.append(y)
+        L, L_caustic = L + dr.zeros(mi.Spectrum, dr.width(first.hit.t)), dr.zeros(mi.Spectrum, dr.width(first.hit.t))
+        if plan.limits.max_depth < 2:
+            return Traced(L, Le, L_caustic, offsets, path.chain)
 
         # --------------------- The first step ------------------------
-        # A base path that finds nothing has no throughput, but walks on as a ghost, for its offset paths' sake.
-        β = dr.select(x.is_valid(), β, 0)
-        false = mi.Bool(False)
-        step, η = base_step(
-            scene, plan, random, x, place, channel, β, mi.Float(1), mi.UInt32(1), seen, false, false, chain, offsets
-        )
+        step, path = base_step(scene, plan, random, path, offsets)
         # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
-        L = L_first + β * step.L_light + step.β1 * step.L_bsdf
-        L_caustic = β * step.L_caustic if plan.caustic else step.L_caustic
+        L += step.β * step.L_light + step.β1 * step.L_bsdf
+        if plan.caustic:
+            L_caustic = step.β * step.L_caustic
         offsets = first_steps(scene, plan, step, offsets)
-        L, L_caustic, offsets, chain = self.walk(scene, plan, random, step, η, L, L_caustic, offsets)
-        return L, Le, L_caustic, offsets, chain
+        return walk(scene, plan, random, path, Traced(L, Le, L_caustic, offsets, path.chain))
 
-    @dr.syntax
-    def walk(self, scene, plan, random, step, η, L, L_caustic, offsets):
-        """The rest of all paths past their first ``step``."""
-        # ---------------------- Loop state ---------------------------
-        x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
-        rough, late, chain = step.rough, step.late, step.chain
-        place, channel = step.segment.place if plan.media else None, step.channel
-        depth = mi.UInt32(2)
-        # As long as the base path lives, or a ghost has company
-        active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
-        while dr.hint(active, label="gpt"):
-            # The base path first: an offset path can only join a vertex that is known.
-            step, η = base_step(scene, plan, random, x, place, channel, β, η, depth, seen, rough, late, chain, offsets)
-            L += β * step.L_light + step.β1 * step.L_bsdf
-            if dr.hint(plan.caustic, mode="scalar"):
-                L_caustic += β * step.L_caustic
-            if dr.hint(plan.manifold, mode="scalar"):
-                L += step.β1 * step.L_followed
-            offsets = later_steps(scene, plan, step, offsets)
-            x, β, seen = step.x1, dr.select(step.x1.is_valid(), step.β1, 0), step.seen
-            rough, late, chain = step.rough, step.late, step.chain
-            if dr.hint(plan.media is not None, mode="scalar"):
-                place = step.segment.place
-            depth += 1
-            active = step.walks & (x.is_valid() | dr.any([y.apart for y in offsets])) & (depth < plan.max_depth)
-        return L, L_caustic, offsets, chain
+
+@dataclass
+class Traced:
+    """Base paths and their offset paths, as far as they have come."""
+
+    L: mi.Spectrum  # of base paths, emission that the camera sees directly not included
+    Le: mi.Spectrum  # the same emission
+    L_caustic: mi.Spectrum  # of the layer ``caustic``
+    offsets: list[Offset]
+    chain: Chain | None  # what the shift "manifold" has recorded
+
+
+@dr.syntax
+def walk(scene, plan: Plan, random, path: Path, so_far: Traced) -> Traced:
+    """The rest of all paths past their first step."""
+    L, L_caustic, offsets = so_far.L, so_far.L_caustic, so_far.offsets
+    active = path.goes_on(plan, offsets)
+    while dr.hint(active, label="gpt"):
+        # The base path first: an offset path can only join a vertex that is known.
+        step, path = base_step(scene, plan, random, path, offsets)
+        L += step.β * step.L_light + step.β1 * step.L_bsdf
+        if dr.hint(plan.caustic, mode="scalar"):
+            L_caustic += step.β * step.L_caustic
+        if dr.hint(plan.manifold, mode="scalar"):
+            L += step.β1 * step.L_followed
+        offsets = later_steps(scene, plan, step, offsets)
+        active = path.goes_on(plan, offsets)
+    return Traced(L, so_far.Le, L_caustic, offsets, path.chain)
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:

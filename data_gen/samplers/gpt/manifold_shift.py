@@ -51,38 +51,47 @@ class Chain:
     record: mi.UInt32
     survival: mi.Float
 
+    def end(self, depth, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
+        """Behind the ``depth``-th vertex: whether the chain ends at ``x1``, where it finds ``Le``, and then its record.
+
+        Only ``late`` light is followed: a lamp behind panes alone is no worse off with replay.
+        """
+        # A lamp that is a mirror too could be met again further on: a lane has one record.
+        sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
+        ends = late & (self.state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
+        events = self.state & _EVENTS
+        k = (33 - dr.lzcnt(events)) >> 1
+        record = dr.select(ends, ((depth - 1 - k) << _EVENT_BITS) | events, self.record)
+        # Nothing that comes later belongs to the record.
+        return Chain(self.state, record, dr.select(self.record == 0, self.survival * survival, self.survival)), ends
+
 
 def no_chain(lanes: int) -> Chain:
     return Chain(dr.zeros(mi.UInt32, lanes), dr.zeros(mi.UInt32, lanes), dr.full(mi.Float, 1, lanes))
 
 
-def advance(chain: Chain, depth, sampled_type, goes_on, connectable, survival, late, x1, Le) -> tuple[Chain, mi.Bool]:
-    """The chain behind the ``depth``-th vertex, and whether it ends at ``x1``, where it finds ``Le``.
-
-    Only ``late`` light is followed: a lamp behind panes alone is no worse off with replay.
-    """
-    # --------------------- One more event ------------------------
+def advance(chain: Chain, sampled_type, goes_on, connectable) -> Chain:
+    """The chain behind an event at a vertex that is ``connectable`` or not."""
     code = event(sampled_type)
     before, open_ = chain.state == _BEFORE, chain.state >= _OPEN
     longer, fits = add_event(chain.state & _EVENTS, code)
     state = dr.select(before & (code == 0) & connectable, mi.UInt32(_OPEN), _LOST)
     state = dr.select(before & (code != 0), _BEFORE, state)
     state = dr.select(open_ & (code != 0) & fits, longer | _OPEN, state)
-    state = dr.select(goes_on, state, _LOST)
-
-    # -------------------------- Its end --------------------------
-    # A lamp that is a mirror too could be met again further on: a lane has one record.
-    sharp = mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Delta) | mi.has_flag(x1.bsdf().flags(), mi.BSDFFlags.Null)
-    ends = late & (state > _OPEN) & ~(x1.is_valid() & sharp) & (dr.max(Le) > 0)
-    events = state & _EVENTS
-    k = (33 - dr.lzcnt(events)) >> 1
-    record = dr.select(ends, ((depth - 1 - k) << _EVENT_BITS) | events, chain.record)
-    # Nothing that comes later belongs to the record.
-    survival = dr.select(chain.record == 0, chain.survival * survival, chain.survival)
-    return Chain(state, record, survival), ends
+    return Chain(dr.select(goes_on, state, _LOST), chain.record, chain.survival)
 
 
-def add_followed(scene, plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Chain, Δ: list) -> list:
+@dataclass
+class Recorded:
+    """What some lanes have recorded, for one of the offset paths of each."""
+
+    shift: mi.Vector2f  # that displaces the offset path, in pixels
+    word: mi.UInt32  # the ``record`` of ``Chain``
+    survival: mi.Float
+    exists: mi.Bool
+
+
+def add_followed(plan: Plan, first_hit, camera: CameraSamples, shifts, chain: Chain, Δ: list) -> list:
     """``Δ``, colours of all lanes for each of the ``shifts``, with the samples of all recorded paths added.
 
     ``first_hit`` is where a camera ray leads. All arguments are evaluated.
@@ -96,29 +105,34 @@ def add_followed(scene, plan: Plan, first_hit, camera: CameraSamples, shifts, ch
     number = dr.arange(mi.UInt32, n * len(lanes)) % n
     shift = dr.gather(mi.Vector2f, mi.Vector2f(*np.array(shifts, np.float32).T), number)
     word, survival = dr.gather(mi.UInt32, chain.record, wide), dr.gather(mi.Float, chain.survival, wide)
-    samples = followed(scene, plan, first_hit, camera.at(wide), shift, word, survival, found)
+    samples = followed(plan, first_hit, camera.at(wide), Recorded(shift, word, survival, found))
     dr.eval(samples)
-    return [with_samples(total, samples, mi.UInt32(lanes), mi.Bool(exists), n, i) for i, total in enumerate(Δ)]
+    first = dr.arange(mi.UInt32, len(lanes)) * n
+    return [
+        with_samples(total, samples, first + dr.opaque(mi.UInt32, i), mi.UInt32(lanes), mi.Bool(exists))
+        for i, total in enumerate(Δ)
+    ]
 
 
-def with_samples(total: mi.Color3f, samples: mi.Color3f, lanes, exists, n: int, i: int) -> mi.Color3f:
-    """``total`` with every ``n``-th of the ``samples``, from the ``i``-th on, added to ``lanes`` of it."""
-    own = dr.gather(mi.Color3f, samples, dr.arange(mi.UInt32, dr.width(lanes)) * n + dr.opaque(mi.UInt32, i))
+def with_samples(total: mi.Color3f, samples: mi.Color3f, which: mi.UInt32, lanes, exists) -> mi.Color3f:
+    """``total`` with those ``samples`` added to ``lanes`` of it."""
+    own = dr.gather(mi.Color3f, samples, which)
     channels = [mi.Float(channel) for channel in total]
     for channel, value in zip(channels, own, strict=True):
         dr.scatter_add(channel, value, lanes, exists)
     return mi.Color3f(*channels)
 
 
-def followed(scene, plan: Plan, first_hit, camera: CameraSamples, shift, word, survival, active) -> mi.Color3f:
-    """Δ of the light that each lane has recorded, for the offset path displaced by ``shift`` pixels."""
+def followed(plan: Plan, first_hit, camera: CameraSamples, recorded: Recorded) -> mi.Color3f:
+    """Δ of the light that each lane has ``recorded``."""
     # -------------------- To z_b and to z_b' ---------------------
-    events, steps = word & _EVENTS, word >> _EVENT_BITS
+    scene, survival, active = plan.space.scene, recorded.survival, recorded.exists
+    events, steps = recorded.word & _EVENTS, recorded.word >> _EVENT_BITS
     camera_ray, importance, _ = camera.rays()
-    ray1, importance1, inside = camera.rays(shift)
+    ray1, importance1, inside = camera.rays(recorded.shift)
     random, random1 = camera.random.clone(), camera.random.clone()
-    z, β, active = specular_steps(scene, first_hit, camera_ray, importance, random, steps, active)
-    z1, β1, exists = specular_steps(scene, first_hit, ray1, importance1, random1, steps, active & inside)
+    z, β, active = specular_steps(scene, first_vertex(first_hit, camera_ray), importance, random, steps, active)
+    z1, β1, exists = specular_steps(scene, first_vertex(first_hit, ray1), importance1, random1, steps, active & inside)
 
     # ----------------------- The base path -----------------------
     _, u_lobe, u_direction, _ = draw(random)
@@ -149,10 +163,14 @@ def draw(random) -> tuple:
     return random.next_2d(), random.next_1d(), random.next_2d(), random.next_1d()
 
 
+def first_vertex(first_hit, ray) -> mi.SurfaceInteraction3f:
+    return first_hit(ray).compute_surface_interaction(mi.Ray3f(ray))
+
+
 @dr.syntax
-def specular_steps(scene, first_hit, ray, β, random, steps, active) -> tuple:
-    """The vertex that a replay reaches after so many specular steps, the throughput, and whether it gets there."""
-    z, β = first_hit(scene, ray).compute_surface_interaction(mi.Ray3f(ray)), mi.Spectrum(β)
+def specular_steps(scene, z, β, random, steps, active) -> tuple:
+    """The vertex that a replay reaches ``steps`` events behind ``z``, its throughput, and whether it gets there."""
+    z, β = mi.SurfaceInteraction3f(z), mi.Spectrum(β)
     good, i = active & z.is_valid(), mi.UInt32(0)
     while dr.hint(good & (i < steps), label="specular steps"):
         _, u_lobe, u_direction, _ = draw(random)

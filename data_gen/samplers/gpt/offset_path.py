@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths import caustic, media, segments, shift
-from data_gen.paths.lights import emission, replay_light, shadowed, shared_emission
+from data_gen.paths import caustic, media, shift
+from data_gen.paths.lights import emission, replay_light, shared_emission
+from data_gen.paths.segments import Segment
 from data_gen.paths.shift import mis_weight
-from data_gen.paths.vertex import DELTA, NULL, SMOOTH, evaluate, event_kind, seen_from
-from data_gen.samplers.gpt.base_path import Step, light_mis
+from data_gen.paths.vertex import DELTA, SMOOTH, event_kind, seen_from
+from data_gen.paths.walk import Sky
+from data_gen.samplers.gpt.base_path import Path, Step, light_mis
+from data_gen.samplers.gpt.half_vector import Departure, copy_where_smooth
 from data_gen.samplers.gpt.plan import Plan
 
 
@@ -21,18 +24,28 @@ class Offset:
 
     ray: mi.Ray3f  # apart: led to the offset path's own vertex; joined: to the shared one
     hit: mi.PreliminaryIntersection3f  # apart: that vertex
+    place: media.Place | None  # apart: where it is; None in scenes without media
     β: mi.Spectrum
     r: mi.Float
     apart: mi.Bool
     joined: mi.Bool
-    seen: mi.Bool  # an escape sees the environment
-    a: mi.Spectrum
-    Δ: mi.Spectrum
-    failed: mi.Bool  # the base path went on to where no offset path corresponds to it
-    w2: mi.Float  # settled: 2 w of all that follows
-    A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ
+    sky: Sky  # whether an escape sees the environment
     rough: mi.Bool  # see data_gen.paths.caustic; it is never late
-    place: media.Place | None  # apart: of that vertex; None in scenes without media
+    a: mi.Spectrum  # settled: all that follows in Δ is a times what the base path finds
+    Δ: mi.Spectrum  # 2 w (C(y) |J| - C(x)) / p(x), so far
+    w2: mi.Float  # settled: 2 w of all that follows
+    A: mi.Spectrum  # 2 w C(x) / p(x), the base path's part of Δ, so far
+    failed: mi.Bool  # the base path went on to where no offset path corresponds to it
+
+
+@dataclass
+class Own:
+    """The vertex of an offset path apart from its base path."""
+
+    y: mi.SurfaceInteraction3f
+    place: media.Place | None
+    bsdf: mi.BSDFPtr
+    connectable: mi.Bool
 
 
 @dataclass
@@ -41,42 +54,44 @@ class Move:
 
     ray: mi.Ray3f
     hit: mi.PreliminaryIntersection3f
+    place: media.Place | None
     f_p: mi.Spectrum  # f |J| / p, with the p of the base path
     r: mi.Float  # p' |J| / p
-    seen: mi.Bool
+    sky: Sky
+    rough: mi.Bool
     L_bsdf: mi.Spectrum
     reaches: mi.Bool  # there is a next vertex
     good: mi.Bool
-    rough: mi.Bool
-    place: media.Place | None
 
 
-def start(plan: Plan, x, β, ray, hit, β_offset, inside, place=None) -> Offset:
-    """An offset path up to its first vertex, ``hit``; it has ended where it finds none.
+def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, inside: mi.Bool) -> Offset:
+    """An offset path behind its ``first`` segment, ``inside`` the film or not; it has ended where it finds nothing.
 
     A base path that has ended there walks on as a ghost if the kernel can replay, else the shift is rejected.
     """
+    hit, none = first.hit, dr.zeros(mi.Spectrum, dr.width(first.hit.t))
     lives = inside & hit.is_valid()
-    ended = inside & ~hit.is_valid() & x.is_valid()
+    ended = inside & ~hit.is_valid() & base.x.is_valid()
     # Seen from the neighbour, a base path that has ended there would walk on as a ghost with this one replayed beside
     # it: both have the same random numbers, hence r = 1 and w = 1/2. Without ghosts nothing shifts back, and w = 1
     # (survey, section 3.5).
+    w2_ended = 1 if plan.replays else 2
     return Offset(
-        ray=mi.Ray3f(ray),
+        ray=mi.Ray3f(first.ray),
         hit=hit,
-        β=mi.Spectrum(β_offset),
+        place=first.place,
+        β=mi.Spectrum(importance * first.weight),
         r=mi.Float(1),
-        apart=lives if plan.replays else lives & x.is_valid(),
+        apart=lives if plan.replays else lives & base.x.is_valid(),
         joined=mi.Bool(False),
-        seen=mi.Bool(not plan.hides),
-        a=dr.select(ended, -β * (1 if plan.replays else 2), 0),
-        Δ=dr.zeros(mi.Spectrum, dr.width(hit.t)),
-        failed=mi.Bool(False) if plan.replays else ended,
-        # Beyond the border there is no path that could have its part of the weight.
-        w2=dr.select(ended, 1 if plan.replays else 2, dr.select(inside, mi.Float(0), 2)),
-        A=dr.zeros(mi.Spectrum, dr.width(hit.t)),
+        sky=Sky.from_camera(plan.hides),
         rough=mi.Bool(False),
-        place=place,
+        a=dr.select(ended, -base.β * w2_ended, 0),
+        Δ=none,
+        # Beyond the border there is no path that could have its part of the weight.
+        w2=dr.select(ended, w2_ended, dr.select(inside, mi.Float(0), 2)),
+        A=mi.Spectrum(none),
+        failed=mi.Bool(False) if plan.replays else ended,
     )
 
 
@@ -135,51 +150,23 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     """A step from the offset path's own vertex y."""
     # ----------------------- The vertex --------------------------
     # The state carries the preliminary hit alone: whole interactions of four paths would swell every loop.
-    y = media.vertex(path.ray, path.hit, path.place) if plan.media else path.hit.compute_surface_interaction(path.ray)
-    bsdf = y.bsdf()
-    connectable = plan.materials.connectable(bsdf)
+    y = media.vertex(path.ray, path.hit, path.place)
+    bsdf, scatters = y.bsdf(), media.scatters(path.place)
+    own = Own(y, path.place, bsdf, plan.materials.connectable(bsdf) | scatters)
 
     # ----------------- Emitter sampling: replay ------------------
-    # Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
-    # near, the same point of an emitter.
-    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-    if plan.media:
-        connectable |= path.place.scatters
-        lit |= path.place.scatters
-    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
-    f, p = media.evaluate_vertex(bsdf, y, path.place, y.to_local(light.d), lit)
-    # Each path has its own m: from y, the emitter is found with other densities than from x.
-    if plan.media:
-        L_light = f * light.weight
-        shadow_ray, asked = y.spawn_ray_to(light.target), dr.max(L_light) > 0
-        T = segments.transmittance(
-            scene, plan.media, y, path.place, shadow_ray, light.target, step.channel, step.light_key, asked
-        )
-        L_light *= T * light_mis(light.delta, light.p, p)
-    else:
-        L_light = shadowed(scene, y, light, f) * light_mis(light.delta, light.p, p)
-    if plan.caustic:
-        L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), connectable), L_light)
-    # Never rejected: an emitter that y does not see is a sample of value 0, and the reverse shift knows it as such.
     w2_light = shift.gradient_weight(path.r, True)
     # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
+    L_light = replayed_light(scene, plan, step, path, own)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # ------------- BSDF sampling: reconnect, or part -------------
-    joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, connectable)
+    joins = step.goes_on & shift.reconnects(step.kind, step.x_connectable, step.x1_connectable, own.connectable)
     # Beside a ghost as well, which walks but does not go on
     parts = step.walks & ~joins & ~step.ends_late
-    none = mi.Bool(False)
-    # What neither does is rejected: β' = 0, r = 0.
-    no_light = mi.Spectrum(0)
-    move = Move(
-        path.ray, path.hit, mi.Spectrum(0), mi.Float(0), path.seen, no_light, none, none, path.rough, path.place
-    )
-    move = dr.if_stmt((move,), joins, lambda move: reconnect(scene, plan, step, y, bsdf, move), lambda move: move)
+    move = dr.if_stmt((no_move(path),), joins, lambda move: reconnect(scene, plan, step, own, move), lambda move: move)
     if plan.replays:
-        move = dr.if_stmt(
-            (move,), parts, lambda move: part(scene, plan, step, y, bsdf, connectable, move), lambda move: move
-        )
+        move = dr.if_stmt((move,), parts, lambda move: part(scene, plan, step, own, move), lambda move: move)
 
     # --------------------- Weight and gradient -------------------
     # One ratio p' |J| / p for each step: products of densities along a path would leave float32 (survey, eq. 17).
@@ -192,45 +179,77 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     return Offset(
         ray=move.ray,
         hit=move.hit,
+        place=move.place,
         β=β1,
         r=r1,
         apart=apart,
         joined=joined,
-        seen=move.seen,
+        sky=move.sky,
+        rough=move.rough,
         # Rejected or at its end, it has nothing to set against the rest of the base path.
         a=dr.select(apart | joined, 0, -w2 * step.β1),
         Δ=Δ + w2 * (β1 * move.L_bsdf - step.β1 * step.L_bsdf),
-        failed=path.failed | (step.goes_on & ~step.ends_late & (r1 == 0)),
         w2=dr.select(apart | joined, 0, w2),
         A=path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf,
-        rough=move.rough,
-        place=move.place,
+        failed=path.failed | (step.goes_on & ~step.ends_late & (r1 == 0)),
     )
 
 
-def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
+def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> mi.Spectrum:
+    """f m Le V / p of the emitter that the base path's random numbers lead to from y.
+
+    Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
+    near, the same point of an emitter. It is never rejected: an emitter that y does not see is a sample of value 0, and
+    the reverse shift knows it as such.
+    """
+    y, bsdf = own.y, own.bsdf
+    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
+    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
+    f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
+    # A shadow ray where there is something to be shadowed
+    L_light = f * light.weight
+    T, visible = plan.space.sees(y, own.place, light.target, step.drawn, dr.max(L_light) > 0)
+    # Each path has its own m: from y, the emitter is found with other densities than from x.
+    L_light = dr.select(visible, L_light, 0) * (T * light_mis(light.delta, light.p, p))
+    if plan.caustic:
+        L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), own.connectable), L_light)
+    return L_light
+
+
+def no_move(path: Offset) -> Move:
+    """Of a path that neither reconnects nor parts: rejected, with β' = 0 and r = 0."""
+    none = mi.Bool(False)
+    return Move(
+        ray=path.ray,
+        hit=path.hit,
+        place=path.place,
+        f_p=mi.Spectrum(0),
+        r=mi.Float(0),
+        sky=path.sky,
+        rough=path.rough,
+        L_bsdf=mi.Spectrum(0),
+        reaches=none,
+        good=none,
+    )
+
+
+def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     """Straight to the base path's next vertex, or, where it escapes, along with it."""
     # ------------------------ The segment ------------------------
     # An escape is a vertex at infinity: all directions to it are the same one.
-    x1 = step.x1
+    x1, y = step.x1, own.y
     reaches = x1.is_valid()
     direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
 
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
-    in_medium = step.segment.place.scatters if plan.media else None
+    in_medium = media.scatters(step.segment.place)
     J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n, in_medium), 1)
-    f, p = media.evaluate_vertex(bsdf, y, move.place, y.to_local(direction))
+    f, p = media.evaluate_vertex(own.bsdf, y, own.place, y.to_local(direction))
     # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
     # Where p = 0 that is so already.
     ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
-    T, T_c = 1, 1
-    if plan.media:
-        T, T_c, occluded = segments.reconnect(
-            scene, plan.media, y, move.place, ray, x1, step.segment, step.channel, p > 0
-        )
-    else:
-        occluded = scene.ray_test(ray, p > 0)
+    T, T_c, occluded = plan.space.reconnect(y, own.place, ray, x1, step.segment, step.drawn, active=p > 0)
 
     # ---------------------- Emission at x1 -----------------------
     # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
@@ -240,84 +259,60 @@ def reconnect(scene, plan: Plan, step: Step, y, bsdf, move: Move) -> Move:
     return Move(
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
+        place=own.place,
         # f |J| over the density of the *base* path (survey, eq. 4): p' enters by the weight alone.
         f_p=dr.select(p > 0, f * (J / step.p * step.survival), 0) * T,
         r=J * p / step.p * T_c,
-        seen=mi.Bool(True),
+        sky=Sky(mi.Bool(True)),
+        rough=mi.Bool(plan.caustic),
         L_bsdf=Le * mis_weight(p, p_light),
         reaches=reaches,
         good=~occluded,
-        rough=mi.Bool(plan.caustic),
-        place=move.place,
     )
 
 
-def part(scene, plan: Plan, step: Step, y, bsdf, connectable, move: Move) -> Move:
+def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     """In a direction of its own, with the half-vector of the base path or along its random numbers."""
     # -------------------- Random sequence replay -----------------
     # |J| = p / p' (survey, eq. 6), hence f |J| / p = f / p', which is what sampling returns (eq. 7), and r = 1.
-    sample, f_p = media.sample_vertex(bsdf, y, move.place, step.u_lobe, step.u_direction)
-    found = sample.pdf > 0
-    wo, p, r = sample.wo, sample.pdf, mi.Float(1)
-    kind = dr.select(found, event_kind(sample.sampled_type), DELTA)
-    allowed = mi.Bool(True)
-
-    # ---------------------- Half-vector copy ---------------------
+    y = own.y
+    sample, f_p = media.sample_vertex(own.bsdf, y, own.place, step.u_lobe, step.u_direction)
+    kind = dr.select(sample.pdf > 0, event_kind(sample.sampled_type), DELTA)
+    leaves = Departure(sample.pdf > 0, sample.wo, sample.pdf, kind, f_p, mi.Float(1))
     if plan.half_vectors:
-        # A Dirac event has no density to be divided by: it is replayed, as its own half-vector would have it.
-        copies = step.goes_on & (step.kind == SMOOTH)
-        same = y.bsdf() == step.x.bsdf()
-        copied, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
-        f1, p1 = evaluate(bsdf, y, copied, copies)
-        found = dr.select(copies, exists & (p1 > 0), found)
-        wo, p = dr.select(copies, copied, wo), dr.select(copies, p1, p)
-        # The same half-vector does not take the same numbers (survey, eq. 15): |J| stays, in f |J| / p and in r.
-        f_p = dr.select(copies, f1 * (J / step.p), f_p)
-        r = dr.select(copies, p1 * J / step.p, r)
-        # Past the end of its base path an offset path has no half-vectors to copy, nor would the reverse shift.
-        allowed = dr.select(copies, found, (kind != SMOOTH) | ~step.x.is_valid())
-        kind = dr.select(copies, SMOOTH, kind)
+        leaves = copy_where_smooth(step, y, own.bsdf, leaves)
+    found, kind, allowed = leaves.found, leaves.kind, leaves.allowed
 
     # --------------- Next vertex, and Le there -------------------
-    seen = move.seen if not plan.hides else move.seen | (kind != NULL)
-    ray = y.spawn_ray(y.to_world(wo))
-    place = move.place
-    if plan.media:
-        # The same number, which meets other media, has the same density all the same.
-        trace, medium = segments.next_surface(scene), place.toward(y, ray.d)
-        segment = segments.fly(plan.media, trace, ray, medium, step.channel, step.numbers, found)
-        ray, hit, place = segment.ray, segment.hit, segment.place
-        y1, f_p = media.vertex(ray, hit, place), f_p * segment.weight
-    else:
-        hit = scene.ray_intersect_preliminary(ray, active=found)
-        y1 = hit.compute_surface_interaction(ray)
+    sky = move.sky.behind(kind) if plan.hides else move.sky
+    # The same number, which meets other media, has the same density all the same.
+    segment = plan.space.fly(y, own.place, y.spawn_ray(y.to_world(leaves.wo)), step.drawn, found)
+    y1 = plan.space.end(y, segment)
     reaches = found & y1.is_valid()
-    Le, p_light = emission(scene, y1, y, reaches | (found & seen), found & (kind == SMOOTH))
-    # Reject what would not be shifted back, or the weights of the pair would not sum to 1 (survey, section 3.5).
-    y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf())
-    if plan.media:
-        y1_connectable |= place.scatters
-    inverts = shift.replay_inverts(kind, connectable, y1_connectable, step.x_connectable)
+    Le, p_light = emission(scene, y1, y, reaches | (found & sky.seen), found & (kind == SMOOTH))
+
+    # ----------------- Would it be shifted back? -----------------
+    # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).
+    y1_connectable = ~reaches | plan.materials.connectable(y1.bsdf()) | media.scatters(segment.place)
+    inverts = shift.replay_inverts(kind, own.connectable, y1_connectable, step.x_connectable)
     # Light of the layer ``caustic`` has no differences. If one of the two paths is late, so is it from the other side.
     # A base path that is late, or will be, has not come this far.
     rough = move.rough
     if plan.caustic:
-        rough, late = caustic.classes(move.rough, mi.Bool(False), found, kind, connectable)
-        smooth, sharp = kind == SMOOTH, plan.materials.sharp(y1, scene)
-        if plan.media:
-            sharp &= ~place.scatters
-        allowed &= ~(late | caustic.ends_late(smooth, connectable, sharp))
+        rough, late = caustic.classes(rough, mi.Bool(False), found, kind, own.connectable)
+        sharp = plan.materials.sharp(y1, scene) & ~media.scatters(segment.place)
+        allowed &= ~(late | caustic.ends_late(kind == SMOOTH, own.connectable, sharp))
     return Move(
-        ray=ray,
-        hit=hit,
-        f_p=dr.select(found, f_p * step.survival, 0),
-        r=r,
-        seen=seen,
-        L_bsdf=Le * mis_weight(p, p_light),
+        ray=segment.ray,
+        hit=segment.hit,
+        place=segment.place,
+        f_p=dr.select(found, leaves.f_p * segment.weight * step.survival, 0),
+        r=leaves.r,
+        sky=sky,
+        rough=rough,
+        L_bsdf=Le * mis_weight(leaves.p, p_light),
         reaches=reaches,
         good=allowed & inverts,
-        rough=rough,
-        place=place,
     )
 
 
@@ -330,17 +325,14 @@ def step_joined(step: Step, path: Offset) -> Offset:
     # One vertex, one emitter, one shadow ray: only f and m know from where the path has come.
     f, p = media.evaluate_vertex(bsdf, y, step.place, y.to_local(step.light.d), step.lit)
     L_light = dr.select(step.lit, f * step.light_weight * light_mis(step.light.delta, step.light.pdf, p), 0)
-    if step.segment:
-        L_light *= step.T_light
+    L_light *= step.T_light
     w2_light = shift.gradient_weight(path.r, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # -------------- BSDF sampling: the same direction ------------
     # J = 1 (same vertex, same direction), but sampled with another p' after another arrival: the last factor of r.
     f, p = media.evaluate_vertex(bsdf, y, step.place, step.wo, step.goes_on)
-    β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0)
-    if step.segment:
-        β1 *= step.segment.weight
+    β1 = path.β * dr.select(p > 0, f * (step.survival / step.p), 0) * step.segment.weight
     r1 = path.r * p / step.p
     # Where the base path has ended r1 is not finite, and both halves of what follows are 0, whatever w.
     good = shift.keeps_joined(step.kind) & dr.isfinite(r1) & dr.isfinite(dr.sum(β1))
@@ -350,19 +342,12 @@ def step_joined(step: Step, path: Offset) -> Offset:
     # All later factors of both paths are the same: r and w stay, and a is all that is left to know of y.
     a, Δ = w2 * (β1 - step.β1), Δ + w2 * (β1 * L_bsdf - step.β1 * step.L_bsdf)
     A = path.A + w2_light * step.β * step.L_light + w2 * step.β1 * step.L_bsdf
-    return Offset(
-        ray=path.ray,
-        hit=path.hit,
-        β=path.β,
-        r=path.r,
-        apart=path.apart,
+    return replace(
+        path,
         joined=mi.Bool(False),
-        seen=path.seen,
         a=dr.select(path.joined, a, path.a),
         Δ=dr.select(path.joined, Δ, path.Δ),
-        failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
         w2=dr.select(path.joined, w2, path.w2),
         A=dr.select(path.joined, A, path.A),
-        rough=path.rough,
-        place=path.place,
+        failed=path.failed | (path.joined & step.goes_on & ~(good & (r1 > 0))),
     )

@@ -27,7 +27,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import SMOOTH, evaluate
-from data_gen.samplers.gpt.base_path import light_mis, roulette
+from data_gen.paths.walk import roulette
+from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.restir.events import DRAWN, draw, sample_event
 from data_gen.samplers.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
@@ -171,9 +172,10 @@ def _further(scene, plan: Plan, random, x, record: Record, active):
         L = dr.select(lit, B * f * light_mis(light.delta, light.pdf, p) * Le_p, L)
         event = sample_event(scene, plan, x, numbers, active & (i < behind))
         η = dr.select(event.found, η * event.η, η)
-        survival, walks = roulette(plan, depth, B * event.f_p, event.f_p, η, numbers.survival, [])
-        walks &= event.found
-        B *= dr.select(walks, event.f_p * survival, 0)
+        B *= event.f_p
+        q = roulette(dr.max(B), depth >= plan.limits.rr_depth, η)
+        walks = event.found & (dr.max(B) > 0) & (numbers.survival < q)
+        B = dr.select(walks, B * dr.rcp(q), 0)
         met = walks & ~sampled & (i + 1 == behind)
         Le, p_light = emission(scene, event.x1, x, met, met & (event.kind == SMOOTH))
         L = dr.select(met, B * Le * mis_weight(event.p, p_light), L)

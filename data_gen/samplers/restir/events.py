@@ -66,7 +66,7 @@ def check(plan: Plan) -> None:
     """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera, media."""
     if not mi.is_rgb or mi.is_polarized:
         raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")
-    if plan.hide_emitters:
+    if plan.limits.hide_emitters:
         raise NgptError("restir: emitters that hide from the camera are not known; leave out hide_emitters")
-    if plan.media:
+    if plan.space.media:
         raise NgptError("restir: media are not known; leave out volumes")

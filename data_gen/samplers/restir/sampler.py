@@ -11,12 +11,12 @@ from data_gen.film import GradientFilm
 from data_gen.passes import lanes_within, recording
 from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
+from data_gen.paths.walk import Limits
 from data_gen.samplers.gpt.plan import make_plan
 from data_gen.samplers.restir.carry import Stage
 from data_gen.samplers.restir.history import Frame, History
 from data_gen.scenes.geometry import Geometry
-from data_gen.scenes.load import path_depths, reference_integrator
-from ngpt.errors import NgptError
+from data_gen.scenes.load import reference_integrator
 
 # What a lane takes: five reservoirs of 100 bytes, those of the frame before, and E of what they ask for.
 LANE_BYTES = 3072
@@ -48,12 +48,7 @@ class Restir:
         self._history = self._new()
 
     def _stage(self, scene: mi.Scene, shapes: Sequence[Geometry]) -> Stage:
-        path = reference_integrator(scene)
-        depths = path_depths(path)
-        if not depths:
-            raise NgptError(f"restir: cannot read max_depth and rr_depth from the integrator {str(path)!r}")
-        limit = depths["max_depth"] if depths["max_depth"] >= 0 else 0xFFFFFFFF
-        plan = make_plan(scene, self._roughness, limit, depths["rr_depth"], "replay", path.hide_emitters, caustic=False)
+        plan = make_plan(scene, Limits.of(reference_integrator(scene)), self._roughness, caustic=False)
         return Stage(scene, plan, scene.sensors()[0], shapes)
 
     def film(

@@ -27,7 +27,8 @@ from data_gen.paths.lights import emission
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.streams import sample_streams
 from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
-from data_gen.samplers.gpt.base_path import light_mis, roulette
+from data_gen.paths.walk import roulette
+from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.restir.events import draw, sample_event
 from data_gen.samplers.restir.record import (
@@ -97,7 +98,7 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
         *(record.w, record.geometry),
     )
     replayed, stuck = mi.UInt32(0), mi.Bool(False)
-    active = x.is_valid() & (depth < plan.max_depth)
+    active = x.is_valid() & (depth < plan.limits.max_depth)
     while active:
         numbers = draw(random)
         u_light, u_hit = choice.next_1d(), choice.next_1d()
@@ -144,7 +145,8 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
         η = dr.select(event.found, η * event.η, η)
         # Behind rc it goes by what is behind rc alone, so that it can be played again from there.
         β1 = dr.select(behind, B, F * W) * f_p
-        survival, walks = roulette(plan, depth, β1, f_p, η, numbers.survival, [])
+        q = roulette(dr.max(β1), depth >= plan.limits.rr_depth, η)
+        survival, walks = dr.rcp(q), (dr.max(β1) > 0) & (numbers.survival < q)
         # Where a join has no density, after that correction, there is no such path.
         walks &= event.found & (~joins | (p > 0))
         survival = dr.select(walks, survival, 0)
@@ -183,7 +185,7 @@ def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
         phase = dr.select(joins | at, phase + 1, phase)
         x = x1
         depth += 1
-        active = walks & x.is_valid() & (depth < plan.max_depth)
+        active = walks & x.is_valid() & (depth < plan.limits.max_depth)
     record = Record(
         pixel=pixel,
         sample=sample,

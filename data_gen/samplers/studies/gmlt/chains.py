@@ -43,16 +43,14 @@ class Paths:
         """The layers of paths with these ``random`` numbers; light seen directly; which neighbours are on the film."""
         ray, importance, _ = camera.rays(mi.Vector2f(0))
         shifted = {name: camera.rays(shift) for name, shift in self.shifts.items()}
-        L, Le, L_caustic, offsets, _ = self.gpt.trace(
-            self.scene, self.plan, random, ray, importance, list(shifted.values()), None
-        )
-        layers = {"primal": to_rgb(L, ray.wavelengths)}
+        paths = self.gpt.trace(self.scene, self.plan, random, (ray, importance), list(shifted.values()))
+        layers = {"primal": to_rgb(paths.L, ray.wavelengths)}
         if self.plan.caustic:
-            layers["caustic"] = to_rgb(L_caustic, ray.wavelengths)
+            layers["caustic"] = to_rgb(paths.L_caustic, ray.wavelengths)
         inside = {name: inside for name, (_, _, inside) in shifted.items()}
-        for (name, exists), y in zip(inside.items(), offsets, strict=True):
+        for (name, exists), y in zip(inside.items(), paths.offsets, strict=True):
             layers[name] = dr.select(exists, to_rgb(y.Δ, ray.wavelengths), 0)
-        return layers, to_rgb(Le, ray.wavelengths), inside
+        return layers, to_rgb(paths.Le, ray.wavelengths), inside
 
 
 @dataclass

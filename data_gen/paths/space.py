@@ -1,0 +1,118 @@
+"""What is between the surfaces of a scene: nothing, or media. The paths of ``gpt`` ask it, and nothing else does.
+
+Nothing of media is compiled into the kernel of a scene without them: there a vertex has no ``Place``, a path draws no
+numbers for its segments, and a segment is the ray to the next surface.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import media, segments
+from data_gen.paths.media import Media, Place, index_matched
+from data_gen.paths.segments import Numbers, Segment
+
+
+@dataclass
+class Drawn:
+    """What a path has drawn for one step through media."""
+
+    channel: mi.UInt32  # the colour by which it samples its distances, the same in all steps
+    numbers: Numbers  # of the segment
+    light: mi.UInt32 | None  # key of the numbers on the way to the emitter; None without grids
+
+
+class Space:
+    """Empty: light goes straight from surface to surface."""
+
+    media: Media | None = None
+    grids = False  # whether there are media whose density varies
+
+    def __init__(self, scene: mi.Scene):
+        self.scene = scene
+
+    def passed(self, shape: mi.Shape) -> bool:
+        """Whether rays go straight through that shape."""
+        return False
+
+    def begin(self, random) -> Drawn | None:
+        """What the first segment needs."""
+        return None
+
+    def draw(self, random, channel: mi.UInt32 | None) -> Drawn | None:
+        """What another step needs, of a path that samples distances by that ``channel``."""
+        return None
+
+    def first(self, view, ray, within, drawn: Drawn | None) -> Segment:
+        """From a camera ``within`` a medium; ``view`` is the integrator, which knows what hides from the camera."""
+        return straight(ray, view.first_hit(self.scene, ray))
+
+    def fly(self, x, place: Place | None, ray, drawn: Drawn | None, active) -> Segment:
+        """The segment along ``ray`` from vertex ``x``."""
+        return straight(ray, self.scene.ray_intersect_preliminary(ray, active=active))
+
+    def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
+        """The vertex where the ``segment`` from vertex ``x`` ends."""
+        return media.vertex(segment.ray, segment.hit, segment.place)
+
+    def sees(self, x, place: Place | None, target: mi.Point3f, drawn: Drawn | None, active) -> tuple[Any, mi.Bool]:
+        """Transmittance from vertex ``x`` to the point ``target`` of an emitter, and whether anything comes through."""
+        return 1, ~self.scene.ray_test(x.spawn_ray_to(target), active)
+
+    def reconnect(
+        self, y, place: Place | None, ray, x1, base: Segment, drawn: Drawn | None, *, active
+    ) -> tuple[Any, Any, mi.Bool]:
+        """Along ``ray`` from vertex ``y`` to ``x1``, where the segment ``base`` ends: see ``segments.reconnect``."""
+        return 1, 1, self.scene.ray_test(ray, active)
+
+
+def straight(ray, hit: mi.PreliminaryIntersection3f) -> Segment:
+    """Through nothing."""
+    return Segment(ray, hit, place=None, weight=1, albedo=1, τ_c=0, nulls=None)
+
+
+class Filled(Space):
+    """Filled with media: vertices may be in them, and light is dimmed on its way."""
+
+    def __init__(self, scene: mi.Scene):
+        super().__init__(scene)
+        self.media = Media(scene)
+        self.grids = self.media.grids
+
+    def passed(self, shape: mi.Shape) -> bool:
+        return index_matched(shape)
+
+    def begin(self, random) -> Drawn:
+        return Drawn(media.choose_channel(random.next_1d()), segments.draw(random, self.media), None)
+
+    def draw(self, random, channel: mi.UInt32) -> Drawn:
+        return Drawn(channel, segments.draw(random, self.media), random.next_key() if self.grids else None)
+
+    def first(self, view, ray, within, drawn: Drawn) -> Segment:
+        trace = partial(view.first_surface, self.scene)
+        return segments.fly(self.media, trace, ray, within, drawn.channel, drawn.numbers, mi.Bool(True))
+
+    def fly(self, x, place: Place, ray, drawn: Drawn, active) -> Segment:
+        trace, medium = segments.next_surface(self.scene), place.toward(x, ray.d)
+        return segments.fly(self.media, trace, ray, medium, drawn.channel, drawn.numbers, active)
+
+    def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
+        x1 = super().end(x, segment)
+        # Of the whole segment, not of its last piece
+        x1.t = dr.select(x1.is_valid(), dr.norm(x1.p - x.p), x1.t)
+        return x1
+
+    def sees(self, x, place: Place, target: mi.Point3f, drawn: Drawn, active) -> tuple[mi.Spectrum, mi.Bool]:
+        ray = x.spawn_ray_to(target)
+        T = segments.transmittance(self.scene, self.media, x, place, ray, target, drawn.channel, drawn.light, active)
+        return T, dr.max(T) > 0
+
+    def reconnect(
+        self, y, place: Place, ray, x1, base: Segment, drawn: Drawn, *, active
+    ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
+        return segments.reconnect(self.scene, self.media, y, place, ray, x1, base, drawn.channel, active)

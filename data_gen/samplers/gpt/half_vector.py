@@ -1,0 +1,50 @@
+"""The shift "half-vector": an offset path leaves its vertex with the half-vector of its base path's event.
+
+It is taken instead of random sequence replay where the base path goes on by a smooth event. [Kettunen et al. 2015,
+section 5.2 and supplement; Hua et al. 2019, section 3.2]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import shift
+from data_gen.paths.vertex import SMOOTH, evaluate
+from data_gen.samplers.gpt.base_path import Step
+
+
+@dataclass
+class Departure:
+    """How an offset path apart from its base path leaves its vertex."""
+
+    found: mi.Bool  # there is a direction
+    wo: mi.Vector3f
+    p: mi.Float  # its density
+    kind: mi.UInt32
+    f_p: mi.Spectrum  # f |J| / p, with the p of the base path
+    r: mi.Float  # p' |J| / p
+    allowed: mi.Bool | bool = True  # False where the shift is rejected
+
+
+def copy_where_smooth(step: Step, y: mi.SurfaceInteraction3f, bsdf: mi.BSDFPtr, replayed: Departure) -> Departure:
+    """From vertex ``y`` with the base path's half-vector where that has one, else as ``replayed``."""
+    # A Dirac event has no density to be divided by: it is replayed, as its own half-vector would have it.
+    copies = step.goes_on & (step.kind == SMOOTH)
+    same = y.bsdf() == step.x.bsdf()
+    wo, J, exists = shift.copy_half_vector(step.x.wi, step.wo, step.η, y.wi, same)
+    f, p = evaluate(bsdf, y, wo, copies)
+    found = dr.select(copies, exists & (p > 0), replayed.found)
+    return Departure(
+        found=found,
+        wo=dr.select(copies, wo, replayed.wo),
+        p=dr.select(copies, p, replayed.p),
+        kind=dr.select(copies, SMOOTH, replayed.kind),
+        # The same half-vector does not take the same numbers (survey, eq. 15): |J| stays, in f |J| / p and in r.
+        f_p=dr.select(copies, f * (J / step.p), replayed.f_p),
+        r=dr.select(copies, p * J / step.p, replayed.r),
+        # Past the end of its base path an offset path has no half-vectors to copy, nor would the reverse shift.
+        allowed=dr.select(copies, found, (replayed.kind != SMOOTH) | ~step.x.is_valid()),
+    )
