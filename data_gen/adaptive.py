@@ -91,6 +91,7 @@ def render_adaptive(
     seed: int,
     adaptive: Adaptive,
     spp: int | None,
+    *,
     progress: Progress = lambda done, total: None,
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,
@@ -116,7 +117,9 @@ def render_adaptive(
             progress(min(done, total), total)
 
     most = None if spp is None else spp * pixels
-    work = UnevenRender(sample, sensor, seed, most, seconds, memory, stop, lane_bytes, report)
+    work = UnevenRender(
+        sample, sensor, seed, most, seconds=seconds, memory=memory, stop=stop, lane_bytes=lane_bytes, report=report
+    )
     report()
     work.add(np.ones(pixels, int), whole=True)
     attributes: dict = {}

@@ -43,6 +43,7 @@ def render_passes(
     sensor: mi.Sensor,
     seed: int,
     spp: int | None,
+    *,
     progress: Progress = lambda done, total: None,
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,

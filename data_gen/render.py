@@ -67,12 +67,11 @@ def render_stack(
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sample, sensor, chosen = entry.make(scene, **settings, **more), scene.sensors()[0], {}
+    limits = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
     if adaptive is None:
-        film = render_passes(sample, sensor, seed, spp, progress, seconds, memory, stop, entry.lane_bytes, entry.batch)
+        film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
     else:
-        film, chosen = render_adaptive(
-            sample, sensor, seed, adaptive, spp, progress, seconds, memory, stop, entry.lane_bytes
-        )
+        film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
     if adaptive is not None:
         chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
     return stack_of(film, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))

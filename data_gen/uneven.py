@@ -36,6 +36,7 @@ class UnevenRender:
         sensor: mi.Sensor,
         seed: int,
         most: int | None = None,
+        *,
         seconds: float | None = None,
         memory: int = DEFAULT_MEMORY,
         stop: Callable[[], bool] = lambda: False,

@@ -207,15 +207,15 @@ def with_one_kernel(around: Surroundings, view: View) -> View:
     crop, corner = mi.ScalarVector2i(view.size, view.size), mi.ScalarVector2i(*view.window)
     # Some sizes have equal factors whatever the field of view: all those that are as high as the crop.
     for larger in range(16):
-        film = view.film[0] + larger, view.film[1] + larger
+        width, height = view.film[0] + larger, view.film[1] + larger
         for steps in range(8):
             fov = np.float32(view.fov) * np.float32(1 + steps * 1e-6)
             projection = mi.perspective_projection(
-                mi.ScalarVector2i(*film), crop, corner, mi.Float(fov), params["near_clip"], params["far_clip"]
+                mi.ScalarVector2i(width, height), crop, corner, mi.Float(fov), params["near_clip"], params["far_clip"]
             )
             factors = projection.inverse().matrix
             if factors[0, 0] != factors[1, 1]:
-                return replace(view, fov=float(fov), film=film)
+                return replace(view, fov=float(fov), film=(width, height))
     return view
 
 

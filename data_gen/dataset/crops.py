@@ -148,7 +148,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 seeds = _seeds(rng, config)
                 clock = time.perf_counter()
                 first = render_input(config, scene, counts[0], seeds[0], uneven[0])
-            data, told = _crop(config, scene, first, counts, seeds, uneven, clock)
+            data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock)
             told = {"crop": crop, "view": movement.view_at(frame).record()} | told
             told["seconds"]["camera"] = round(found, 4)
             if moving:
@@ -169,7 +169,14 @@ def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
 
 
 def _crop(
-    config: Config, scene, first: GradientStack, counts: list[int], seeds: list[int], uneven: list[bool], clock: float
+    config: Config,
+    scene,
+    first: GradientStack,
+    counts: list[int],
+    seeds: list[int],
+    uneven: list[bool],
+    *,
+    clock: float,
 ) -> tuple[CropData, dict]:
     """The crop of which ``first`` is the first input, begun at ``clock``, and its record."""
     from data_gen.render import render_stack

@@ -6,7 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.film.moments import Moments, accumulate, no_moments, one_more, put_back, taken
+from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
@@ -121,15 +121,15 @@ class GradientFilm:
         if self.batches:
             self._add_batch(values, splats, spp)
         else:
-            # Block b goes to strand b mod strands. Opaque: literals would be compiled into the kernel, each anew.
+            # Block b goes to strand b mod strands.
             pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
             strand, pixel = pixel // self.pixels, pixel % self.pixels
-            behind = dr.opaque(mi.UInt32, self.strands - self.blocks % self.strands)
-            first = ((strand + behind) % self.strands * self.pixels + pixel) * dr.opaque(mi.UInt32, block)
+            behind = opaque(self.strands - self.blocks % self.strands)
+            first = ((strand + behind) % self.strands * self.pixels + pixel) * opaque(block)
             dr.eval(first)
-            where = (first, *(dr.opaque(mi.UInt32, n) for n in (lanes, block, self.strands * self.pixels * block)))
+            strands = Strands(first, opaque(lanes), opaque(block), opaque(self.strands * self.pixels * block))
             for name, (components, active) in values.items():
-                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, *where)
+                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, strands)
                 # One by one: the old moments and the new ones are in memory together.
                 dr.eval(self.moments[name])
         self.samples += spp
@@ -151,13 +151,13 @@ class GradientFilm:
 
         # As in passes of all pixels, block b of a pixel goes to strand b mod strands.
         behind = of_job(self.strands - self._blocks_each[pixels] % self.strands)
-        first = (of_job(starts) + (strand + behind) % self.strands) * dr.opaque(mi.UInt32, block)
+        first = (of_job(starts) + (strand + behind) % self.strands) * opaque(block)
         end, place = of_job((starts + blocks) * block), strand * self.pixels + of_job(pixels)
         dr.eval(first, end, place)
-        where = (first, end, *(dr.opaque(mi.UInt32, n) for n in (block, self.strands * block)))
+        strands = Strands(first, end, opaque(block), opaque(self.strands * block))
         for name, (components, active) in values.items():
             old = self._moments(name, len(components))
-            new = accumulate(taken(old, place), components, active, *where)
+            new = accumulate(taken(old, place), components, active, strands)
             dr.eval(new)
             self.moments[name] = put_back(old, new, place)
         self.counts[pixels] += blocks * block
@@ -165,13 +165,13 @@ class GradientFilm:
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
-        first = dr.arange(mi.UInt32, self.pixels) * dr.opaque(mi.UInt32, spp)
-        where = (first, first + dr.opaque(mi.UInt32, spp), *(dr.opaque(mi.UInt32, n) for n in (spp, spp)))
+        first = dr.arange(mi.UInt32, self.pixels) * opaque(spp)
+        strands = Strands(first, first + opaque(spp), opaque(spp), opaque(spp))
         for name in dict.fromkeys((*values, *splats)):
             mean, exists, lost = None, mi.Bool(True), mi.UInt32(0)
             if name in values:
                 components, active = values[name]
-                batch = accumulate(no_moments(self.pixels, len(components), False), components, active, *where)
+                batch = accumulate(no_moments(self.pixels, len(components), False), components, active, strands)
                 mean, exists, lost = batch.mean, batch.count > 0, batch.lost
             if name in splats:
                 sums, lost_splats = splats[name].totals(), splats[name].lost
@@ -296,3 +296,8 @@ class GradientFilm:
 def _components(value) -> list:
     """The channels of a Float or a colour."""
     return [value] if isinstance(value, mi.Float) else list(value)
+
+
+def opaque(n: int) -> mi.UInt32:
+    """A number that is not compiled into kernels, each anew."""
+    return dr.opaque(mi.UInt32, n)

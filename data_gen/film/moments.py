@@ -44,9 +44,19 @@ def one_more(old: Moments, x: list, exists) -> Moments:
     return Moments(count, lost, mean, m2)
 
 
-def accumulate(moments: Moments, components: list, active, first, end, block, stride) -> Moments:
-    """Adds samples to each strand's moments: ``block`` of them from ``first`` on, again from ``first + stride`` on, and
-    so forth below ``end``, all UInt32."""
+@dataclass
+class Strands:
+    """Which samples each strand takes: ``block`` from ``first`` on, again ``stride`` later, all before ``end``."""
+
+    first: mi.UInt32
+    end: mi.UInt32
+    block: mi.UInt32
+    stride: mi.UInt32
+
+
+def accumulate(moments: Moments, components: list, active, strands: Strands) -> Moments:
+    """Adds samples to each strand's moments."""
+    first, end, block, stride = strands.first, strands.end, strands.block, strands.stride
 
     def add(i: mi.UInt32, n: mi.UInt32, old: Moments):
         x = [dr.gather(mi.Float, component, i) for component in components]

@@ -56,7 +56,7 @@ class Room:
         from data_gen.frames.motion import snapshot
         from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt.plan import make_plan
-        from data_gen.samplers.restir.carry import Stage
+        from data_gen.samplers.restir.stage import Stage
 
         scene = self.scenes[frame % 2]
         params = self.mi.traverse(scene)
@@ -142,7 +142,7 @@ def found_in(room, frame):
     stage, _ = room.stage(frame)
     camera = CameraSamples(stage.sensor, 3, 16)
     sample = room.mi.UInt32(np.arange(SIZE * SIZE * 16) % 16)
-    found = walk.walk(stage.scene, stage.plan, camera, sample, walk.choices(3, camera, sample))
+    found = walk.walk(stage, camera, sample, walk.choices(3, camera, sample))
     dr.eval(found)
     return stage, found
 
@@ -154,9 +154,7 @@ def worth(stage, record, place=None):
 
     from data_gen.samplers.restir.evaluate import evaluate_record
 
-    shifted = evaluate_record(
-        stage.scene, stage.plan, stage.sensor, 3, record, record.place if place is None else place, mi.Bool(True)
-    )
+    shifted = evaluate_record(stage, 3, record, record.place if place is None else place, mi.Bool(True))
     dr.eval(shifted)
     return np.array(shifted.f), np.array(shifted.J), shifted.geometry
 

@@ -46,8 +46,8 @@ class Room:
     def frames(self, seed=5, chains=CHAINS, count=FRAMES, **options):
         """History, and for each frame its values, (chains, H, W, 3)."""
         from data_gen.frames.motion import motion_vectors
-        from data_gen.samplers.restir.carry import Stage
         from data_gen.samplers.restir.history import History
+        from data_gen.samplers.restir.stage import Stage
 
         history = History(Stage(self.scene, self.plan, self.sensor), seed, chains, **options)
         before = None
@@ -193,7 +193,7 @@ def test_shifted_to_this_frame_and_back_is_what_was_kept(rooms, scene):
     _, it = all_kept(history)
     # The camera of the frame to come
     room.at(FRAMES - 1)
-    shift = (room.scene, room.plan, room.sensor, history.seed)
+    shift = (history.stage, history.seed)
     record = gather(history.kept.record, it.source)
     here = evaluate_record(*shift, record, it.place, it.good)
     dr.eval(here)

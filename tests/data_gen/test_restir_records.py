@@ -42,16 +42,18 @@ class Paths:
         from data_gen.paths.walk import Limits
         from data_gen.samplers.gpt.plan import make_plan
         from data_gen.samplers.restir import walk
+        from data_gen.samplers.restir.stage import Stage
 
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         self.mi, self.walk = mi, walk
         self.scene = mi.load_dict(description)
         self.sensor = self.scene.sensors()[0]
         self.plan = make_plan(self.scene, Limits(6, 3), caustic=False)
+        self.stage = Stage(self.scene, self.plan, self.sensor)
         self.camera = CameraSamples(self.sensor, SEED, SPP)
         self.sample = mi.UInt32(np.arange(SIZE * SIZE * SPP) % SPP)
         choice = walk.choices(SEED, self.camera, self.sample)
-        self.found = walk.walk(self.scene, self.plan, self.camera, self.sample, choice)
+        self.found = walk.walk(self.stage, self.camera, self.sample, choice)
         dr.eval(self.found)
         self.f, self.W = np.array(self.found.f), np.array(self.found.W)
         self.kind = np.array(self.found.record.kind)
@@ -70,7 +72,7 @@ class Paths:
         from data_gen.samplers.restir.evaluate import evaluate_record
 
         place = self.place(record, move)
-        shifted = evaluate_record(self.scene, self.plan, self.sensor, SEED, record, place, self.mi.Bool(True))
+        shifted = evaluate_record(self.stage, SEED, record, place, self.mi.Bool(True))
         dr.eval(shifted)
         return np.array(shifted.f), np.array(shifted.J), shifted.geometry
 
@@ -153,7 +155,7 @@ def test_a_walk_from_there_would_reconnect_at_the_same_vertex(paths, move):
     camera = paths.camera
     camera_there = Displaced(camera, move)
     choice = paths.walk.choices(SEED, camera, paths.sample)
-    other = paths.walk.walk(paths.scene, paths.plan, camera_there, paths.sample, choice)
+    other = paths.walk.walk(paths.stage, camera_there, paths.sample, choice)
     kind, replayed = np.array(other.record.kind), np.array(other.record.replayed)
     # Of the kinds that tell where the walk from there has its rc
     tells = (np.array(other.W) > 0) & np.isin(kind, (1, 2, 3, 5)) & (paths.W > 0) & f.any(axis=0)

@@ -16,8 +16,7 @@ other triangles. [Lin et al. 2022: shifts between domains of any kind, here thos
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import drjit as dr
 import mitsuba as mi
@@ -32,17 +31,8 @@ from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.restir.events import DRAWN, draw, sample_event
 from data_gen.samplers.restir.record import LIGHT, RC_LIGHT, REPLAY, STUCK, SUFFIX, Record, word_of
-from data_gen.scenes.geometry import Geometry, Mesh
-
-
-@dataclass
-class Stage:
-    """A scene in the state of one frame; ``shapes`` are those of its shapes, in their order."""
-
-    scene: mi.Scene
-    plan: Plan
-    sensor: mi.Sensor
-    shapes: Sequence[Geometry] = ()
+from data_gen.samplers.restir.stage import Stage
+from data_gen.scenes.geometry import Mesh
 
 
 class Carry:
@@ -163,8 +153,12 @@ def _sampled(scene: mi.Scene, x: mi.SurfaceInteraction3f, numbers, active: mi.Bo
 @dr.syntax
 def _further(scene, plan: Plan, random, x, record: Record, active):
     """``L`` of what ends behind the first vertex after rc, which is ``x``: as in ``walk``, along the one path."""
-    L, B, η, i = mi.Spectrum(0), mi.Spectrum(1), mi.Float(1), mi.UInt32(1)
-    behind, sampled, depth = record.behind, record.sampled, record.replayed + 3
+    L = mi.Spectrum(0)  # what the path's lamp brings
+    B = mi.Spectrum(1)  # f / p of all vertices since rc, Russian roulette included
+    η = mi.Float(1)  # product of the relative indices of refraction since rc
+    i = mi.UInt32(1)  # vertices behind rc so far
+    depth = record.replayed + 3  # number of x in the whole path
+    behind, sampled = record.behind, record.sampled
     while active:
         numbers = draw(random)
         light, Le_p, lit = _sampled(scene, x, numbers, active & sampled & (i == behind))

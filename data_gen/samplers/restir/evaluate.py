@@ -27,6 +27,7 @@ from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.restir.events import Numbers, draw, sample_event
 from data_gen.samplers.restir.record import HIT, LIGHT, RC_LIGHT, REPLAY, STUCK, Record, geometry_of
+from data_gen.samplers.restir.stage import Stage
 
 
 @dataclass
@@ -38,11 +39,10 @@ class Shifted:
     geometry: mi.Float  # for Record.moved()
 
 
-def evaluate_record(
-    scene: mi.Scene, plan: Plan, sensor: mi.Sensor, seed: int, record: Record, place: mi.Point2f, active: mi.Bool
-) -> Shifted:
+def evaluate_record(stage: Stage, seed: int, record: Record, place: mi.Point2f, active: mi.Bool) -> Shifted:
     """E(record, place): the paths of the records, as those of the ``place`` on the film; J is that of the way there."""
-    camera = CameraSamples.replayed(sensor, seed, record.pixel, record.sample, place)
+    scene, plan = stage.scene, stage.plan
+    camera = CameraSamples.replayed(stage.sensor, seed, record.pixel, record.sample, place)
     ray, importance, inside = camera.rays()
     y = scene.ray_intersect(mi.Ray3f(ray), active & inside)
     kind = record.kind
@@ -65,7 +65,9 @@ def evaluate_record(
 @dr.syntax
 def _replay(scene, plan: Plan, random, record: Record, y, good):
     """The vertex that the prefix leads to, its f / p, whether that can be undone; the radiance of REPLAY."""
-    β, L, i = mi.Spectrum(1), mi.Spectrum(0), mi.UInt32(0)
+    β = mi.Spectrum(1)  # f / p of the vertices that were left so far
+    L = mi.Spectrum(0)  # radiance of REPLAY
+    i = mi.UInt32(0)  # how many those are
     replayed, ends = record.replayed, record.kind == REPLAY
     active = good & (i < replayed)
     while active:

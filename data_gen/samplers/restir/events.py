@@ -9,7 +9,6 @@ import mitsuba as mi
 
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.samplers.gpt.plan import Plan
-from ngpt.errors import NgptError
 
 # Random numbers of a vertex, all told
 DRAWN = 6
@@ -60,13 +59,3 @@ def sample_event(scene: mi.Scene, plan: Plan, x: mi.SurfaceInteraction3f, number
     joined = (kind == SMOOTH) & plan.materials.connectable(bsdf) & rough
     joined &= hit.instance == None  # noqa: E711 - a comparison of arrays of pointers
     return Event(found, kind, sample.wo, sample.pdf, sample.eta, dr.select(found, f_p, 0), ray, hit, x1, joined)
-
-
-def check(plan: Plan) -> None:
-    """Raises NgptError where records would be wrong: other colours than RGB, lamps that hide from the camera, media."""
-    if not mi.is_rgb or mi.is_polarized:
-        raise NgptError(f"restir: records hold RGB, and the variant is '{mi.variant()}'; use 'llvm_ad_rgb'")
-    if plan.limits.hide_emitters:
-        raise NgptError("restir: emitters that hide from the camera are not known; leave out hide_emitters")
-    if plan.space.media:
-        raise NgptError("restir: media are not known; leave out volumes")

@@ -5,7 +5,7 @@ r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to
         E   of each candidate in the four neighbours                           ``_partners``
         E   of what is kept, in this frame                                     ``_here``
         E   of each candidate, by the camera of the frame before               ``_there``
-        of each reservoir, one path of all that is offered                     ``_merged``
+        of each reservoir, one path of all that is offered                     ``merging``
 
 There are five reservoirs for each pixel: of its own light, and of the difference to its right and to its lower
 neighbour, one for each sign. Values that change sign have no density to choose by.
@@ -29,6 +29,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -36,15 +37,16 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.camera import CameraSamples
-from data_gen.samplers.restir.carry import Carry, Stage
-from data_gen.samplers.restir.evaluate import Shifted, evaluate_record
-from data_gen.samplers.restir.events import check
+from data_gen.samplers.restir.carry import Carry
+from data_gen.samplers.restir.evaluate import evaluate_record
 from data_gen.samplers.restir.footprint import CORNERS, pair_motions
 from data_gen.samplers.restir.layout import RESERVOIRS, STEPS, Layout, across, step
+from data_gen.samplers.restir.merging import Evaluated, Merging, differences
 from data_gen.samplers.restir.pose import Pose
-from data_gen.samplers.restir.record import Record, gather, select
+from data_gen.samplers.restir.record import Record
 from data_gen.samplers.restir.requests import Request, Requests, evaluate_some
-from data_gen.samplers.restir.reservoir import Reservoir, choose, confidence_after, difference, part, weigh, weight_of
+from data_gen.samplers.restir.reservoir import Reservoir, confidence_after
+from data_gen.samplers.restir.stage import Stage, check
 from data_gen.samplers.restir.walk import Candidate, choices, walk
 
 
@@ -60,28 +62,6 @@ class Frame:
     primal: mi.Spectrum
     dx: mi.Spectrum
     dy: mi.Spectrum
-
-
-@dataclass
-class _Evaluated:
-    """E of all that a frame needs; None where it is not needed."""
-
-    partners: Requests | None = None
-    here: Requests | None = None
-    elsewhere: Requests | None = None
-    there: Requests | None = None
-
-
-@dataclass
-class _Offer:
-    """A path for a reservoir: its value there, resampling weight, side; lane of the record, and how that has moved."""
-
-    value: mi.Spectrum
-    weight: mi.Float
-    side: mi.UInt32
-    source: mi.UInt32
-    place: mi.Point2f
-    geometry: mi.Float
 
 
 class History:
@@ -136,7 +116,7 @@ class History:
                 dr.opaque(mi.UInt32, self.frames * self.chains) + dr.arange(mi.UInt32, self.at.lanes) % self.at.chains
             )
             choice = choices(self.seed, camera, sample)
-            found = walk(self.stage.scene, self.stage.plan, camera, sample, choice)
+            found = walk(self.stage, camera, sample, choice)
             u = [choice.next_1d() for _ in range(self.at.reservoirs)]
             dr.eval(found, u)
             frame = self._resample(camera, found, dr.concat(u))
@@ -163,13 +143,10 @@ class History:
         return record if source is target else Carry(source, target)(self.seed, record, active)
 
     def _of(self, stage: Stage, pool: Record, lanes: int, ends: int, active: mi.Bool, request: Request) -> Requests:
-        def evaluate(record: Record, place: mi.Point2f, exists: mi.Bool) -> Shifted:
-            return evaluate_record(stage.scene, stage.plan, stage.sensor, self.seed, record, place, exists)
-
-        return evaluate_some(evaluate, pool, lanes, ends, active, request)
+        return evaluate_some(partial(evaluate_record, stage, self.seed), pool, lanes, ends, active, request)
 
     def _resample(self, camera: CameraSamples, found: Candidate, u: mi.Float) -> Frame:
-        e, kept = _Evaluated(), self.kept
+        e, kept = Evaluated(), self.kept
         if kept is not None:
             with self._then() as stage:
                 back = self._carried(found.record, self.stage, self.before, found.W > 0)
@@ -178,7 +155,7 @@ class History:
             e.here = self._here(kept)
         if self.pairs:
             e.partners = self._partners(found.record, found.W)
-        kept = self._merged(found, kept, e, u)
+        kept = Merging(self.at, self._ends, found, kept, e).merged(u)
         dr.eval(kept)
         self.kept = kept
         values = kept.estimate()
@@ -190,7 +167,9 @@ class History:
         if self.pairs:
             dx, dy = signs[0] - signs[1], signs[2] - signs[3]
         else:
-            dx, dy = self._differences(kept) if self.gradients else (mi.Spectrum(0), mi.Spectrum(0))
+            dx, dy = mi.Spectrum(0), mi.Spectrum(0)
+            if self.gradients:
+                dx, dy = differences(self.at, kept, self._partners(kept.record, kept.W))
         dr.eval(primal, dx, dy)
         return Frame(camera, found.L, primal, dx, dy)
 
@@ -252,93 +231,3 @@ class History:
         _, _, i, _, good = where(dr.arange(mi.UInt32, 2 * self.at.total))
         good &= dr.gather(mi.Float, found.W, i) > 0
         return self._of(stage, found.record, 2 * self.at.total, self._ends, good, request)
-
-    # ------------------------------ What is kept ------------------------------
-
-    def _merged(self, found: Candidate, kept: Reservoir | None, e: _Evaluated, u: mi.Float) -> Reservoir:
-        """Of each reservoir the path that is kept, of this frame or of the one before."""
-        lane = dr.arange(mi.UInt32, self.at.total)
-        r, i = lane // self.at.n, lane % self.at.n
-        domain, pixel = (r + 1) // 2, self.at.pixel(i)
-        exists = self.at.on_film(pixel + step(domain))
-        offers = [self._candidate(found, e, r, i, mi.UInt32(side)) for side in range(self._ends)]
-        candidates = len(offers)
-        if kept is not None:
-            offers += [self._history(kept, e, r, lane * len(CORNERS) + k) for k in range(len(CORNERS))]
-        chosen, total = choose([dr.select(exists, offer.weight, 0) for offer in offers], u)
-        best = offers[0]
-        for k, offer in enumerate(offers[1:], 1):
-            best = dr.select(chosen == k, offer, best)
-        record = gather(found.record, dr.select(chosen < candidates, best.source, 0))
-        if kept is not None:
-            old = chosen >= candidates
-            history = gather(kept.record, best.source, old).moved(best.place, best.geometry)
-            record = select(old, history, record)
-        return Reservoir(record, best.side, best.value, weight_of(total, best.value))
-
-    def _candidate(self, found: Candidate, e: _Evaluated, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:
-        """What a pixel's candidate offers: of a pair that of either side."""
-        domain, pixel = (r + 1) // 2, self.at.pixel(i)
-        at = pixel + step(domain) * mi.Int32(side)
-        active = self.at.on_film(at) & ((side == 0) | (domain > 0))
-        source = dr.select(active, self.at.lane(at, i % self.at.chains), 0)
-        f, W = dr.gather(mi.Spectrum, found.f, source, active), dr.gather(mi.Float, found.W, source, active)
-        other = mi.Spectrum(0)
-        if e.partners is not None:
-            other = e.partners.part((2 * domain - 2 + side) * self.at.n + source, domain > 0)
-        value = _value(r, f, other, side)
-        target, others = mi.luminance(value), mi.Float(0)
-        if e.there is not None:
-            entry = dr.select(domain > 0, 2 * domain - 1 + side, 0) * self.at.n + source
-            place = dr.gather(mi.Point2f, found.record.place, source)
-            for wrapped in (False, True):
-                _, before, there = self.at.before(domain, pixel, side, place, mi.Bool(wrapped))
-                lane = entry + (self.at.all if wrapped else 0)
-                density = mi.luminance(_value(r, e.there.part(lane), e.there.part(lane, domain > 0, 1), side))
-                others += dr.select(there, self.at.confidence(domain, before), 0) * density
-        weight = dr.select(active, weigh(target, others, target, W)[1], 0)
-        return _Offer(value, weight, side, source, dr.gather(mi.Point2f, found.record.place, source), mi.Float(0))
-
-    def _history(self, kept: Reservoir, e: _Evaluated, r: mi.UInt32, lane: mi.UInt32) -> _Offer:
-        """What a reservoir of the frame before offers."""
-        it = self.at.corner(lane, kept)
-        own, partner = e.here.at(lane), e.here.part(lane, it.domain > 0, 1)
-        # In the measure of the pixel that the path is in
-        value = _value(r, own.f, partner / own.J, it.side)
-        value = dr.select(dr.all(dr.isfinite(value)), value, 0)
-        target = mi.luminance(value) * own.J
-        was = mi.luminance(dr.gather(mi.Spectrum, kept.value, it.source))
-        other = mi.luminance(_value(r, e.elsewhere.part(lane), e.elsewhere.part(lane, it.domain > 0, 1), it.side))
-        others = target + dr.select(it.twice, self.at.confidence(it.domain, it.other), 0) * other
-        W = dr.gather(mi.Float, kept.W, it.source)
-        _, weight = weigh(self.at.confidence(it.domain, it.before) * was, others, target, W)
-        return _Offer(value, dr.select(it.good, weight, 0), it.side, it.source, it.place, own.geometry)
-
-    def _differences(self, kept: Reservoir) -> tuple[mi.Spectrum, mi.Spectrum]:
-        """dx and dy of the paths that pixels have kept, each weighted against its mirror image."""
-        partners = self._partners(kept.record, kept.W)
-        i = dr.arange(mi.UInt32, self.at.lanes)
-        pixel, chain = self.at.pixel(i), i % self.at.chains
-        found = []
-        for domain, (x, y) in enumerate(list(STEPS.values())[1:]):
-            step = mi.Point2i(x, y)
-            exists = self.at.on_film(pixel + step)
-            total = mi.Spectrum(0)
-            for side in (0, 1):
-                at = dr.select(exists, self.at.lane(pixel + step, chain), 0) if side else i
-                f, W = dr.gather(mi.Spectrum, kept.value, at, exists), dr.gather(mi.Float, kept.W, at, exists)
-                other = partners.part(dr.opaque(mi.UInt32, (2 * domain + side) * self.at.lanes) + at)
-                total += dr.select(exists & (W > 0), _pair(f, other, mi.UInt32(side)) * W, 0)
-            found.append(total)
-        return found[0], found[1]
-
-
-def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    first = side == 0
-    return difference(dr.select(first, own, other), dr.select(first, other, own), side)
-
-
-def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
-    """What reservoir number ``r`` is of, light or one sign of a difference: of a path in its pixel and in the other."""
-    sign = dr.select(r % 2 == 1, mi.Float(1), -1)
-    return dr.select(r == 0, own, part(_pair(own, other, side), sign))

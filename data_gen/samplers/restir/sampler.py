@@ -13,8 +13,8 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.walk import Limits
 from data_gen.samplers.gpt.plan import make_plan
-from data_gen.samplers.restir.carry import Stage
 from data_gen.samplers.restir.history import Frame, History
+from data_gen.samplers.restir.stage import Stage
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import reference_integrator
 
@@ -36,6 +36,7 @@ class Restir:
         seed: int,
         spp: int,
         memory: int,
+        *,
         history: float,
         gradients: str,
         roughness_threshold: float,

@@ -30,7 +30,7 @@ from data_gen.paths.vertex import SMOOTH, evaluate, seen_from
 from data_gen.paths.walk import roulette
 from data_gen.samplers.gpt.base_path import light_mis
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.restir.events import draw, sample_event
+from data_gen.samplers.restir.events import Numbers, draw, sample_event
 from data_gen.samplers.restir.record import (
     HIT,
     LIGHT,
@@ -43,6 +43,7 @@ from data_gen.samplers.restir.record import (
     geometry_of,
     word_of,
 )
+from data_gen.samplers.restir.stage import Stage
 
 _BEFORE, _AT, _BEHIND = 0, 1, 2
 
@@ -63,13 +64,61 @@ class Candidate:
 
 @dataclass
 class _Choice:
-    """What differs between the paths of a walk; rc they share."""
+    """What differs between the paths of a walk; rc they share. Names as in ``Record``."""
 
     word: mi.UInt32
-    f: mi.Spectrum
+    f: mi.Spectrum  # integrand of the path
     w: mi.Vector3f
     L: mi.Spectrum
     p_light: mi.Float
+
+
+@dataclass
+class _Kept:
+    """The path that is chosen of those that were found so far."""
+
+    chosen: _Choice
+    total: mi.Float  # Σ of the luminances of all paths
+    L: mi.Spectrum  # Σ of their contributions f W
+
+    def offered(self, new: _Choice, W: mi.Float, u: mi.Float, exists: mi.Bool | bool = True) -> _Kept:
+        """Behind one more path: weighted reservoir sampling by a random number ``u``."""
+        L = self.L + dr.select(exists, new.f * W, 0)
+        weight = mi.luminance(new.f) * W
+        weight = dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
+        total = self.total + weight
+        takes = u * total < weight
+        values = {f.name: dr.select(takes, getattr(new, f.name), getattr(self.chosen, f.name)) for f in fields(_Choice)}
+        return _Kept(_Choice(**values), total, L)
+
+
+@dataclass
+class _RC:
+    """The vertex where copies of the path reconnect, and how the walk goes on from there. Names as in ``Record``."""
+
+    P: mi.Point3f
+    shape: mi.ShapePtr
+    primitive: mi.UInt32
+    uv: mi.Point2f
+    geometry: mi.Float
+    w: mi.Vector3f
+
+
+@dataclass
+class _State:
+    """A walk at its vertex x."""
+
+    x: mi.SurfaceInteraction3f
+    depth: mi.UInt32  # number of x, from 1 on
+    F: mi.Spectrum  # integrand up to x, or up to rc where that is before x
+    W: mi.Float  # 1 / density of the same
+    B: mi.Spectrum  # f / p of the vertices behind rc
+    η: mi.Float  # product of the relative indices of refraction up to x, or since rc
+    phase: mi.UInt32
+    replayed: mi.UInt32  # vertices before rc that a copy leaves by replay
+    stuck: mi.Bool  # rc was left by a Dirac delta or a hole
+    rc: _RC
+    walks: mi.Bool  # x was reached
 
 
 def choices(seed: int, camera: CameraSamples, sample: mi.UInt32) -> mi.Sampler:
@@ -78,137 +127,137 @@ def choices(seed: int, camera: CameraSamples, sample: mi.UInt32) -> mi.Sampler:
     return sample_streams(own, camera.pixel, sample)
 
 
-def walk(scene: mi.Scene, plan: Plan, camera: CameraSamples, sample: mi.UInt32, choice) -> Candidate:
+def walk(stage: Stage, camera: CameraSamples, sample: mi.UInt32, choice) -> Candidate:
     """A candidate for each camera sample, which has number ``sample``; ``choice`` draws what chooses among paths."""
     ray, importance, _ = camera.rays()
-    x = scene.ray_intersect(mi.Ray3f(ray))
-    return _walk(scene, plan, camera.random.clone(), choice, camera.pixel, sample, camera.position, x, importance)
-
-
-@dr.syntax
-def _walk(scene, plan, random, choice, pixel, sample, place, x, importance):
-    lanes = dr.width(pixel)
-    record = empty(lanes)
-    chosen = _Choice(record.word, record.L, record.w, record.L, record.p_light)
-    F, W, B = mi.Spectrum(importance), mi.Float(1), mi.Spectrum(1)
-    L, total, η, phase, depth = mi.Spectrum(0), mi.Float(0), mi.Float(1), mi.UInt32(_BEFORE), mi.UInt32(1)
-    # rc, and how the walk goes on from there
-    P, shape, primitive, uv, w, geometry = (
-        *(record.P, record.shape, record.primitive, record.uv),
-        *(record.w, record.geometry),
+    none = empty(dr.width(camera.pixel))
+    start = _State(
+        x=stage.scene.ray_intersect(mi.Ray3f(ray)),
+        depth=mi.UInt32(1),
+        F=mi.Spectrum(importance),
+        W=mi.Float(1),
+        B=mi.Spectrum(1),
+        η=mi.Float(1),
+        phase=mi.UInt32(_BEFORE),
+        replayed=mi.UInt32(0),
+        stuck=mi.Bool(False),
+        rc=_RC(none.P, none.shape, none.primitive, none.uv, none.geometry, none.w),
+        walks=mi.Bool(True),
     )
-    replayed, stuck = mi.UInt32(0), mi.Bool(False)
-    active = x.is_valid() & (depth < plan.limits.max_depth)
-    while active:
-        numbers = draw(random)
-        u_light, u_hit = choice.next_1d(), choice.next_1d()
-        before, at, behind = phase == _BEFORE, phase == _AT, phase == _BEHIND
-
-        # ---------------------- Emitter sampling ---------------------
-        bsdf = x.bsdf()
-        lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
-        light, Le_p = scene.sample_emitter_direction(x, numbers.light, True, lit)
-        lit &= light.pdf != 0
-        f, p = evaluate(bsdf, x, x.to_local(light.d), lit)
-        fm = f * light_mis(light.delta, light.pdf, p)
-        at_rc = dr.select(light.delta, mi.UInt32(SUFFIX), mi.UInt32(RC_LIGHT))
-        ends = dr.select(stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
-        found = _Choice(
-            word_of(
-                dr.select(before, mi.UInt32(LIGHT), dr.select(at, at_rc, ends)),
-                dr.select(before, depth - 1, replayed),
-                dr.select(before, 0, depth - 2 - replayed),
-                True,
-            ),
-            dr.select(lit, F * B * fm * Le_p, 0),
-            dr.select(behind, w, light.d),
-            dr.select(behind, B * fm * Le_p, Le_p),
-            dr.select(at & ~light.delta, light.pdf, 0),
-        )
-        L += found.f * W
-        chosen, total = _stream(chosen, total, found, W, u_light)
-
-        # ----------------------- BSDF sampling -----------------------
-        event = sample_event(scene, plan, x, numbers, active)
-        x1 = event.x1
-        there = before & event.joined & x1.is_valid()
-        # A ray starts beside its surface, to leave it: what it meets is seen from x in a direction that differs a bit.
-        d = dr.select(there, dr.normalize(x1.p - x.p), event.ray.d)
-        x1 = seen_from(x1, d)
-        f, p = evaluate(bsdf, x, dr.select(there, x.to_local(d), event.wo), event.kind == SMOOTH)
-        joins = before & event.joined
-        # The two steps whose directions have a density in solid angle
-        follows = at & (event.kind == SMOOTH) & (p > 0)
-        stuck |= at & ~follows
-        density = joins | follows
-        f_p = dr.select(density, f / p, event.f_p)
-        η = dr.select(event.found, η * event.η, η)
-        # Behind rc it goes by what is behind rc alone, so that it can be played again from there.
-        β1 = dr.select(behind, B, F * W) * f_p
-        q = roulette(dr.max(β1), depth >= plan.limits.rr_depth, η)
-        survival, walks = dr.rcp(q), (dr.max(β1) > 0) & (numbers.survival < q)
-        # Where a join has no density, after that correction, there is no such path.
-        walks &= event.found & (~joins | (p > 0))
-        survival = dr.select(walks, survival, 0)
-        W = dr.select(behind, W, W * survival * dr.select(density, dr.rcp(p), 1))
-        F = dr.select(behind, F, F * dr.select(density, f, event.f_p))
-        B = dr.select(behind, B * f_p * survival, B)
-
-        # ----------------------------- rc ----------------------------
-        P, shape = dr.select(there, x1.p, P), dr.select(there, event.hit.shape, shape)
-        primitive, uv = dr.select(there, event.hit.prim_index, primitive), dr.select(there, event.hit.prim_uv, uv)
-        geometry = dr.select(there, geometry_of(x1.n, x1.p, x.p), geometry)
-        replayed = dr.select(joins, depth - 1, replayed)
-        w = dr.select(joins | at, d, w)
-
-        # ----------------------- Le that was met ---------------------
-        Le, p_light = emission(scene, x1, x, walks, walks & (event.kind == SMOOTH))
-        m = mis_weight(dr.select(density, p, event.p), p_light)
-        # Behind rc m is a part of L; at rc it is the other paths' own.
-        ends = dr.select(stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
-        met = _Choice(
-            word_of(
-                dr.select(joins, mi.UInt32(HIT), dr.select(before, mi.UInt32(REPLAY), ends)),
-                dr.select(before & ~joins, depth, replayed),
-                dr.select(before, 0, depth - 1 - replayed),
-                False,
-            ),
-            dr.select(walks, F * B * Le * m, 0),
-            w,
-            dr.select(behind, B * Le * m, Le),
-            dr.select(follows, p_light, 0),
-        )
-        L += dr.select(walks, met.f * W, 0)
-        chosen, total = _stream(chosen, total, met, W, u_hit)
-
-        η = dr.select(at, 1, η)
-        phase = dr.select(joins | at, phase + 1, phase)
-        x = x1
-        depth += 1
-        active = walks & x.is_valid() & (depth < plan.limits.max_depth)
+    kept = _Kept(_Choice(none.word, none.L, none.w, none.L, none.p_light), mi.Float(0), mi.Spectrum(0))
+    rc, kept = _walk(stage.scene, stage.plan, camera.random.clone(), choice, start, kept)
+    chosen, weight = kept.chosen, mi.luminance(kept.chosen.f)
     record = Record(
-        pixel=pixel,
+        pixel=camera.pixel,
         sample=sample,
-        place=place,
+        place=camera.position,
         word=chosen.word,
-        P=P,
-        shape=shape,
-        primitive=primitive,
-        uv=uv,
+        P=rc.P,
+        shape=rc.shape,
+        primitive=rc.primitive,
+        uv=rc.uv,
         w=chosen.w,
         L=chosen.L,
         p_light=chosen.p_light,
-        geometry=geometry,
+        geometry=rc.geometry,
     )
-    weight = mi.luminance(chosen.f)
-    return Candidate(record, chosen.f, dr.select(weight > 0, total / weight, 0), L)
+    return Candidate(record, chosen.f, dr.select(weight > 0, kept.total / weight, 0), kept.L)
 
 
-def _stream(chosen: _Choice, total: mi.Float, new: _Choice, W: mi.Float, u: mi.Float) -> tuple[_Choice, mi.Float]:
-    """Weighted reservoir sampling of one more path."""
-    weight = mi.luminance(new.f) * W
-    weight = dr.select(dr.isfinite(weight) & (weight > 0), weight, 0)
-    total = total + weight
-    takes = u * total < weight
-    values = {f.name: dr.select(takes, getattr(new, f.name), getattr(chosen, f.name)) for f in fields(_Choice)}
-    return _Choice(**values), total
+@dr.syntax
+def _walk(scene, plan: Plan, random, choice, at: _State, kept: _Kept) -> tuple[_RC, _Kept]:
+    """The whole walk: where copies of its paths reconnect, and the one that is kept."""
+    active = at.x.is_valid() & (at.depth < plan.limits.max_depth)
+    while active:
+        numbers = draw(random)
+        u_light, u_hit = choice.next_1d(), choice.next_1d()
+        kept = kept.offered(_to_light(scene, at, numbers), at.W, u_light)
+        at, met = _onward(scene, plan, at, numbers, active)
+        kept = kept.offered(met, at.W, u_hit, at.walks)
+        active = at.walks & at.x.is_valid() & (at.depth < plan.limits.max_depth)
+    return at.rc, kept
+
+
+def _to_light(scene, at: _State, numbers: Numbers) -> _Choice:
+    """The path that ends at an emitter which is sampled at x."""
+    x, bsdf = at.x, at.x.bsdf()
+    before, at_rc, behind = at.phase == _BEFORE, at.phase == _AT, at.phase == _BEHIND
+    lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth)
+    light, Le_p = scene.sample_emitter_direction(x, numbers.light, True, lit)
+    lit &= light.pdf != 0
+    f, p = evaluate(bsdf, x, x.to_local(light.d), lit)
+    fm = f * light_mis(light.delta, light.pdf, p)
+    # What kind of path that is
+    kind_at_rc = dr.select(light.delta, mi.UInt32(SUFFIX), mi.UInt32(RC_LIGHT))
+    kind_behind = dr.select(at.stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
+    kind = dr.select(before, mi.UInt32(LIGHT), dr.select(at_rc, kind_at_rc, kind_behind))
+    replayed = dr.select(before, at.depth - 1, at.replayed)
+    return _Choice(
+        word=word_of(kind, replayed, dr.select(before, 0, at.depth - 2 - at.replayed), True),
+        f=dr.select(lit, at.F * at.B * fm * Le_p, 0),
+        w=dr.select(behind, at.rc.w, light.d),
+        L=dr.select(behind, at.B * fm * Le_p, Le_p),
+        p_light=dr.select(at_rc & ~light.delta, light.pdf, 0),
+    )
+
+
+def _onward(scene, plan: Plan, at: _State, numbers: Numbers, active: mi.Bool) -> tuple[_State, _Choice]:
+    """A step along a sampled direction: the walk at its next vertex x1, and the path that ends at a lamp there."""
+    x, before, at_rc, behind = at.x, at.phase == _BEFORE, at.phase == _AT, at.phase == _BEHIND
+
+    # ------------------------- The event -------------------------
+    event = sample_event(scene, plan, x, numbers, active)
+    x1 = event.x1
+    joins = before & event.joined  # x1 is rc,
+    there = joins & x1.is_valid()  # on a surface
+    # A ray starts beside its surface, to leave it: what it meets is seen from x in a direction that differs a bit.
+    d = dr.select(there, dr.normalize(x1.p - x.p), event.ray.d)
+    x1 = seen_from(x1, d)
+    f, p = evaluate(x.bsdf(), x, dr.select(there, x.to_local(d), event.wo), event.kind == SMOOTH)
+    follows = at_rc & (event.kind == SMOOTH) & (p > 0)  # a copy can leave rc along d
+    stuck = at.stuck | (at_rc & ~follows)
+    # The two steps whose directions have a density in solid angle; in others f is f / p.
+    density = joins | follows
+    f_p = dr.select(density, f / p, event.f_p)
+    η = dr.select(event.found, at.η * event.η, at.η)
+
+    # ---------------------- Russian roulette ---------------------
+    # Behind rc it goes by what is behind rc alone, so that it can be played again from there.
+    throughput = dr.max(dr.select(behind, at.B, at.F * at.W) * f_p)
+    q = roulette(throughput, at.depth >= plan.limits.rr_depth, η)
+    # Where a join has no density, after that correction, there is no such path.
+    walks = (throughput > 0) & (numbers.survival < q) & event.found & (~joins | (p > 0))
+    survival = dr.select(walks, dr.rcp(q), 0)
+    # Up to rc survival belongs to the density, behind it to B.
+    W = dr.select(behind, at.W, at.W * survival * dr.select(density, dr.rcp(p), 1))
+    F = dr.select(behind, at.F, at.F * dr.select(density, f, event.f_p))
+    B = dr.select(behind, at.B * f_p * survival, at.B)
+
+    # ----------------------------- rc ----------------------------
+    rc = _RC(
+        P=dr.select(there, x1.p, at.rc.P),
+        shape=dr.select(there, event.hit.shape, at.rc.shape),
+        primitive=dr.select(there, event.hit.prim_index, at.rc.primitive),
+        uv=dr.select(there, event.hit.prim_uv, at.rc.uv),
+        geometry=dr.select(there, geometry_of(x1.n, x1.p, x.p), at.rc.geometry),
+        w=dr.select(joins | at_rc, d, at.rc.w),
+    )
+    replayed = dr.select(joins, at.depth - 1, at.replayed)
+
+    # ----------------------- Le that was met ---------------------
+    Le, p_light = emission(scene, x1, x, walks, walks & (event.kind == SMOOTH))
+    m = mis_weight(dr.select(density, p, event.p), p_light)
+    kind_behind = dr.select(stuck, mi.UInt32(STUCK), mi.UInt32(SUFFIX))
+    kind = dr.select(joins, mi.UInt32(HIT), dr.select(before, mi.UInt32(REPLAY), kind_behind))
+    left = dr.select(before & ~joins, at.depth, replayed)
+    met = _Choice(
+        word=word_of(kind, left, dr.select(before, 0, at.depth - 1 - replayed), False),
+        f=dr.select(walks, F * B * Le * m, 0),
+        w=rc.w,
+        # Behind rc m is a part of L; at rc it is the other paths' own.
+        L=dr.select(behind, B * Le * m, Le),
+        p_light=dr.select(follows, p_light, 0),
+    )
+    phase = dr.select(joins | at_rc, at.phase + 1, at.phase)
+    η = dr.select(at_rc, 1, η)
+    return _State(x1, at.depth + 1, F, W, B, η, phase, replayed, stuck, rc, walks), met

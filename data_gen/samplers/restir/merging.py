@@ -1,0 +1,141 @@
+"""Of each reservoir one path of all that it is offered; and differences of the paths that pixels have kept."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.samplers.restir.footprint import CORNERS
+from data_gen.samplers.restir.layout import STEPS, Layout, step
+from data_gen.samplers.restir.record import gather, select
+from data_gen.samplers.restir.requests import Requests
+from data_gen.samplers.restir.reservoir import Reservoir, choose, difference, part, weigh, weight_of
+from data_gen.samplers.restir.walk import Candidate
+
+
+@dataclass
+class Evaluated:
+    """E of all that a frame needs; None where it is not needed."""
+
+    partners: Requests | None = None
+    here: Requests | None = None
+    elsewhere: Requests | None = None
+    there: Requests | None = None
+
+
+@dataclass
+class _Offer:
+    """A path for a reservoir: its value there, resampling weight, side; lane of the record, and how that has moved."""
+
+    value: mi.Spectrum
+    weight: mi.Float
+    side: mi.UInt32
+    source: mi.UInt32
+    place: mi.Point2f
+    geometry: mi.Float
+
+
+@dataclass
+class Merging:
+    """What the reservoirs of a frame are offered."""
+
+    at: Layout
+    ends: int  # pixels that a value is of
+    found: Candidate  # of this frame
+    kept: Reservoir | None  # of the frame before, in this one's scene
+    e: Evaluated
+
+    def merged(self, u: mi.Float) -> Reservoir:
+        """Of each reservoir the path that is kept, of this frame or of the one before, by random numbers ``u``."""
+        lane = dr.arange(mi.UInt32, self.at.total)
+        r, i = lane // self.at.n, lane % self.at.n
+        domain, pixel = (r + 1) // 2, self.at.pixel(i)
+        exists = self.at.on_film(pixel + step(domain))
+        offers = [self._candidate(r, i, mi.UInt32(side)) for side in range(self.ends)]
+        candidates = len(offers)
+        if self.kept is not None:
+            offers += [self._history(r, lane * len(CORNERS) + k) for k in range(len(CORNERS))]
+        chosen, total = choose([dr.select(exists, offer.weight, 0) for offer in offers], u)
+        best = offers[0]
+        for k, offer in enumerate(offers[1:], 1):
+            best = dr.select(chosen == k, offer, best)
+        record = gather(self.found.record, dr.select(chosen < candidates, best.source, 0))
+        if self.kept is not None:
+            old = chosen >= candidates
+            history = gather(self.kept.record, best.source, old).moved(best.place, best.geometry)
+            record = select(old, history, record)
+        return Reservoir(record, best.side, best.value, weight_of(total, best.value))
+
+    def _candidate(self, r: mi.UInt32, i: mi.UInt32, side: mi.UInt32) -> _Offer:
+        """What a pixel's candidate offers: of a pair that of either side."""
+        found, e = self.found, self.e
+        domain, pixel = (r + 1) // 2, self.at.pixel(i)
+        at = pixel + step(domain) * mi.Int32(side)
+        active = self.at.on_film(at) & ((side == 0) | (domain > 0))
+        source = dr.select(active, self.at.lane(at, i % self.at.chains), 0)
+        f, W = dr.gather(mi.Spectrum, found.f, source, active), dr.gather(mi.Float, found.W, source, active)
+        other = mi.Spectrum(0)
+        if e.partners is not None:
+            other = e.partners.part((2 * domain - 2 + side) * self.at.n + source, domain > 0)
+        value = _value(r, f, other, side)
+        target, others = mi.luminance(value), mi.Float(0)
+        if e.there is not None:
+            entry = dr.select(domain > 0, 2 * domain - 1 + side, 0) * self.at.n + source
+            place = dr.gather(mi.Point2f, found.record.place, source)
+            for wrapped in (False, True):
+                _, before, there = self.at.before(domain, pixel, side, place, mi.Bool(wrapped))
+                lane = entry + (self.at.all if wrapped else 0)
+                density = mi.luminance(_value(r, e.there.part(lane), e.there.part(lane, domain > 0, 1), side))
+                others += dr.select(there, self.at.confidence(domain, before), 0) * density
+        weight = dr.select(active, weigh(target, others, target, W)[1], 0)
+        return _Offer(value, weight, side, source, dr.gather(mi.Point2f, found.record.place, source), mi.Float(0))
+
+    def _history(self, r: mi.UInt32, lane: mi.UInt32) -> _Offer:
+        """What a reservoir of the frame before offers."""
+        kept, e = self.kept, self.e
+        it = self.at.corner(lane, kept)
+        own, partner = e.here.at(lane), e.here.part(lane, it.domain > 0, 1)
+        # In the measure of the pixel that the path is in
+        value = _value(r, own.f, partner / own.J, it.side)
+        value = dr.select(dr.all(dr.isfinite(value)), value, 0)
+        target = mi.luminance(value) * own.J
+        was = mi.luminance(dr.gather(mi.Spectrum, kept.value, it.source))
+        other = mi.luminance(_value(r, e.elsewhere.part(lane), e.elsewhere.part(lane, it.domain > 0, 1), it.side))
+        others = target + dr.select(it.twice, self.at.confidence(it.domain, it.other), 0) * other
+        W = dr.gather(mi.Float, kept.W, it.source)
+        _, weight = weigh(self.at.confidence(it.domain, it.before) * was, others, target, W)
+        return _Offer(value, dr.select(it.good, weight, 0), it.side, it.source, it.place, own.geometry)
+
+
+def differences(at: Layout, kept: Reservoir, partners: Requests) -> tuple[mi.Spectrum, mi.Spectrum]:
+    """dx and dy of the paths that pixels have kept, each weighted against its mirror image.
+
+    ``partners``: E of these paths in the neighbours of their pixels.
+    """
+    i = dr.arange(mi.UInt32, at.lanes)
+    pixel, chain = at.pixel(i), i % at.chains
+    found = []
+    for domain, (x, y) in enumerate(list(STEPS.values())[1:]):
+        step = mi.Point2i(x, y)
+        exists = at.on_film(pixel + step)
+        total = mi.Spectrum(0)
+        for side in (0, 1):
+            lane = dr.select(exists, at.lane(pixel + step, chain), 0) if side else i
+            f, W = dr.gather(mi.Spectrum, kept.value, lane, exists), dr.gather(mi.Float, kept.W, lane, exists)
+            other = partners.part(dr.opaque(mi.UInt32, (2 * domain + side) * at.lanes) + lane)
+            total += dr.select(exists & (W > 0), _pair(f, other, mi.UInt32(side)) * W, 0)
+        found.append(total)
+    return found[0], found[1]
+
+
+def _pair(own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
+    first = side == 0
+    return difference(dr.select(first, own, other), dr.select(first, other, own), side)
+
+
+def _value(r: mi.UInt32, own: mi.Spectrum, other: mi.Spectrum, side: mi.UInt32) -> mi.Spectrum:
+    """What reservoir number ``r`` is of, light or one sign of a difference: of a path in its pixel and in the other."""
+    sign = dr.select(r % 2 == 1, mi.Float(1), -1)
+    return dr.select(r == 0, own, part(_pair(own, other, side), sign))
