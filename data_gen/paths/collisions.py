@@ -98,7 +98,7 @@ def null_and_real(medium, ray, t, μ_c, active) -> tuple[mi.Spectrum, mi.Spectru
 
 
 @dr.syntax
-def fly_on(passes, trace, ray, medium, channel, u, key, active):
+def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
     """As ``segments.fly_on()``, where there are grids; returns the same, its null collisions, and ∏ σn / σn_c."""
     lanes = dr.width(ray.o)
     ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
@@ -143,7 +143,7 @@ def fly_on(passes, trace, ray, medium, channel, u, key, active):
 
 
 @dr.syntax
-def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
+def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, active):
     """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
 
     Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.
@@ -182,20 +182,22 @@ def cross(passes, trace, ray, medium, reach, channel, key, scale, most, active):
     return τ, hit, ray, medium, M, N
 
 
-def rescale(passes, trace, ray, medium, reach, channel, base: Collisions, active, to_surface: bool = False) -> tuple:
+def rescale(passes, trace, ray, medium, reach, base: Collisions, *, channel, active, to_surface: bool = False) -> tuple:
     """The null collisions of a ``base`` segment on another way, to its end or ``to_surface``: m_i' = m_i M' / M.
 
     Returns τ of homogeneous media, what is met, the last piece of the ray, the medium there, the integrand of the list
     with its Jacobian over the density of that of the base path, and of that the colour c, which is the ratio of the
     densities.
     """
+    way = {"channel": channel, "key": base.key}
+    # First without collisions, for M'
     none, one = mi.UInt32(0), mi.Float(1)
-    τ, hit, last, end, M, N = cross(passes, trace, ray, medium, reach, channel, base.key, one, none, active)
+    τ, hit, last, end, M, N = cross(passes, trace, ray, medium, reach, **way, scale=one, most=none, active=active)
     scale = M / base.M
     moved = active & (base.n > 0) & (to_surface | ~hit.is_valid())
 
     def placed():
-        return cross(passes, trace, ray, medium, reach, channel, base.key, scale, base.n, mi.Bool(True))[-1]
+        return cross(passes, trace, ray, medium, reach, **way, scale=scale, most=base.n, active=mi.Bool(True))[-1]
 
     (N,) = dr.if_stmt((N,), moved, lambda N: (placed(),), lambda N: (N,))
     N *= dr.exp(base.M - M) * list_jacobian(scale, base.n) / base.N_c

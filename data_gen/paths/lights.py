@@ -62,7 +62,9 @@ def shadowed(scene: mi.Scene, si: mi.SurfaceInteraction3f, light: LightSample, f
     return dr.select(scene.ray_test(si.spawn_ray_to(light.target), dr.max(lit) > 0), 0, lit)
 
 
-def replay_light(scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, lit: mi.Bool) -> LightSample:
+def replay_light(
+    scene, lights: Lights, base, base_weight, u, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
+) -> LightSample:
     """``sample_light(scene, y, u, lit, False)``, by way of what the same numbers gave at another vertex.
 
     ``base`` is the direction sample there and ``base_weight`` its Le / p.
@@ -93,7 +95,7 @@ def emission(scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, a
     return light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, sampled)
 
 
-def shared_emission(scene, lights: Lights, x1, Le, p, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
+def shared_emission(scene, lights: Lights, x1, Le, p, *, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
     """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` at the same vertex ``x1``, seen from elsewhere.
 
     ``y1`` is ``x1`` with another incident direction, of which ``J`` is the ratio d'²/d² of squared distances.

@@ -18,7 +18,7 @@ Not followed: bump and normal maps, whose derivatives Mitsuba keeps to itself.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -116,17 +116,23 @@ def shoot(
     events: mi.UInt32,
     target: Target,
     active=True,
+    *,
     ends: Ends = nowhere,
 ) -> Shot:
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
     frame = mi.Frame3f(ω)
-    dp0, dp1 = mi.Vector3f(0), mi.Vector3f(0)
-    dd0, dd1 = mi.Vector3f(frame.s), mi.Vector3f(frame.t)
-    weight, P, length = mi.Spectrum(1), mi.Float(1), mi.Float(0)
-    η, turns = mi.Float(1), mi.Float(1)
-    good, left, first = mi.Bool(active), mi.UInt32(events), mi.Point3f(z.p)
+    dp0, dp1 = mi.Vector3f(0), mi.Vector3f(0)  # differentials of the ray's origin
+    dd0, dd1 = mi.Vector3f(frame.s), mi.Vector3f(frame.t)  # and of its direction
+    weight = mi.Spectrum(1)  # product of f / P
+    P = mi.Float(1)  # product of the probabilities
+    η = mi.Float(1)  # product of the relative indices of refraction
+    turns = mi.Float(1)  # product of the quotients of cosines
+    length = mi.Float(0)  # of the way so far
+    first = mi.Point3f(z.p)  # point of the first event
+    left = mi.UInt32(events)  # events to come
+    good = mi.Bool(active)  # all events were met so far
     while dr.hint(good & (left != 0), label="chain"):
         # ------------------------ Event --------------------------
         si = scene.ray_intersect(ray, mi.RayFlags.All | mi.RayFlags.dNSdUV, False, good)
@@ -139,7 +145,7 @@ def shoot(
         # --------------------- Differentials ---------------------
         dp0, dn0 = on_surface(si, ray.d, dp0 + dd0 * si.t)
         dp1, dn1 = on_surface(si, ray.d, dp1 + dd1 * si.t)
-        d, dd0, dd1 = turn(code, sample.eta, si.sh_frame.n, ray.d, dn0, dn1, dd0, dd1)
+        d, dd0, dd1 = turn(code, sample.eta, si.sh_frame.n, ray.d, (dn0, dn1), (dd0, dd1))
         wo = si.to_world(sample.wo)
         # A bumpy surface turns rays elsewhere than its shape would.
         good &= dr.squared_norm(wo - d) < 1e-6
@@ -151,11 +157,13 @@ def shoot(
         length += si.t
         ray = si.spawn_ray(wo)
         left >>= 2
-    return arrive(target, ray, length, (dp0, dp1), (dd0, dd1), first, (weight, P, η, turns), good)
+    end = Shot(good, mi.Vector2f(0), length, mi.Vector2f(0), mi.Vector2f(0), first, weight, P, η, turns, ray)
+    return arrive(target, end, (dp0, dp1), (dd0, dd1))
 
 
-def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, products: tuple, good) -> Shot:
-    """The end of a shot: from the last event to the plane of the target."""
+def arrive(target: Target, shot: Shot, dp: tuple, dd: tuple) -> Shot:
+    """The ``shot`` from its last event to the plane of the target; its ``reach`` was the length up to there."""
+    ray, good = shot.ray, shot.good
     plane = mi.Frame3f(target.n)
     cos = dr.dot(ray.d, target.n)
     t = dr.select(target.far, 0, dr.dot(target.p - ray.o, target.n) / cos)
@@ -167,8 +175,8 @@ def arrive(target: Target, ray: mi.Ray3f, length, dp, dd, first, products: tuple
         move = p + d * t
         columns.append(dr.select(target.far, d, move - ray.d * (dr.dot(move, target.n) / cos)))
     B0, B1, miss = (mi.Vector2f(dr.dot(v, plane.s), dr.dot(v, plane.t)) for v in (*columns, miss))
-    reach = dr.select(target.far, 1, length + t)
-    return Shot(good & dr.isfinite(dr.squared_norm(miss)), miss, reach, B0, B1, first, *products, ray)
+    reach = dr.select(target.far, 1, shot.reach + t)
+    return replace(shot, good=good & dr.isfinite(dr.squared_norm(miss)), miss=miss, reach=reach, B0=B0, B1=B1)
 
 
 def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> tuple[mi.Vector3f, mi.Vector3f]:
@@ -181,7 +189,7 @@ def on_surface(si: mi.SurfaceInteraction3f, d: mi.Vector3f, dp: mi.Vector3f) -> 
     return dp, si.dn_du * ((vv * u - uv * v) * scale) + si.dn_dv * ((uu * v - uv * u) * scale)
 
 
-def turn(code, η, n, d, dn0, dn1, dd0, dd1) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
+def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f, mi.Vector3f]:
     """A direction after an event, and its differentials (Igehy 1999, eq. 14-18); ``η`` is n_t / n_i along it."""
     back = dr.dot(d, n) > 0
     N = mi.Vector3f(dr.select(back, -n, n))
@@ -194,22 +202,22 @@ def turn(code, η, n, d, dn0, dn1, dd0, dd1) -> tuple[mi.Vector3f, mi.Vector3f, 
     b = dr.select(refracts, cos_t - e * cos, dr.select(reflects, -2 * cos, 0))
     slope = dr.select(refracts, dr.square(e) * cos / cos_t - e, dr.select(reflects, mi.Float(-2), 0))
     changes = []
-    for dn, dd in ((dn0, dd0), (dn1, dd1)):
-        dN = dr.select(back, -dn, dn)
-        dcos = dr.dot(dd, N) + dr.dot(d, dN)
-        changes.append(a * dd + b * dN + (slope * dcos) * N)
+    for dn_i, dd_i in zip(dn, dd, strict=True):
+        dN = dr.select(back, -dn_i, dn_i)
+        dcos = dr.dot(dd_i, N) + dr.dot(d, dN)
+        changes.append(a * dd_i + b * dN + (slope * dcos) * N)
     return a * d + b * N, *changes
 
 
 @dr.syntax
 def walk(
-    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, ends: Ends = nowhere
+    scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, *, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
     """Newton's method from ``ω`` on: the direction from ``z`` to the target, its shot, and whether it was found.
 
     A step that breaks the chain, or comes no nearer, is halved.
     """
-    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends)
+    best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends=ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)
     active = best.good & ~found
@@ -221,7 +229,7 @@ def walk(
         s = (best.B1.y * best.miss.x - best.B1.x * best.miss.y) * scale
         t = (best.B0.x * best.miss.y - best.B0.y * best.miss.x) * scale
         next_ω = dr.normalize(best_ω + turns.s * s + turns.t * t)
-        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends)
+        shot = shoot(scene, z, next_ω, events, target, active & dr.isfinite(s + t), ends=ends)
         nearer = shot.good & (dr.norm(shot.miss) < error)
         part = dr.select(nearer, dr.fmin(1, 2 * part), part / 2)
         if nearer:
@@ -233,7 +241,7 @@ def walk(
 
 
 def follow(
-    scene, z, ω, base: Shot, z1, events, target: Target, active=True, ends: Ends = nowhere
+    scene, z, ω, base: Shot, z1, events, *, target: Target, active=True, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Float, mi.Bool]:
     """The copy, from vertex ``z1``, of the chain that the ``base`` shot took from ``z`` in direction ``ω``.
 
@@ -241,10 +249,10 @@ def follow(
     returned, and nothing is between the last event and the target.
     """
     # Walks begin toward the other chain's first event: along its direction they would miss what is small or near.
-    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends)
+    ω1, shot, found = walk(scene, z1, dr.normalize(base.first - z1.p), events, target, active & base.good, ends=ends)
     J = dr.abs(base.det / shot.det)
     found &= dr.isfinite(J) & (J > 0)
-    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends)
+    back, _, returned = walk(scene, z, dr.normalize(shot.first - z.p), events, target, found, ends=ends)
     found &= returned & (dr.squared_norm(back - ω) < RETURNS**2)
     ray = mi.Ray3f(shot.ray)
     ray.maxt = dr.select(target.far, dr.largest(mi.Float), dr.norm(target.p - ray.o) * (1 - mi.math.ShadowEpsilon))

@@ -59,7 +59,7 @@ def next_surface(scene):
     return lambda ray, medium, active: scene.ray_intersect_preliminary(ray, active=active)
 
 
-def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, active) -> Segment:
+def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, *, active) -> Segment:
     """The segment along ``ray``, from within ``medium``, that these ``numbers`` make.
 
     ``trace`` (ray, medium, active) finds the next surface, as ``next_surface()`` does.
@@ -67,10 +67,10 @@ def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, active) -> 
     nulls, N = None, 1
     if media.grids:
         ray, hit, medium, scatters, τ, nulls, N = collisions.fly_on(
-            media.passes, trace, ray, medium, channel, numbers.u, numbers.key, active
+            media.passes, trace, ray, medium, channel=channel, u=numbers.u, key=numbers.key, active=active
         )
     else:
-        ray, hit, medium, scatters, τ = fly_on(media.passes, trace, ray, medium, channel, numbers.u, active)
+        ray, hit, medium, scatters, τ = fly_on(media.passes, trace, ray, medium, channel, numbers.u, active=active)
     here = dr.zeros(mi.MediumInteraction3f, dr.width(hit.t))
     here.p, here.wavelengths, here.medium, here.t = ray(hit.t), ray.wavelengths, medium, hit.t
     σs, _, σ = medium.get_scattering_coefficients(here, scatters)
@@ -81,7 +81,7 @@ def fly(media: Media, trace, ray, medium, channel, numbers: Numbers, active) -> 
 
 
 @dr.syntax
-def fly_on(passes, trace, ray, medium, channel, u, active):
+def fly_on(passes, trace, ray, medium, channel, u, *, active):
     """The last piece of a segment, its surface, its medium, whether the path scatters there, and τ up to there."""
     ray, medium = mi.Ray3f(ray), mi.MediumPtr(medium)
     left = -dr.log(1 - u)
@@ -124,7 +124,7 @@ def cross(passes, trace, ray, medium, reach, active):
     return τ, hit, ray, medium
 
 
-def see(media: Media, trace, ray, medium, reach, channel, key, active) -> tuple:
+def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tuple:
     """T along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary: in grids an estimate.
 
     Returns T, that surface, and the last piece of the ray.
@@ -133,8 +133,8 @@ def see(media: Media, trace, ray, medium, reach, channel, key, active) -> tuple:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
     # Ratio tracking: at each collision of the majorant what is null goes on.
-    every, same = mi.UInt32(0xFFFFFFFF), mi.Float(1)
-    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, channel, key, same, every, active)
+    every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "active": active}
+    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every)
     return dr.exp(-τ) * N, hit, ray
 
 
@@ -147,23 +147,24 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
-    none, same = mi.UInt32(0), mi.Float(1)
-    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, channel, none, same, none, active)
+    none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "active": active}
+    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none)
     return dr.select(M > 0, 0, dr.exp(-τ)), hit, ray
 
 
 def transmittance(
-    scene, media: Media, x, place: Place, ray, target: mi.Point3f, channel, key, active: mi.Bool
+    scene, media: Media, x, place: Place, target: mi.Point3f, *, channel, key, active: mi.Bool
 ) -> mi.Spectrum:
-    """T of the way along ``ray``, from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
+    """T of the way from vertex ``x`` to the point ``target`` of an emitter; 0 where it is blocked."""
+    ray = x.spawn_ray_to(target)
     medium, reach = place.toward(x, ray.d), dr.norm(target - ray.o)
     if not media.boundaries and not media.grids:
         return dr.select(scene.ray_test(ray, active), 0, dr.exp(-depth(extinction(medium, ray), reach)))
-    T, hit, _ = see(media, next_surface(scene), ray, medium, reach, channel, key, active)
+    T, hit, _ = see(media, next_surface(scene), ray, medium, reach, channel=channel, key=key, active=active)
     return dr.select(active & hit.is_valid(), 0, T)
 
 
-def reconnect(scene, media: Media, y, place: Place, ray, x1, base: Segment, channel, active) -> tuple:
+def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, channel, active) -> tuple:
     """``ray`` from the offset path's vertex ``y`` to ``x1``, where the segment ``base`` ends.
 
     Returns its integrand over the density of the base path; the ratio of the two densities, of colour c; and whether it
@@ -173,7 +174,7 @@ def reconnect(scene, media: Media, y, place: Place, ray, x1, base: Segment, chan
     trace = next_surface(scene)
     if media.grids:
         τ, hit, _, medium, N, N_c = collisions.rescale(
-            media.passes, trace, ray, medium, reach, channel, base.nulls, active
+            media.passes, trace, ray, medium, reach, base.nulls, channel=channel, active=active
         )
     else:
         τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active)

@@ -95,11 +95,11 @@ class Filled(Space):
 
     def first(self, view, ray, within, drawn: Drawn) -> Segment:
         trace = partial(view.first_surface, self.scene)
-        return segments.fly(self.media, trace, ray, within, drawn.channel, drawn.numbers, mi.Bool(True))
+        return segments.fly(self.media, trace, ray, within, drawn.channel, drawn.numbers, active=mi.Bool(True))
 
     def fly(self, x, place: Place, ray, drawn: Drawn, active) -> Segment:
         trace, medium = segments.next_surface(self.scene), place.toward(x, ray.d)
-        return segments.fly(self.media, trace, ray, medium, drawn.channel, drawn.numbers, active)
+        return segments.fly(self.media, trace, ray, medium, drawn.channel, drawn.numbers, active=active)
 
     def end(self, x, segment: Segment) -> mi.SurfaceInteraction3f:
         x1 = super().end(x, segment)
@@ -108,11 +108,12 @@ class Filled(Space):
         return x1
 
     def sees(self, x, place: Place, target: mi.Point3f, drawn: Drawn, active) -> tuple[mi.Spectrum, mi.Bool]:
-        ray = x.spawn_ray_to(target)
-        T = segments.transmittance(self.scene, self.media, x, place, ray, target, drawn.channel, drawn.light, active)
+        drawn = {"channel": drawn.channel, "key": drawn.light}
+        T = segments.transmittance(self.scene, self.media, x, place, target, **drawn, active=active)
         return T, dr.max(T) > 0
 
     def reconnect(
         self, y, place: Place, ray, x1, base: Segment, drawn: Drawn, *, active
     ) -> tuple[mi.Spectrum, mi.Float, mi.Bool]:
-        return segments.reconnect(self.scene, self.media, y, place, ray, x1, base, drawn.channel, active)
+        of_base = {"x1": x1, "base": base, "channel": drawn.channel}
+        return segments.reconnect(self.scene, self.media, y, place, ray, **of_base, active=active)

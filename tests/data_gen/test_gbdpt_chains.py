@@ -108,7 +108,8 @@ class Bent:
         target = Target(step.x1.p, dr.select(reached, self.mi.Vector3f(step.x1.n), step.d), ~reached)
         base = shoot(self.scene, chain.x1, chain.ω, chain.events, target, active)
         ends = partial(chain_shift.ends, self.plan)
-        ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, target, active, ends)
+        to = {"target": target, "active": active, "ends": ends}
+        ω, _, _, _ = follow(self.scene, chain.x1, chain.ω, base, x, chain.events, **to)
         dr.eval(ω)
         return ω
 

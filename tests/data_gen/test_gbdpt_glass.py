@@ -280,8 +280,8 @@ def test_unbiased_by_more_lights(renderer, long_passes, lit, pixels):
 
 
 def without_jacobian(follow):
-    def mutant(*args):
-        ω, shot, J, found = follow(*args)
+    def mutant(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
         return ω, shot, J * 0 + 1, found
 
     return mutant

@@ -85,7 +85,7 @@ def test_a_chain_visits_paths_in_proportion_to_their_values(renderer, monkeypatc
     # Starts in proportion to f, as a pass chooses them, in an order that says nothing
     rng, values = np.random.default_rng(1), np.array(f)
     start = mi.UInt32(rng.choice(values.size, 4096, p=values.astype(np.float64) / values.sum(dtype=np.float64)))
-    rate = chains.run(Steps(), camera, start, layers, f, 40, lambda f: dr.rcp(f), film)
+    rate = chains.run(Steps(), camera, start, layers, f, film, steps=40, scale=lambda f: dr.rcp(f))
     visits = np.array(film.splats("primal").totals()[0])
     assert visits.sum() == pytest.approx(4096 * 40, rel=1e-5)  # every step counts one, whatever is accepted
     assert np.allclose(visits / visits.sum(), Steps.VALUES / 7, atol=0.015)

@@ -102,8 +102,8 @@ def test_mutants_that_only_far_shifts_see(renderer, mutant, monkeypatch):
     references = render_references(renderer, scene, spp=128)
     if mutant == "emission at the joint":
         # What is found at the shared vertex has the density of emitter sampling that the base path knows.
-        def of_the_base(scene, lights, x1, Le, p, *geometry):
-            return emission(scene, lights, x1, Le, p, *geometry)[0], p
+        def of_the_base(scene, lights, x1, Le, p, **geometry):
+            return emission(scene, lights, x1, Le, p, **geometry)[0], p
 
         monkeypatch.setattr(offset_path, "shared_emission", of_the_base)
     else:

@@ -36,8 +36,8 @@ def test_unbiased(renderer, scene):
 
 
 def inverted(mi, follow):
-    def mutant(*args):
-        ω, shot, J, found = follow(*args)
+    def mutant(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
         return ω, shot, 1 / J, found
 
     return mutant
@@ -48,7 +48,7 @@ def inverted(mi, follow):
     [
         ("follow", inverted),
         ("gradient_weight", lambda mi, _: lambda r, good: mi.Float(1)),
-        ("shoot", lambda mi, shoot: lambda *args: _tinted(shoot(*args))),
+        ("shoot", lambda mi, shoot: lambda *args, **more: _tinted(shoot(*args, **more))),
     ],
     ids=["determinant inverted", "rejected walks count half", "colour of the base path alone"],
 )
@@ -107,8 +107,8 @@ def test_the_second_kernel_finds_what_the_first_has_recorded(renderer, monkeypat
 
     light = {}
 
-    def refused(*args):
-        ω, shot, J, found = follow(*args)
+    def refused(*args, **more):
+        ω, shot, J, found = follow(*args, **more)
         return ω, shot, J, found & False
 
     def kept(plan, first_hit, camera, shifts, chain, Δ):

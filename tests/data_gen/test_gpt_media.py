@@ -117,9 +117,9 @@ def reconnect_is(monkeypatch, wrong):
 
     right = segments.reconnect
 
-    def changed(*args):
-        T, T_c, blocked = right(*args)
-        return *wrong(T, T_c, args[6]), blocked
+    def changed(*args, **more):
+        T, T_c, blocked = right(*args, **more)
+        return *wrong(T, T_c, more["base"]), blocked
 
     monkeypatch.setattr(segments, "reconnect", changed)
 
@@ -149,9 +149,9 @@ def list_forgotten(monkeypatch):
 
     right = collisions.rescale
 
-    def changed(*args):
-        τ, hit, medium, N, N_c = right(*args)
-        return τ, hit, medium, N / N, N_c / N_c
+    def changed(*args, **more):
+        τ, hit, last, medium, N, N_c = right(*args, **more)
+        return τ, hit, last, medium, N / N, N_c / N_c
 
     monkeypatch.setattr(collisions, "rescale", changed)
 
@@ -209,7 +209,7 @@ class Ways:
         ray = self.x.spawn_ray(mi.Vector3f(direction) + dr.zeros(mi.Vector3f, self.LANES))
         trace = segments.next_surface(self.scene)
         self.base = segments.fly(
-            self.media, trace, ray, self.around[0].medium, self.channel, self.numbers, mi.Bool(True)
+            self.media, trace, ray, self.around[0].medium, self.channel, self.numbers, active=mi.Bool(True)
         )
         self.end = media.vertex(self.base.ray, self.base.hit, self.base.place)
         self.direction = ray.d
@@ -234,8 +234,8 @@ class Ways:
     def reconnect(self, y, place, base):
         direction = self.dr.select(self.end.is_valid(), self.dr.normalize(self.end.p - y.p), self.direction)
         ray = self.dr.select(self.end.is_valid(), y.spawn_ray_to(self.end.p), y.spawn_ray(direction))
-        arguments = (ray, self.end, base, self.channel, self.mi.Bool(True))
-        T, T_c, blocked = self.segments.reconnect(self.scene, self.media, y, place, *arguments)
+        of_base = {"x1": self.end, "base": base, "channel": self.channel, "active": self.mi.Bool(True)}
+        T, T_c, blocked = self.segments.reconnect(self.scene, self.media, y, place, ray, **of_base)
         return np.array(T).T, np.array(T_c), np.array(blocked)
 
 
@@ -277,10 +277,8 @@ def test_shifted_segments_carry_what_comes_through(renderer, scene):
     shifted = np.where(arrives[:, None], T, 0)
     first = int(np.argmax(arrives))
     target = ways.mi.Point3f(*(float(c[first]) for c in np.array(ways.end.p)))
-    ray, key = ways.y.spawn_ray_to(target), ways.random.next_key()
-    through = ways.segments.transmittance(
-        ways.scene, ways.media, ways.y, ways.around[1], ray, target, ways.channel, key, ways.mi.Bool(True)
-    )
+    drawn = {"channel": ways.channel, "key": ways.random.next_key(), "active": ways.mi.Bool(True)}
+    through = ways.segments.transmittance(ways.scene, ways.media, ways.y, ways.around[1], target, **drawn)
     through = np.array(through).T + np.zeros_like(shifted)
     error = np.sqrt((shifted.var(axis=0) + through.var(axis=0)) / len(shifted))
     difference = shifted.mean(axis=0) - through.mean(axis=0)

@@ -142,7 +142,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
 
     x, y, u, yes = vertex(), vertex(), random.next_2d(), mi.Bool(True)
     base, weight = scene.sample_emitter_direction(x, u, False, yes)
-    shared, own = replay_light(scene, lights, base, weight, u, y, yes), sample_light(scene, y, u, yes)
+    shared, own = replay_light(scene, lights, base, weight, u, y, lit=yes), sample_light(scene, y, u, yes)
     shared.weight = shadowed(scene, y, shared, mi.Spectrum(1))
     found = dr.max(own.weight) > 0
     assert dr.count(found)[0] > 500
@@ -156,7 +156,8 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     Le, p = emission(scene, x1, x, yes, yes)
     direction = dr.select(x1.is_valid(), dr.normalize(x1.p - y.p), ray.d)
     y1 = seen_from(x1, direction)
-    shared = shared_emission(scene, lights, x1, Le, p, y, y1, dr.squared_norm(x1.p - y.p) / dr.square(x1.t))
+    J = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
+    shared = shared_emission(scene, lights, x1, Le, p, y=y, y1=y1, J=J)
     own = emission(scene, y1, y, yes, yes)
     assert dr.any(dr.max(own[0]) > 0) or name == "directional"
     assert mostly(dr.all(dr.abs(shared[0] - own[0]) <= 1e-3 * dr.abs(own[0])))

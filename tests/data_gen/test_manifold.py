@@ -75,7 +75,7 @@ class Chains:
         from data_gen.paths.manifold import follow
 
         ω1, shot, J, found = follow(
-            self.scene, self.z, self.ω, self.base, self.z1, self.events, self.target, self.found
+            self.scene, self.z, self.ω, self.base, self.z1, self.events, target=self.target, active=self.found
         )
         self.dr.eval(ω1, shot, J, found)
         return ω1, shot, J, found
@@ -228,7 +228,8 @@ class TestFollow:
 
         chains = Chains(renderer, thing(), far=far)
         ω1, shot, J, found = chains.follow()
-        ω, _, J1, returned = follow(chains.scene, chains.z1, ω1, shot, chains.z, chains.events, chains.target, found)
+        target = {"target": chains.target, "active": found}
+        ω, _, J1, returned = follow(chains.scene, chains.z1, ω1, shot, chains.z, chains.events, **target)
         found, returned = np.array(found), np.array(returned)
         assert returned[found].mean() > 0.99
         product = np.array(J * J1)[found & returned]

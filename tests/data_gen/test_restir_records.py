@@ -192,11 +192,14 @@ def test_geometry_makes_the_jacobian_of_a_reconnection(renderer, rng):
     assert np.allclose(np.array(after / before), np.array(J), rtol=1e-3)
 
 
-@pytest.mark.parametrize("option", ["hide_emitters", "media"])
+@pytest.mark.parametrize("option", ["limits", "space"])
 def test_what_records_cannot_hold_is_refused(paths, option):
-    from data_gen.samplers.restir.events import check
+    from data_gen.paths.space import Filled
+    from data_gen.paths.walk import Limits
+    from data_gen.samplers.restir.stage import check
     from ngpt.errors import NgptError
 
     check(paths.plan)
+    cannot = {"limits": Limits(hide_emitters=True), "space": Filled(paths.scene)}
     with pytest.raises(NgptError, match="restir"):
-        check(replace(paths.plan, **{option: True}))
+        check(replace(paths.plan, **{option: cannot[option]}))

@@ -151,7 +151,7 @@ def follow_chain(plan: Plan, step: Step, chain: Chain, start: Any, own: mi.Surfa
     target = Target(y.p, dr.select(reached, mi.Vector3f(y.n), step.d), ~reached)
     base = shoot(scene, chain.x1, chain.ω, chain.events, target, active)
     ω, shot, J, found = follow(
-        scene, chain.x1, chain.ω, base, own, chain.events, target, active, ends=partial(ends, plan)
+        scene, chain.x1, chain.ω, base, own, chain.events, target=target, active=active, ends=partial(ends, plan)
     )
     f, p, q = evaluate(RADIANCE, own, own.bsdf(), own.to_local(ω), found)
 

@@ -198,7 +198,7 @@ def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:
     target.n = dr.select(far, -path.start.ray.d, dr.select(point, path.start.ray.d, target.n))
     # Light came from the other side, by rays that began elsewhere: not quite to the point that it is walked to.
     ω, base, active = walk(scene, y.si, ω, path.events, target, active)
-    ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target, active)
+    ω1, shot, J, found = follow(scene, y.si, ω, base, x, path.events, target=target, active=active)
     away, away1 = dr.abs(dr.dot(target.n, base.ray.d)), dr.abs(dr.dot(target.n, shot.ray.d))
     G = J * cosine(x, ω1) / cosine(y.si, ω) * (away / away1)
 

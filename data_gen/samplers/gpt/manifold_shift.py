@@ -147,7 +147,7 @@ def followed(plan: Plan, first_hit, camera: CameraSamples, recorded: Recorded) -
     b = β * f_p * base.weight * survival * emitter.eval(x_c, active)
 
     # ---------------------- The offset path ----------------------
-    ω1, shot, J, exists = follow(scene, z, ω, base, z1, events, target, exists & active)
+    ω1, shot, J, exists = follow(scene, z, ω, base, z1, events, target=target, active=exists & active)
     f1, p1 = evaluate(z1.bsdf(), z1, z1.to_local(ω1), exists)
     J *= shot.P / (sample.pdf * base.P)
     b1 = β1 * f1 * shot.weight * (J * survival) * emitter.eval(seen_from(x_c, shot.ray.d), exists)

@@ -204,7 +204,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> mi.
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
-    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit)
+    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit=lit)
     f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
     # A shadow ray where there is something to be shadowed
     L_light = f * light.weight
@@ -255,7 +255,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
     y1 = seen_from(x1, direction)
     ratio = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
-    Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, y, y1, ratio)
+    Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, y=y, y1=y1, J=ratio)
     return Move(
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,

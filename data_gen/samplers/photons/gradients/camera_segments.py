@@ -54,7 +54,7 @@ class PathsBySegments(CameraPaths):
         trace = partial(self.integrator.first_surface, self.world.scene)
         for path in (self.first(*ray) for ray in rays):
             medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, dr.width(path.ray)))
-            segment = segments.fly(fog.media, trace, path.ray, medium, channel, numbers, path.alive)
+            segment = segments.fly(fog.media, trace, path.ray, medium, channel, numbers, active=path.alive)
             flights.append(self.flight(path, segment, channel))
             if fog.media.grids:
                 Le = self.integrator.behind_grids(self.world.scene, fog.media, segment)
@@ -81,7 +81,7 @@ class PathsBySegments(CameraPaths):
         trace = segments.next_surface(self.world.scene)
         for path in (at_lanes(flight, lanes) for flight in level.paths):
             medium = taken(path.medium, lanes)
-            segment = segments.fly(media_of_scene, trace, path.ray, medium, channel, numbers, path.alive)
+            segment = segments.fly(media_of_scene, trace, path.ray, medium, channel, numbers, active=path.alive)
             flights.append(self.flight(path, segment, channel))
         return self.of_lanes(level, flights, random, lanes)
 

@@ -138,7 +138,15 @@ def let_through(world: World, way: Way, reach: mi.Float, active, to_surface: boo
     trace = segments.next_surface(world.scene)
     if through.nulls is not None:
         τ, met, ray, medium, N, N_c = collisions.rescale(
-            fog.media.passes, trace, ray, through.medium, reach, through.channel, through.nulls, active, to_surface
+            fog.media.passes,
+            trace,
+            ray,
+            through.medium,
+            reach,
+            through.nulls,
+            channel=through.channel,
+            active=active,
+            to_surface=to_surface,
         )
     else:
         τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
@@ -219,9 +227,8 @@ def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
     if fog.media.grids:
         # Of the way back the majorant's optical depth M alone: with no collision to place
         back, none = media.shortened(back, reach), mi.UInt32(0)
-        τ, _, _, medium, M, _ = collisions.cross(
-            fog.media.passes, trace, back, medium, reach, photon.channel, none, mi.Float(1), none, mi.Bool(True)
-        )
+        steps = {"channel": photon.channel, "key": none, "scale": mi.Float(1), "most": none, "active": mi.Bool(True)}
+        τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, **steps)
         key, n, N_c = (dr.gather(type(v), v, photon.place) for v in (photons.key, photons.nulls, photons.N_c))
         nulls = Collisions(key, n, M, N_c)
     elif not fog.media.boundaries:

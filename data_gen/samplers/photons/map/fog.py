@@ -62,7 +62,7 @@ class Fog:
     def fly(self, trace, ray, medium, channel, random, active):
         """The segment along ``ray``, and the vertex at its end; ``trace`` is that of ``segments.fly()``."""
         numbers = segments.draw(random, self.media)
-        segment = segments.fly(self.media, trace, ray, medium, channel, numbers, active)
+        segment = segments.fly(self.media, trace, ray, medium, channel, numbers, active=active)
         return segment, vertex(segment.ray, segment.hit, segment.place)
 
     def ahead(self, trace, ray, medium, channel, random, active):

@@ -76,9 +76,10 @@ def run(
     start: mi.UInt32,
     layers: dict[str, mi.Color3f],
     f: mi.Float,
+    film: GradientFilm,
+    *,
     steps: int,
     scale: Callable[[mi.Float], mi.Float],
-    film: GradientFilm,
 ) -> mi.Float:
     """Runs chains of so many ``steps``; returns the share of mutations that each has accepted.
 

@@ -61,7 +61,7 @@ class GMLT:
         b, K = dr.opaque(mi.Float, sums[-1] / len(sums)), dr.opaque(mi.Float, chains * steps / len(sums))
         if sums[-1] > 0:
             start = mi.UInt32(chosen(sums, chains, camera))
-            run(self.paths, camera, start, layers, f, steps, lambda f: b / (self.b0 + K * f), film)
+            run(self.paths, camera, start, layers, f, film, steps=steps, scale=lambda f: b / (self.b0 + K * f))
         # ---------------------- Candidates ---------------------------
         share = dr.select(f > 0, self.b0 / (self.b0 + K * f), 1)
         for name, light in layers.items():
