@@ -312,16 +312,8 @@ def one_scene_for_both(monkeypatch):
     """What was kept is evaluated in the scene of the frame before."""
     from data_gen.samplers.restir.history import History
 
-    right = History._here
-
-    def wrong(self, kept):
-        now, self.stage = self.stage, self.before
-        try:
-            return right(self, kept)
-        finally:
-            self.stage = now
-
-    monkeypatch.setattr(History, "_here", wrong)
+    right = History._of_kept
+    monkeypatch.setattr(History, "_of_kept", lambda self, stage, *args, **more: right(self, self.before, *args, **more))
 
 
 @pytest.mark.parametrize(

@@ -26,9 +26,9 @@ from elsewhere), then *settled*: joined for longer, ended, or rejected. A base p
 apart walks on as a ghost. Its offset paths replay numbers that it has no use for, so that what their pixels see serves
 this pixel too, with w = 1/2, as it does in random sequence replay; to reject them would double their variance.
 
-The base path is in ``base_path``, the offset paths in ``offset_path``, the rules of shifting in
-``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in a medium:
-see ``data_gen.paths.media`` and ``segments``.
+All paths begin in ``trace``; the base path is in ``base_path``, the offset paths in ``offset_path``, the rules of
+shifting in ``data_gen.paths.shift``; ``plan`` decides which of all that a scene needs in its kernel. A vertex may be in
+a medium: ``data_gen.paths.space`` knows whether, and ``media`` and ``segments`` how.
 
 Russian roulette looks at all five paths, so that none is starved. It leaves r as it is: the weights of the two
 directions of a difference sum to one whatever paths survive.
@@ -39,7 +39,6 @@ sections 3 and 4.1]
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 
 import drjit as dr
@@ -47,15 +46,13 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, like_path
-from data_gen.samplers.gpt.base_path import Path, base_step, begin
-from data_gen.samplers.gpt.manifold_shift import Chain, add_followed
-from data_gen.samplers.gpt.offset_path import Offset, first_steps, later_steps, start
+from data_gen.samplers.gpt.manifold_shift import add_followed
 from data_gen.samplers.gpt.plan import Plan, make_plan
+from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name, media_of
 from ngpt.errors import NgptError
@@ -124,7 +121,7 @@ class GPT(GradientIntegrator):
         within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        paths = self.trace(scene, plan, camera.random.clone(), (ray, importance), shifted, within)
+        paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within)
         Le = self.emission_in_pixel(scene, camera, paths.Le, plan.space.media, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (paths.L, Le, paths.L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in paths.offsets]
@@ -148,75 +145,6 @@ class GPT(GradientIntegrator):
             film.put(name, value)
         for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
             film.put(name, value, active)
-
-    def trace(self, scene, plan: Plan, random, camera_ray: tuple, shifted: list, within=None) -> Traced:
-        """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
-
-        Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``.
-        At the first vertex all of them are apart, and few later on: that step stands before the loop.
-        """
-        # --------------------- First vertices ------------------------
-        (ray, importance), space = camera_ray, plan.space
-        drawn = space.begin(random)
-        first = space.first(self, ray, within, drawn)
-        x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
-        path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
-        # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
-        if space.media:
-            Le = importance * self.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
-        else:
-            Le = importance * x.emitter(scene).eval(x, path.sky.meets(x) & (plan.limits.max_depth > 0))
-        L = L_first = β * self.behind_grids(scene, space.media, first) if space.grids else mi.Spectrum(0)
-        offsets = []
-        for offset_ray, offset_importance, inside in shifted:
-            there = space.first(self, offset_ray, within, drawn)
-            y = start(plan, path, there, offset_importance, inside)
-            if space.grids:
-                # Both paths replay the numbers of this segment: r = 1, w = 1/2.
-                y.Δ = y.β * self.behind_grids(scene, space.media, there) - L_first
-                y.A = dr.select(inside, 1, 2) * L_first
-            offsets.append(y)
-        L, L_caustic = L + dr.zeros(mi.Spectrum, dr.width(first.hit.t)), dr.zeros(mi.Spectrum, dr.width(first.hit.t))
-        if plan.limits.max_depth < 2:
-            return Traced(L, Le, L_caustic, offsets, path.chain)
-
-        # --------------------- The first step ------------------------
-        step, path = base_step(scene, plan, random, path, offsets)
-        # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
-        L += step.β * step.L_light + step.β1 * step.L_bsdf
-        if plan.caustic:
-            L_caustic = step.β * step.L_caustic
-        offsets = first_steps(scene, plan, step, offsets)
-        return walk(scene, plan, random, path, Traced(L, Le, L_caustic, offsets, path.chain))
-
-
-@dataclass
-class Traced:
-    """Base paths and their offset paths, as far as they have come."""
-
-    L: mi.Spectrum  # of base paths, emission that the camera sees directly not included
-    Le: mi.Spectrum  # the same emission
-    L_caustic: mi.Spectrum  # of the layer ``caustic``
-    offsets: list[Offset]
-    chain: Chain | None  # what the shift "manifold" has recorded
-
-
-@dr.syntax
-def walk(scene, plan: Plan, random, path: Path, so_far: Traced) -> Traced:
-    """The rest of all paths past their first step."""
-    L, L_caustic, offsets = so_far.L, so_far.L_caustic, so_far.offsets
-    active = path.goes_on(plan, offsets)
-    while dr.hint(active, label="gpt"):
-        # The base path first: an offset path can only join a vertex that is known.
-        step, path = base_step(scene, plan, random, path, offsets)
-        L += step.β * step.L_light + step.β1 * step.L_bsdf
-        if dr.hint(plan.caustic, mode="scalar"):
-            L_caustic += step.β * step.L_caustic
-        if dr.hint(plan.manifold, mode="scalar"):
-            L += step.β1 * step.L_followed
-        offsets = later_steps(scene, plan, step, offsets)
-        active = path.goes_on(plan, offsets)
-    return Traced(L, so_far.Le, L_caustic, offsets, path.chain)
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:

@@ -3,7 +3,7 @@ r"""Reservoirs of all pixels, and of all pairs of neighbours, kept from frame to
     for each frame
         a candidate for each pixel                                             ``walk``
         E   of each candidate in the four neighbours                           ``_partners``
-        E   of what is kept, in this frame                                     ``_here``
+        E   of what is kept, in this frame                                     ``_of_kept``
         E   of each candidate, by the camera of the frame before               ``_there``
         of each reservoir, one path of all that is offered                     ``merging``
 
@@ -70,7 +70,7 @@ class History:
     Lanes are ordered pixel by pixel, within a pixel by chain. ``cap`` is the confidence that a reservoir can reach, in
     frames; 1: hardly any history. Without ``pairs``, differences have no reservoirs of their own: they are taken of the
     paths that the pixels' reservoirs have kept, the paper's baseline. Raises NgptError for what records cannot hold:
-    see ``events.check``.
+    see ``stage.check``.
     """
 
     def __init__(
@@ -150,9 +150,10 @@ class History:
         if kept is not None:
             with self._then() as stage:
                 back = self._carried(found.record, self.stage, self.before, found.W > 0)
-                e.elsewhere, e.there = self._elsewhere(stage, kept), self._there(stage, replace(found, record=back))
+                e.elsewhere = self._of_kept(stage, kept, elsewhere=True)
+                e.there = self._there(stage, replace(found, record=back))
             kept = replace(kept, record=self._carried(kept.record, self.before, self.stage, kept.W > 0))
-            e.here = self._here(kept)
+            e.here = self._of_kept(self.stage, kept, elsewhere=False)
         if self.pairs:
             e.partners = self._partners(found.record, found.W)
         kept = Merging(self.at, self._ends, found, kept, e).merged(u)
@@ -189,28 +190,21 @@ class History:
             self.stage, record, 4 * self.at.lanes, 1, active, lambda lane, end: (*place(lane), mi.Bool(True))
         )
 
-    def _here(self, kept: Reservoir) -> Requests:
-        """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir."""
+    def _of_kept(self, stage: Stage, kept: Reservoir, elsewhere: bool) -> Requests:
+        """Each path that was kept, where the pixels that look for it have it now: 4 requests for each reservoir.
+
+        ``elsewhere``: in the frame before, where else the path could have been.
+        """
 
         def request(lane: mi.UInt32, end: mi.UInt32):
             it = self.at.corner(lane, kept)
-            return it.source, it.place + mi.Float(end) * across(it.domain, it.side), (end == 0) | (it.domain > 0)
-
-        lanes = self.at.total * len(CORNERS)
-        good = self.at.corner(dr.arange(mi.UInt32, lanes), kept).good
-        return self._of(self.stage, kept.record, lanes, self._ends, good, request)
-
-    def _elsewhere(self, stage: Stage, kept: Reservoir) -> Requests:
-        """The same in the frame before, where else the path could have been."""
-
-        def request(lane: mi.UInt32, end: mi.UInt32):
-            it = self.at.corner(lane, kept)
-            return it.source, it.elsewhere + mi.Float(end) * across(it.domain, it.side), (end == 0) | (it.domain > 0)
+            place = it.elsewhere if elsewhere else it.place
+            return it.source, place + mi.Float(end) * across(it.domain, it.side), (end == 0) | (it.domain > 0)
 
         lanes = self.at.total * len(CORNERS)
         it = self.at.corner(dr.arange(mi.UInt32, lanes), kept)
-        known = it.twice & (self.at.confidence(it.domain, it.other) > 0)
-        return self._of(stage, kept.record, lanes, self._ends, known, request)
+        good = it.twice & (self.at.confidence(it.domain, it.other) > 0) if elsewhere else it.good
+        return self._of(stage, kept.record, lanes, self._ends, good, request)
 
     def _there(self, stage: Stage, found: Candidate) -> Requests:
         """Each candidate in the frame before: requests of lane, of primal, dx and dy as side 0 and 1; all that twice,

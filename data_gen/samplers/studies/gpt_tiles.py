@@ -46,15 +46,15 @@ from data_gen.paths.shift import mis_weight, reconnection_jacobian
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, evaluate, seen_from
 from data_gen.paths.walk import Limits
-from data_gen.samplers.common import like_path
-from data_gen.samplers.teaching.gpt_simple import GPTSimple, base_step, reflected
+from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.teaching.gpt_simple import base_step, reflected, trace, walk
 from ngpt.errors import NgptError
 
 # Of a lane: its suffix, its camera sample and sums; and what is kept of one connection.
 _LANE_BYTES, _CONNECTION_BYTES = 272, 32
 
 
-class GPTTiles(GPTSimple):
+class GPTTiles(GradientIntegrator):
     """Gradient-domain path tracing with path reuse in tiles, for surfaces.
 
     Plugin ``gpt_tiles``. Parameters, the first two as for Mitsuba's ``path``:
@@ -74,6 +74,11 @@ class GPTTiles(GPTSimple):
     def __init__(self, props: mi.Properties):
         super().__init__(props)
         self.tile, self.roughness_threshold = self.options["tile"], self.options["roughness_threshold"]
+
+    def sample(self, scene, sampler, ray, medium=None, active=True):
+        """The primal estimate alone."""
+        L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
+        return L + Le, mi.Bool(True), []
 
     def prepare(self, scene) -> SamplePass:
         refuse(self.limits)
@@ -139,7 +144,7 @@ class Tiles:
         first = base_step(scene, random, x, importance, lives)
         s = first.x1
         second = base_step(scene, random, s, mi.Spectrum(1), s.is_valid() & (limit > 2))
-        R = self.integrator.walk(scene, random, second.x1)
+        R = walk(scene, self.integrator.limits, random, second.x1)
 
         # With the densities left in, as other pixels have it: a path of its own is a connection with J = V = 1.
         C = first.β1 * first.p

@@ -60,7 +60,7 @@ class GPTSimple(GradientIntegrator):
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone."""
-        L, Le, _ = self.trace(scene, sampler, ray, mi.Spectrum(1), [])
+        L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
     def prepare(self, scene) -> SamplePass:
@@ -71,48 +71,50 @@ class GPTSimple(GradientIntegrator):
         """Takes one base path and its four offset paths for each camera sample."""
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
-        L, Le, Δ = self.trace(scene, camera.random.clone(), ray, importance, shifted)
+        L, Le, Δ = trace(scene, self.limits, camera.random.clone(), ray, importance, shifted)
         film.put("primal", to_rgb(L + Le, ray.wavelengths))
         film.put("direct", to_rgb(Le, ray.wavelengths))
         for name, value, (_, _, inside) in zip(SHIFTS, Δ, shifted, strict=True):
             film.put(name, to_rgb(value, ray.wavelengths), inside)
         film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
 
-    def trace(self, scene, random, ray, importance, shifted):
-        """L, Le and the four Δ, in the order of SHIFTS, of base paths that begin with ``ray``."""
-        # ------------------ First vertex: offset paths are apart ------------------
-        x = scene.ray_intersect(mi.Ray3f(ray))
-        Le = importance * x.emitter(scene).eval(x, self.limits.max_depth > 0)
-        active = x.is_valid() & (self.limits.max_depth > 1)
-        offsets = [start(scene, active, *ray_and_importance) for *ray_and_importance, _ in shifted]
-        step = base_step(scene, random, x, importance, active)
-        L = step.β * step.L_light + step.β1 * step.L_bsdf
-        offsets = [step_apart(scene, step, y) for y in offsets]
 
-        # ------------------ Second vertex: they are joined to it ------------------
-        step = base_step(scene, random, step.x1, step.β1, step.x1.is_valid() & (self.limits.max_depth > 2))
-        L += step.β * step.L_light + step.β1 * step.L_bsdf
-        settled = [step_joined(step, y) for y in offsets]
+def trace(scene, limits: Limits, random, ray, importance, shifted):
+    """L, Le and the four Δ, in the order of SHIFTS, of base paths that begin with ``ray``."""
+    # ------------------ First vertex: offset paths are apart ------------------
+    x = scene.ray_intersect(mi.Ray3f(ray))
+    Le = importance * x.emitter(scene).eval(x, limits.max_depth > 0)
+    active = x.is_valid() & (limits.max_depth > 1)
+    offsets = [start(scene, active, *ray_and_importance) for *ray_and_importance, _ in shifted]
+    step = base_step(scene, random, x, importance, active)
+    L = step.β * step.L_light + step.β1 * step.L_bsdf
+    offsets = [step_apart(scene, step, y) for y in offsets]
 
-        # --------------- From the third on: one path, so one radiance -------------
-        R = self.walk(scene, random, step.x1)
-        return L + step.β1 * R, Le, [Δ + a * R for Δ, a in settled]
+    # ------------------ Second vertex: they are joined to it ------------------
+    step = base_step(scene, random, step.x1, step.β1, step.x1.is_valid() & (limits.max_depth > 2))
+    L += step.β * step.L_light + step.β1 * step.L_bsdf
+    settled = [step_joined(step, y) for y in offsets]
 
-    @dr.syntax
-    def walk(self, scene, random, x):
-        """R, the radiance that reaches the second vertex from the third, ``x``."""
-        R, β, depth = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(3)
-        active = x.is_valid() & (depth < self.limits.max_depth)
-        while dr.hint(active, label="gpt_simple"):
-            step = base_step(scene, random, x, β, active)
-            R += β * step.L_light + step.β1 * step.L_bsdf
-            # Roulette by the throughput since the second vertex, which is that of all five paths: none is starved.
-            q = roulette(dr.max(step.β1), depth >= self.limits.rr_depth)
-            survives = random.next_1d() < q
-            x, β = step.x1, step.β1 / q
-            depth += 1
-            active = survives & x.is_valid() & (depth < self.limits.max_depth)
-        return R
+    # --------------- From the third on: one path, so one radiance -------------
+    R = walk(scene, limits, random, step.x1)
+    return L + step.β1 * R, Le, [Δ + a * R for Δ, a in settled]
+
+
+@dr.syntax
+def walk(scene, limits: Limits, random, x):
+    """R, the radiance that reaches the second vertex from the third, ``x``."""
+    R, β, depth = mi.Spectrum(0), mi.Spectrum(1), mi.UInt32(3)
+    active = x.is_valid() & (depth < limits.max_depth)
+    while dr.hint(active, label="gpt_simple"):
+        step = base_step(scene, random, x, β, active)
+        R += β * step.L_light + step.β1 * step.L_bsdf
+        # Roulette by the throughput since the second vertex, which is that of all five paths: none is starved.
+        q = roulette(dr.max(step.β1), depth >= limits.rr_depth)
+        survives = random.next_1d() < q
+        x, β = step.x1, step.β1 / q
+        depth += 1
+        active = survives & x.is_valid() & (depth < limits.max_depth)
+    return R
 
 
 @dataclass

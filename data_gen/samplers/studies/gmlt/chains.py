@@ -12,6 +12,7 @@ import mitsuba as mi
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.spectrum import to_rgb
+from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.studies.gmlt.mutation import REMEMBERED, Proposal, acceptance, taken
 
 # The share of mutations that are independent of the state
@@ -43,7 +44,7 @@ class Paths:
         """The layers of paths with these ``random`` numbers; light seen directly; which neighbours are on the film."""
         ray, importance, _ = camera.rays(mi.Vector2f(0))
         shifted = {name: camera.rays(shift) for name, shift in self.shifts.items()}
-        paths = self.gpt.trace(self.scene, self.plan, random, (ray, importance), list(shifted.values()))
+        paths = trace(self.gpt, self.plan, random, (ray, importance), list(shifted.values()))
         layers = {"primal": to_rgb(paths.L, ray.wavelengths)}
         if self.plan.caustic:
             layers["caustic"] = to_rgb(paths.L_caustic, ray.wavelengths)

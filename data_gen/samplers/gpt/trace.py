@@ -1,0 +1,85 @@
+"""All paths of ``gpt`` from the camera to their ends. Symbols as in ``gpt``."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import media
+from data_gen.samplers.gpt.base_path import Path, base_step, begin
+from data_gen.samplers.gpt.manifold_shift import Chain
+from data_gen.samplers.gpt.offset_path import Offset, first_steps, later_steps, start
+from data_gen.samplers.gpt.plan import Plan
+
+
+@dataclass
+class Traced:
+    """Base paths and their offset paths, as far as they have come."""
+
+    L: mi.Spectrum  # of base paths, emission that the camera sees directly not included
+    Le: mi.Spectrum  # the same emission
+    L_caustic: mi.Spectrum  # of the layer ``caustic``
+    offsets: list[Offset]
+    chain: Chain | None  # what the shift "manifold" has recorded
+
+
+def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None) -> Traced:
+    """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
+
+    Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``;
+    ``view`` is the integrator, which knows what hides from it. At the first vertex all offset paths are apart, and few
+    later on: that step stands before the loop.
+    """
+    # --------------------- First vertices ------------------------
+    (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
+    drawn = space.begin(random)
+    first = space.first(view, ray, within, drawn)
+    x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
+    path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
+    # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
+    if space.media:
+        Le = importance * view.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
+    else:
+        Le = importance * x.emitter(scene).eval(x, path.sky.meets(x) & (plan.limits.max_depth > 0))
+    L = L_first = β * view.behind_grids(scene, space.media, first) if space.grids else mi.Spectrum(0)
+    offsets = []
+    for offset_ray, offset_importance, inside in shifted:
+        there = space.first(view, offset_ray, within, drawn)
+        y = start(plan, path, there, offset_importance, inside)
+        if space.grids:
+            # Both paths replay the numbers of this segment: r = 1, w = 1/2.
+            y.Δ = y.β * view.behind_grids(scene, space.media, there) - L_first
+            y.A = dr.select(inside, 1, 2) * L_first
+        offsets.append(y)
+    L, L_caustic = L + dr.zeros(mi.Spectrum, dr.width(first.hit.t)), dr.zeros(mi.Spectrum, dr.width(first.hit.t))
+    if plan.limits.max_depth < 2:
+        return Traced(L, Le, L_caustic, offsets, path.chain)
+
+    # --------------------- The first step ------------------------
+    step, path = base_step(scene, plan, random, path, offsets)
+    # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
+    L += step.β * step.L_light + step.β1 * step.L_bsdf
+    if plan.caustic:
+        L_caustic = step.β * step.L_caustic
+    offsets = first_steps(scene, plan, step, offsets)
+    return walk(scene, plan, random, path, Traced(L, Le, L_caustic, offsets, path.chain))
+
+
+@dr.syntax
+def walk(scene, plan: Plan, random, path: Path, so_far: Traced) -> Traced:
+    """The rest of all paths past their first step."""
+    L, L_caustic, offsets = so_far.L, so_far.L_caustic, so_far.offsets
+    active = path.goes_on(plan, offsets)
+    while dr.hint(active, label="gpt"):
+        # The base path first: an offset path can only join a vertex that is known.
+        step, path = base_step(scene, plan, random, path, offsets)
+        L += step.β * step.L_light + step.β1 * step.L_bsdf
+        if dr.hint(plan.caustic, mode="scalar"):
+            L_caustic += step.β * step.L_caustic
+        if dr.hint(plan.manifold, mode="scalar"):
+            L += step.β1 * step.L_followed
+        offsets = later_steps(scene, plan, step, offsets)
+        active = path.goes_on(plan, offsets)
+    return Traced(L, so_far.Le, L_caustic, offsets, path.chain)
