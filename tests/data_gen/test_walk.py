@@ -98,58 +98,9 @@ def test_a_hidden_sky_hides_behind_holes_until_something_scatters(renderer):
 # ------------------------------ The style of data_gen ------------------------------
 
 
-# What has not been mended yet: these lists end empty.
-TODO_ROULETTE = [
-    "samplers/gpt/base_path.py",
-]
-TODO_ARGUMENTS = [
-    "adaptive.py:render_adaptive",
-    "dataset/crops.py:_crop",
-    "film/moments.py:accumulate",
-    "frames/shot.py:_with_dt",
-    "frames/shot.py:render_shot",
-    "passes.py:render_passes",
-    "paths/collisions.py:cross",
-    "paths/collisions.py:fly_on",
-    "paths/collisions.py:rescale",
-    "paths/lights.py:replay_light",
-    "paths/lights.py:shared_emission",
-    "paths/manifold.py:arrive",
-    "paths/manifold.py:follow",
-    "paths/manifold.py:shoot",
-    "paths/manifold.py:turn",
-    "paths/manifold.py:walk",
-    "paths/segments.py:fly",
-    "paths/segments.py:fly_on",
-    "paths/segments.py:reconnect",
-    "paths/segments.py:see",
-    "paths/segments.py:transmittance",
-    "samplers/gpt/base_path.py:base_step",
-    "samplers/gpt/base_path.py:roulette",
-    "samplers/gpt/integrator.py:trace",
-    "samplers/gpt/integrator.py:walk",
-    "samplers/gpt/manifold_shift.py:add_followed",
-    "samplers/gpt/manifold_shift.py:advance",
-    "samplers/gpt/manifold_shift.py:followed",
-    "samplers/gpt/manifold_shift.py:specular_steps",
-    "samplers/gpt/offset_path.py:part",
-    "samplers/gpt/offset_path.py:start",
-    "samplers/gpt/plan.py:make_plan",
-    "samplers/restir/evaluate.py:evaluate_record",
-    "samplers/restir/sampler.py:__init__",
-    "samplers/restir/walk.py:_walk",
-    "samplers/studies/gmlt/chains.py:run",
-    "uneven.py:__init__",
-]
-TODO_SPREADS = [
-    "dataset/cameras.py",
-    "film/gradient_film.py",
-]
-
-
 def test_roulette_stands_in_one_place():
     found = [name for name, _ in trees() if name.startswith("samplers/") and "0.95)" in source(name)]
-    assert found == TODO_ROULETTE
+    assert found == []
 
 
 def test_no_function_takes_more_than_six_positional_arguments():
@@ -160,14 +111,12 @@ def test_no_function_takes_more_than_six_positional_arguments():
                 given = [arg.arg for arg in (*node.args.posonlyargs, *node.args.args) if arg.arg not in ("self", "cls")]
                 if len(given) > 6:
                     found.add(f"{name}:{node.name}")
-    assert found <= {*TODO_ARGUMENTS}, "make a dataclass of what belongs together, or keywords"
-    assert found >= {*TODO_ARGUMENTS}, "mended: take it off the list"
+    assert not found, "make a dataclass of what belongs together, or keywords"
 
 
 def test_no_tuple_of_unlike_things_is_spread_into_a_call():
     found = {name for name, tree in trees() for node in ast.walk(tree) if spreads(node)}
-    assert found <= {*TODO_SPREADS}, "name the arguments"
-    assert found >= {*TODO_SPREADS}, "mended: take it off the list"
+    assert not found, "name the arguments"
 
 
 def spreads(function: ast.AST) -> bool:
