@@ -14,9 +14,10 @@ that the noise of the reference drops out in expectation; the 0.1 % of the pixel
 as in the tables. Pixels within SPREAD of a light that the camera sees are left out too, in numbers and crops: ngpt
 keeps such light apart, OIDN is given it, and the comparison is of what is left. The numbers of the whole image are
 recorded beside them, and those of OIDN with such light kept apart and of ngpt without gradients. FLIP is computed
-against m and recorded beside its floor, the FLIP of A and B. The two crops of the reference are rendered again with
---crop-spp samples, for the eye alone. All renders are kept in the cache, so a run that was broken off goes on. Written
-are the picture and bench/results/hero.json.
+against m and recorded beside its floor, the FLIP of A and B. For the eye, and for no number, the two crops of the
+reference are rendered again with --crop-spp samples, and pixels of the reference whose own standard error is over
+UNSETTLED are shown as the median of 3x3: fireflies, which path tracing does not lose in any time. All renders are
+kept in the cache, so a run that was broken off goes on. Written are the picture and bench/results/hero.json.
 """
 
 import argparse
@@ -25,7 +26,7 @@ import time
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import binary_dilation
+from scipy.ndimage import binary_dilation, median_filter
 
 import ngpt
 from bench import panels
@@ -41,6 +42,7 @@ from ngpt.system.writing import write_json
 REFERENCE_SEED = 1 << 20  # far from the seed 0 of what is judged
 TIMING_SPP, REPEATS = 16, 3
 SPREAD = 3  # pixels
+UNSETTLED = 0.1  # standard error over the light of a pixel
 ZOOM = 3
 COLUMN, ROW = 130 * ZOOM, 66 * ZOOM  # size of a crop in the picture
 TITLES = {"path tracing": "Path tracing", "OIDN": "Open Image Denoise", "ngpt": "ngpt ({method})"}
@@ -103,7 +105,8 @@ def main() -> None:
     quality = {"spp": spp, "crop spp": args.crop_spp, "relMSE of its noise": noise, "FLIP of its halves": floor}
     where = metadata("mitsuba", "mitsuba-oidn", "flip-evaluator")
     save(args.output, setup | {"results": numbers, "reference": quality, "crops": boxes, "metadata": where})
-    shown = {name: images[name] for name in TITLES} | {"reference": reference}
+    variance = np.mean([part["primal_var"] for part in parts], axis=0) / len(parts)
+    shown = {name: images[name] for name in TITLES} | {"reference": settled(reference, variance)}
     clean = [reference_crop(args, box) for box in boxes]
     panels.save(args.picture, picture(shown, headings(numbers, spp, args.crop_spp), boxes, clean))
 
@@ -157,7 +160,14 @@ def reference_crop(args: argparse.Namespace, box: tuple[int, int, int, int]) -> 
         film["film.crop_size"], film["film.crop_offset"] = [width, height], [left, top]
         film.update()
         ngpt.write(file, render_stack(scene, args.crop_spp, REFERENCE_SEED, "primal", with_features=False))
-    return ngpt.read(file)["primal"]
+    crop = ngpt.read(file)
+    return settled(crop["primal"], crop["primal_var"])
+
+
+def settled(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """The image, (H, W, 3), with the median of 3x3 pixels where its own standard error is over ``UNSETTLED``."""
+    error = np.sqrt(variance.sum(axis=-1)) / (image.sum(axis=-1) + 0.01)
+    return np.where((error > UNSETTLED)[..., None], median_filter(image, size=(3, 3, 1)), image)
 
 
 def extremes(gain: np.ndarray, judged: np.ndarray, width: int, height: int) -> list[tuple[int, int, int, int]]:
