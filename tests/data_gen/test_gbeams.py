@@ -4,13 +4,10 @@ That it repeats its bits, says how noisy it is and stays within its memory is am
 does on surfaces is that of ``gpm``, its camera paths are those of ``gbre``.
 """
 
-import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import fog
 from test_gbre import rays  # noqa: F401 - a fixture
-from test_gpm import assert_no_bias, gain, largest, passes
-from unbiased import far_shifts, load, render_ours
+from test_gpm import largest
 
 
 @pytest.mark.parametrize("far", [False, True])
@@ -54,61 +51,3 @@ def test_beams_turn_to_and_fro(rays, far):  # noqa: F811
     lengths = 1 if far else dr.square(near[0] / dr.norm(target - a))
     told = np.array(there[3] / near[3] * lengths)
     assert np.quantile(np.abs(measured / told - 1), 0.95) < 1e-4 and np.std(np.log(told)) > 0.02
-
-
-QUICK = [("colours", 4)]
-SLOW = [("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
-
-
-@pytest.mark.parametrize(("name", "pixels"), QUICK + [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW])
-def test_differences_by_beams_are_those_of_the_image(renderer, name, pixels):
-    """In one pass after another: with the same light paths, so that the noise of both falls out in part."""
-    scene = load(renderer, getattr(media_scenes, name), (12, 12))
-    stacks = passes(scene, 32, pixels, "gbeams", radius=0.5, photons=1)
-    assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
-    assert_no_bias(stacks, pixels)
-
-
-@pytest.mark.slow
-def test_a_wrong_jacobian_of_beams_is_found(renderer, monkeypatch):
-    """One without the lengths."""
-    from data_gen.samplers.photons.gradients import shift
-
-    monkeypatch.setattr(shift, "jacobian_in_medium", lambda length2, length2_1: 0 * length2_1 + 1)
-    stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 32, 4, "gbeams", radius=0.5, photons=2)
-    with pytest.raises(AssertionError):
-        assert_no_bias(stacks, 4)
-
-
-@pytest.mark.slow
-def test_the_primal_is_that_of_beams(renderer):
-    """The same camera paths and beams; Russian roulette alone looks at five paths instead of one."""
-
-    def short():
-        return media_scenes.nested() | {"integrator": {"type": "volpath", "max_depth": 5, "rr_depth": 9}}
-
-    scene = load(renderer, short, (24, 16))
-    ours, theirs = (render_ours(scene, sampler, 1, 2, radius=1.0)[0] for sampler in ("gbeams", "beams"))
-    for layer in ("primal", "direct", "albedo", "normal", "depth"):
-        assert np.allclose(ours[layer], theirs[layer], rtol=1e-3, atol=1e-5), layer
-
-
-@pytest.mark.slow
-def test_beams_shifted_by_nothing_find_no_difference(renderer):
-    from data_gen.render import render_stack
-
-    with far_shifts(0):
-        layers = render_stack(load(renderer, media_scenes.milk, (16, 16)), 2, 0, "gbeams").layers
-    assert not layers["dx"].any() and not layers["dy"].any() and layers["primal"].any()
-
-
-def test_beams_have_copies_and_differences_little_noise(renderer):
-    """No z-test asks for that: a sampler that rejects every shift is unbiased."""
-    from data_gen.render import render_stack
-    from ngpt.io.exr import pass_through
-
-    scene = load(renderer, fog, (32, 32))
-    stack = render_stack(scene, 2, 0, "gbeams", radius=0.5, diagnostics=True)
-    failed = pass_through(stack)["diagnostics.shiftFailures"]
-    mean, median = gain(passes(scene, 8, 1, "gbeams", radius=0.5))
-    assert failed.mean() < 0.15 and mean > 3 and median > 5, (failed.mean(), mean, median)

@@ -4,15 +4,13 @@ That it repeats its bits, says how noisy it is and stays within its memory is am
 does on surfaces is that of ``gpm``.
 """
 
-from itertools import product
 from types import SimpleNamespace
 
 import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import fog
-from test_gpm import assert_no_bias, gain, joined, largest, passes
-from unbiased import far_shifts, load, render_ours
+from test_gpm import joined, largest
+from unbiased import load
 
 LONG = ("haze", "colours", "forward")
 
@@ -206,62 +204,3 @@ def assert_copies_are_light_paths(mi, name, receivers):
     assert np.median(np.abs(power - 1)) < 5e-4 and np.quantile(np.abs(power - 1), 0.95) < 2e-2
     away = np.linalg.norm(np.array(back.p) - np.array(photon.p), axis=0)[good]
     assert np.median(away) < 2e-5 and np.quantile(away, 0.95) < 1e-3
-
-
-QUICK = [("colours", 4)]
-SLOW = [("haze", 1), *product(["haze", "forward", "dense", "nested", "milk"], [4])]
-
-
-@pytest.mark.parametrize(("name", "pixels"), QUICK + [pytest.param(*case, marks=pytest.mark.slow) for case in SLOW])
-def test_differences_in_media_are_those_of_the_image(renderer, name, pixels):
-    """In one pass after another: with the same photons, so that the noise of both falls out in part."""
-    scene = load(renderer, getattr(media_scenes, name), (12, 12))
-    stacks = passes(scene, 32, pixels, "gbre", radius=0.7, photons=2)
-    assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
-    assert_no_bias(stacks, pixels)
-
-
-@pytest.mark.slow
-def test_a_wrong_jacobian_in_media_is_found(renderer, monkeypatch):
-    from data_gen.samplers.photons.gradients import shift
-
-    monkeypatch.setattr(shift, "jacobian_in_medium", lambda length2, length2_1: 0 * length2_1 + 1)
-    stacks = passes(load(renderer, media_scenes.haze, (12, 12)), 32, 4, "gbre", radius=0.7, photons=4)
-    with pytest.raises(AssertionError):
-        assert_no_bias(stacks, 4)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["nested", "milk"])
-def test_the_primal_is_that_of_bre(renderer, name):
-    """The same camera paths and photons; Russian roulette alone looks at five paths instead of one."""
-
-    def short():
-        scene = getattr(media_scenes, name)()
-        return scene | {"integrator": {"type": "volpath", "max_depth": 5, "rr_depth": 9}}
-
-    scene = load(renderer, short, (24, 16))
-    ours, theirs = (render_ours(scene, sampler, 1, 2, radius=1.0)[0] for sampler in ("gbre", "bre"))
-    for layer in ("primal", "direct", "albedo", "normal", "depth"):
-        assert np.allclose(ours[layer], theirs[layer], rtol=1e-3, atol=1e-5), layer
-
-
-@pytest.mark.slow
-def test_shifts_by_nothing_find_no_difference_in_media(renderer):
-    """The copy of a path through its own pixel is the path."""
-    from data_gen.render import render_stack
-
-    with far_shifts(0):
-        layers = render_stack(load(renderer, media_scenes.milk, (16, 16)), 2, 0, "gbre").layers
-    assert not layers["dx"].any() and not layers["dy"].any() and layers["primal"].any()
-
-
-def test_photons_in_media_have_copies_and_differences_little_noise(renderer):
-    """No z-test asks for that: a sampler that rejects every shift is unbiased. Measured, 64x64: 0.99, 13 and 651."""
-    from data_gen.render import render_stack
-    from ngpt.io.exr import pass_through
-
-    scene = load(renderer, fog, (48, 48))
-    failed = pass_through(render_stack(scene, 2, 0, "gbre", radius=1.0, diagnostics=True))["diagnostics.shiftFailures"]
-    mean, median = gain(passes(scene, 8, 1, "gbre", radius=1.0))
-    assert failed.mean() < 0.1 and mean > 5 and median > 30, (failed.mean(), mean, median)

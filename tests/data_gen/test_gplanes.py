@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from test_gbre import rays  # noqa: F401 - a fixture
 from test_gpm import assert_no_bias, gain, largest, passes
-from unbiased import far_shifts, load, render_ours
+from unbiased import load
 
 
 def turning(g):
@@ -123,19 +123,6 @@ def by_planes_alone(passes, traced):
     yield Gathered(None, NearPlanes(planes_of(passes, traced)))
 
 
-CASES = [("colours", 4), ("haze", 1), ("haze", 4), ("forward", 4), ("dense", 4), ("nested", 4), ("milk", 4)]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("name", "pixels"), CASES)
-def test_differences_by_planes_are_those_of_the_image(renderer, name, pixels):
-    """In one pass after another: with the same light paths, so that the noise of both falls out in part."""
-    scene = load(renderer, getattr(media_scenes, name), (12, 12))
-    stacks = passes(scene, 32, pixels, "gplanes", radius=0.5)
-    assert np.mean([stack["primal"].mean() for stack in stacks]) > 0.01
-    assert_no_bias(stacks, pixels)
-
-
 @pytest.mark.slow
 def test_differences_by_planes_alone_are_those_of_their_image(renderer, monkeypatch):
     from data_gen.samplers.photons.media import gplanes
@@ -162,29 +149,6 @@ def test_a_wrong_jacobian_of_planes_is_found(renderer, monkeypatch, wrong):
         return
     with pytest.raises(AssertionError):
         assert_no_bias(stacks, 4)
-
-
-@pytest.mark.slow
-def test_the_primal_is_that_of_planes(renderer):
-    """The same camera paths, beams and planes; Russian roulette alone looks at five paths instead of one."""
-
-    def short():
-        return media_scenes.nested() | {"integrator": {"type": "volpath", "max_depth": 5, "rr_depth": 9}}
-
-    scene = load(renderer, short, (24, 16))
-    ours, theirs = (render_ours(scene, sampler, 1, 2, radius=1.0)[0] for sampler in ("gplanes", "planes"))
-    for layer in ("primal", "direct", "albedo", "normal", "depth"):
-        assert np.allclose(ours[layer], theirs[layer], rtol=1e-3, atol=1e-5), layer
-
-
-@pytest.mark.slow
-def test_planes_shifted_by_nothing_find_no_difference(renderer):
-    """But for the rounding of planes that turn by nothing."""
-    from data_gen.render import render_stack
-
-    with far_shifts(0):
-        layers = render_stack(load(renderer, media_scenes.milk, (16, 16)), 2, 0, "gplanes").layers
-    assert max(np.abs(layers["dx"]).max(), np.abs(layers["dy"]).max()) < 1e-4 * layers["primal"].max()
 
 
 def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):

@@ -176,6 +176,7 @@ def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
     """Dr.Jit wraps it in a RuntimeError, as it does what keeps a function from being recorded."""
     import drjit as dr
 
+    from data_gen.passes import recording
     from data_gen.paths.frozen import Frozen
 
     mi, calls = renderer, []
@@ -186,11 +187,11 @@ def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
 
     frozen, lanes = Frozen(load(mi, "diffuse", (4, 4))), dr.opaque(mi.UInt32, 3, 4)
     for f in (interrupted, lambda n: dr.while_loop((n,), lambda n: n > 0, interrupted)):
-        with pytest.raises(KeyboardInterrupt):
+        with recording(), pytest.raises(KeyboardInterrupt):
             frozen(f, lanes)
         assert len(calls) == 1
         # The next call is another try.
-        with pytest.raises(KeyboardInterrupt):
+        with recording(), pytest.raises(KeyboardInterrupt):
             frozen(f, lanes)
         assert len(calls) == 2
         calls.clear()

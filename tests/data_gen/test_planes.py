@@ -6,11 +6,8 @@ refused is that of ``vpm``, beams are those of ``beams``.
 
 from functools import partial
 
-import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import fog
-from test_beams import alike
 from unbiased import REFERENCES, load, render_ours
 
 from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere
@@ -125,17 +122,3 @@ def test_paths_of_planes_are_no_longer_than_the_scene_says(renderer, monkeypatch
     scenes = [load(renderer, partial(black_room, depth), (8, 8)) for depth in (2, 3)]
     light = [render_stack(scene, 1, 0, "planes")["primal"].sum() for scene in scenes]
     assert light[0] == 0 < light[1]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["colours", "haze", "forward", "milk", "dense", "nested"])
-def test_small_radii_have_the_image_of_volpath(renderer, name):
-    """Beams bring what planes do not, and photons the light on surfaces."""
-    block = 16 if name in ("nested", "forward") else 8 if name == "milk" else 4
-    alike(renderer, getattr(media_scenes, name), block=block, sampler="planes", planes=512)
-
-
-@pytest.mark.slow
-def test_planes_go_on_behind_boundaries(renderer):
-    """In from outside, where the lamp is, and out again."""
-    alike(renderer, fog, sampler="planes", planes=512)

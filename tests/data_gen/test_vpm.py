@@ -6,62 +6,9 @@ That it repeats its bits, says how noisy it is and stays within its memory is am
 import media_scenes
 import numpy as np
 import pytest
-from data_gen_scenes import _scale, fog
-from test_photons import assert_alike
-from unbiased import gradient_tests, light_of_gradients, load, render_ours, render_references
+from unbiased import gradient_tests, load, render_ours, render_references
 
 from ngpt.errors import NgptError
-
-
-def alike(renderer, scene, radius=0.4, photons=128, block=4, references=128):
-    scene = load(renderer, scene, (16, 16))
-    ours = render_ours(scene, "vpm", batches=8, spp=1, radius=radius, photons=photons)
-    theirs = render_ours(scene, "primal", batches=8, spp=references)
-    # Light that is seen directly is its expectation in ours, and has its own edges.
-    images, references = (np.stack([light_of_gradients(s) for s in stacks]) for stacks in (ours, theirs))
-    assert references.mean() > 0.01
-    assert_alike(images, references, block)
-
-
-SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("forward", "colours", "milk")]
-
-
-@pytest.mark.parametrize("name", ["haze", *SLOW])
-def test_small_radii_have_the_image_of_volpath(renderer, name):
-    """One phase function or another, colours apart, liquids in clear and in frosted glass."""
-    alike(renderer, getattr(media_scenes, name))
-
-
-@pytest.mark.slow
-def test_media_within_each_other(renderer):
-    """Behind boundaries that bend nothing, along which it is too dark by a share that falls like the radius."""
-    alike(renderer, media_scenes.nested, radius=0.2, photons=256, block=16)
-
-
-@pytest.mark.slow
-def test_boundaries_within_one_medium_change_nothing(renderer):
-    """Photons on the other side are of the same medium, and are gathered."""
-
-    def crossed():
-        air = {"type": "ref", "id": "air"}
-        cube = {"type": "cube", "to_world": _scale(0.7), "bsdf": {"type": "null"}, "interior": air, "exterior": air}
-        return media_scenes.haze() | {"cube": cube}
-
-    alike(renderer, crossed, radius=1.0, photons=64)
-
-
-@pytest.mark.parametrize("max_depth", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_paths_in_media_are_no_longer_than_the_scene_says(renderer, max_depth):
-    def short():
-        scene = media_scenes.haze()
-        return scene | {"integrator": {"type": "volpath", "max_depth": max_depth}}
-
-    alike(renderer, short)
-
-
-def test_density_is_not_blurred_in_grids(renderer):
-    """Grids that fade have the image of ``volpath``."""
-    alike(renderer, media_scenes.wisps, radius=0.6, photons=40, references=32)
 
 
 @pytest.mark.slow
@@ -99,22 +46,6 @@ def test_lamps_and_skies_behind_grids_are_seen(renderer, name):
     ours, references = render_ours(scene, name, batches=8, spp=12), render_references(renderer, scene, 8, 64)
     ((_, result),) = gradient_tests([{"primal": stack["primal"]} for stack in ours], references)
     assert result.passed, result
-
-
-def test_it_converges_in_media(renderer):
-    """The squared error of the mean falls with passes; what is left of the blur falls like n^(-4/9) at least."""
-    from data_gen.render import render_stack
-
-    scene = load(renderer, fog, (16, 16))
-    reference = np.array(renderer.render(scene, spp=4096))
-
-    def error(n):
-        x = render_stack(scene, n, 0, "vpm", photons=16, radius=1.0)["primal"]
-        return np.mean((x - reference) ** 2 / (reference**2 + 0.01))
-
-    counts = 2, 8, 32
-    slope, _ = np.polyfit(np.log(counts), np.log([error(n) for n in counts]), 1)
-    assert slope < -4 / 9
 
 
 def test_radii_in_media_shrink_by_volume():
