@@ -113,12 +113,12 @@ def miss(cases: list, factor: float) -> float:
 
 
 def line(method: str, row: dict) -> str:
-    """A row of a table in Markdown: factor, coverage in the mean, and over scenes and samples from least to most."""
-    cells = [f"| `{method}` | {row['factor']} | {row['best factor']:.2f}"]
+    """A row of a table in Markdown: factor, coverage in the mean of the checked scenes, least to most of all."""
+    cells = [f"| `{method}` | {row['factor']}"]
     for name in INTERVALS:
         each = [one[name] for one in row["cases"].values()]
-        checked = f"{100 * row['checked'][name]:.0f}" if row["checked"] else ""
-        cells.append(f"{100 * row['chosen'][name]:.0f} | {checked} | {100 * min(each):.0f} .. {100 * max(each):.0f}")
+        mean = (row["checked"] or row["chosen"])[name]
+        cells.append(f"{100 * mean:.0f} | {100 * min(each):.0f} .. {100 * max(each):.0f}")
     return " | ".join(cells) + " |"
 
 
