@@ -108,7 +108,6 @@ def add_event(events: mi.UInt32, code: mi.UInt32) -> tuple[mi.UInt32, mi.Bool]:
     return events | (code << place), fits
 
 
-@dr.syntax
 def shoot(
     scene,
     z: mi.SurfaceInteraction3f,
@@ -120,6 +119,12 @@ def shoot(
     ends: Ends = nowhere,
 ) -> Shot:
     """Follows the ``events`` from ``z`` in direction ``ω`` (world space), and its differentials with them."""
+    return _shoot(scene, z, ω, events, target, active=active, ends=ends)
+
+
+# ``dr.syntax`` forgets the defaults of keywords.
+@dr.syntax
+def _shoot(scene, z, ω, events, target: Target, *, active, ends: Ends) -> Shot:
     # ------------------------ Loop state -------------------------
     ray = z.spawn_ray(ω)
     frame = mi.Frame3f(ω)
@@ -209,7 +214,6 @@ def turn(code, η, n, d, dn: tuple, dd: tuple) -> tuple[mi.Vector3f, mi.Vector3f
     return a * d + b * N, *changes
 
 
-@dr.syntax
 def walk(
     scene, z, ω: mi.Vector3f, events: mi.UInt32, target: Target, active=True, *, ends: Ends = nowhere
 ) -> tuple[mi.Vector3f, Shot, mi.Bool]:
@@ -217,6 +221,11 @@ def walk(
 
     A step that breaks the chain, or comes no nearer, is halved.
     """
+    return _walk(scene, z, ω, events, target, active=active, ends=ends)
+
+
+@dr.syntax
+def _walk(scene, z, ω, events, target: Target, *, active, ends: Ends) -> tuple[mi.Vector3f, Shot, mi.Bool]:
     best_ω, best = mi.Vector3f(ω), shoot(scene, z, ω, events, target, active, ends=ends)
     error = dr.norm(best.miss)
     found = best.good & (error < TOLERANCE * best.reach)
