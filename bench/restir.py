@@ -7,7 +7,6 @@ The camera goes sideways, or a shape or a lamp moves, as in ``bench.shots``. Riv
     restir       reservoirs of pixels and of pairs
     after        reservoirs of pixels, differences taken of what they have kept: the paper's baseline
     gpt          samples of their own in each frame
-    primal       reservoirs of pixels alone, no differences; beside ``restir`` only in what a frame costs
 
 ``cost`` is what a frame takes, by the clock and in processor time, over that of a sample of ``gpt``: the median of
 ``--repeats`` frames of all rivals in turn, at ``--cost-size``, chains as many as samples. ``noise`` is the variance of
@@ -86,21 +85,19 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
     import drjit as dr
 
     from data_gen.passes import render_passes
-    from data_gen.samplers import SAMPLERS
-    from data_gen.samplers.restir.sampler import Restir
+    from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 
     moving = shot_of(args, scene, shot, args.cost_size)
     changes = shot not in SPEEDS
     turns = [moving, moving.twin()] if changes else [moving]
     loaded = moving.at(0)
     rivals = {
-        name: Restir(loaded, 1, args.chains, 6144, gradients=gradients)
-        for name, gradients in (("restir", "pairs"), ("after", "after"), ("primal", "after"))
+        name: FRAME_SAMPLERS["restir"].made(loaded, 1, args.chains, 6144, gradients=gradients)
+        for name, gradients in (("restir", "pairs"), ("after", "after"))
     }
-    rivals["primal"]._history.gradients = False
-    gpt = SAMPLERS["gpt"].make(loaded)
+    gpt = SAMPLERS["gpt"].made(loaded)
     # What the slow shot moves by, everywhere: for the time that it takes.
-    width, height = rivals["restir"]._history.size
+    width, height = map(int, args.cost_size.split("x"))
     motion = np.full((height, width, 2), (0.5, 0.0))
     clock: dict[str, list[float]] = {}
     processor: dict[str, list[float]] = {}
@@ -115,8 +112,7 @@ def costs(args: argparse.Namespace, scene: str, shot: str) -> dict[str, dict[str
             if name == "gpt":
                 render_passes(gpt, loaded.sensors()[0], frame, args.chains)
             else:
-                stage = rivals[name]._stage(now, shapes) if changes else None
-                rivals[name]._history.next_frame(motion, None, stage)
+                rivals[name].film(frame, motion, None, (now, shapes) if changes else None)
             dr.sync_thread()
             seconds, work = time.perf_counter() - start, time.process_time() - work
             history = dr.kernel_history()

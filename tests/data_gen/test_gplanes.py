@@ -80,7 +80,7 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
     from data_gen.samplers.photons.media.planes import crossing, planes_of
 
     mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
-    made = find("gplanes").make(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
+    made = find("gplanes").made(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
     lane = dr.arange(mi.UInt32, n)
     random = sample_streams(0, lane, mi.UInt32(0))
     traced = next(made.integrator.maps(made, (random.next_key(), random.next_key()), 0))

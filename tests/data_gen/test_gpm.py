@@ -198,7 +198,7 @@ def passes(scene, n, pixels=1, sampler="gpm", **options):
     from data_gen.paths.camera import CameraSamples
     from data_gen.samplers import find
 
-    sample, sensor = find(sampler).make(scene, **options), scene.sensors()[0]
+    sample, sensor = find(sampler).made(scene, **options), scene.sensors()[0]
     stacks = []
     with far_shifts(pixels), recording():
         for seed in range(n):

@@ -129,7 +129,7 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch)
     sensor = scene.sensors()[0]
 
     def rendered(others=()):
-        passes, film = find("gpm").make(scene), GradientFilm(16, 12, batches=True)
+        passes, film = find("gpm").made(scene), GradientFilm(16, 12, batches=True)
         for i in range(3):
             with recording():
                 passes(CameraSamples(sensor, 3, 1, i), film)
@@ -208,7 +208,7 @@ def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch):
     scene = load(renderer, "diffuse", (4, 4))
     monkeypatch.setattr(PPM, "__init__", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        find("ppm").make(scene)
+        find("ppm").made(scene)
 
 
 def test_radii_shrink_as_told():

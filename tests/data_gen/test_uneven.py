@@ -15,7 +15,7 @@ def render(mi, scene, blocks, seed=0, sampler="gpt", memory=1000, **limits):
     from data_gen.samplers import find
     from data_gen.uneven import UnevenRender
 
-    work = UnevenRender(find(sampler).make(scene), scene.sensors()[0], seed, memory=memory, **limits)
+    work = UnevenRender(find(sampler).made(scene), scene.sensors()[0], seed, memory=memory, **limits)
     work.add(np.ones(PIXELS, int), whole=True)
     work.add(blocks)
     return work.film.develop()

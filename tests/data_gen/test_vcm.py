@@ -91,7 +91,7 @@ def images(scene, sampler, n, spp=1, **options):
     from data_gen.paths.camera import CameraSamples
     from data_gen.samplers import find
 
-    passes, sensor, found = find(sampler).make(scene, **options), scene.sensors()[0], []
+    passes, sensor, found = find(sampler).made(scene, **options), scene.sensors()[0], []
     width, height = (int(size) for size in sensor.film().crop_size())
     for i in range(n):
         film = GradientFilm(width, height, batches=True)
@@ -170,7 +170,7 @@ def test_kernels_of_vcm_are_recorded_once(renderer):
     from data_gen.samplers import find
 
     scene = load(renderer, "diffuse", (16, 12))
-    passes, film = find("vcm").make(scene), GradientFilm(16, 12, batches=True)
+    passes, film = find("vcm").made(scene), GradientFilm(16, 12, batches=True)
     for i in range(4):
         with recording():
             passes(CameraSamples(scene.sensors()[0], 3, 1, i), film)
