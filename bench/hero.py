@@ -32,8 +32,8 @@ import ngpt
 from bench import panels
 from bench.common import metadata, save, summary
 from ngpt.evaluation.config import scene_name
+from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relative_squared_error, relmse, relmse_trimmed
-from ngpt.measure.perceptual import flip
 from ngpt.methods import reconstruct
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.stack import GradientStack

@@ -17,8 +17,8 @@ import numpy as np
 from bench import panels
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_image
+from ngpt.measure.flip import flip
 from ngpt.measure.metrics import relmse_trimmed
-from ngpt.measure.perceptual import flip
 from ngpt.report.display import to_srgb8
 from ngpt.system.writing import write_json
 

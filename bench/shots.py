@@ -28,7 +28,7 @@ from ngpt.methods import METHODS
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import shipped
-from ngpt.sequence.windows import reconstruct_shot
+from ngpt.sequence.wcv_windows import reconstruct_shot
 
 # Scene and shot -> the parameter that moves, and by how much a frame. "lamp": the first shape that shines.
 MOVES = {

@@ -28,7 +28,7 @@ ngpt.network
 ngpt.methods
 ngpt.sequence.evidence
 ngpt.sequence.network
-ngpt.api.uncertainty ngpt.api.lightgroups ngpt.sequence.history ngpt.sequence.windows
+ngpt.api.uncertainty ngpt.api.lightgroups ngpt.sequence.history ngpt.sequence.wcv_windows
 ngpt.api.arrays
 ngpt.sequence ngpt.api
 ngpt.report

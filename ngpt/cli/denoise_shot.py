@@ -9,7 +9,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.io.exr import layers_in
 from ngpt.measure.metrics import compare
-from ngpt.sequence.windows import LENGTH, LINK, reconstruct_shot
+from ngpt.sequence.wcv_windows import LENGTH, LINK, reconstruct_shot
 from ngpt.stack import GradientStack
 
 

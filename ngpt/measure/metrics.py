@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.measure import perceptual
+from ngpt.measure import flip, perceptual
 from ngpt.measure.images import check_size, middle, reinhard
 
 # Published relMSE values differ in this constant; ours is that of gradient-domain VCM and photon mapping.
@@ -132,7 +132,7 @@ METRICS = {
     "FLIP": Metric(
         "mean HDR-FLIP, 67 pixels per degree, exposures computed from the reference",
         "lower",
-        lambda image, reference: perceptual.flip(image, reference)[0],
+        lambda image, reference: flip.flip(image, reference)[0],
         whole=True,
         missing=partial(perceptual.lack, "FLIP", "flip_evaluator", "flip-evaluator"),
     ),

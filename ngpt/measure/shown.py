@@ -3,10 +3,11 @@
 import numpy as np
 
 from ngpt.measure import perceptual
+from ngpt.measure.flip import flip
 from ngpt.measure.metrics import METRICS, scores
 
 SHOWN = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR", "SSIM", "FLIP")
-_WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": perceptual.flip}
+_WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 
 
 def available(height: int, width: int) -> tuple[list[str], list[str]]:

@@ -9,7 +9,7 @@ from shots import wall, without
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_exr, read_image
-from ngpt.sequence.windows import LENGTH, reconstruct_shot
+from ngpt.sequence.wcv_windows import LENGTH, reconstruct_shot
 
 
 def written(folder, stacks):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.measure import perceptual
+from ngpt.measure import flip, perceptual
 from ngpt.measure.metrics import METRICS
 
 
@@ -27,12 +27,12 @@ def test_ssim_orders_noise_and_needs_its_window(reference, rng):
 def test_flip_is_that_of_its_authors(reference, rng):
     flip_evaluator = pytest.importorskip("flip_evaluator")
     image = np.maximum(reference + rng.normal(0, 0.2, reference.shape), 0).astype(np.float32)
-    mean, errors = perceptual.flip(image, reference)
+    mean, errors = flip.flip(image, reference)
     assert errors.shape == reference.shape[:2] and errors.mean() == pytest.approx(mean, rel=1e-4)
     # Left to itself, FLIP takes its exposures from the reference by the same rule.
     _, expected, parameters = flip_evaluator.evaluate(reference, image, "HDR", applyMagma=False)
     assert mean == pytest.approx(expected, rel=1e-3)
-    start, stop, count = perceptual.flip_exposures(reference)
+    start, stop, count = flip.flip_exposures(reference)
     found = [parameters[name] for name in ("startExposure", "stopExposure", "numExposures")]
     assert [start, stop, count] == pytest.approx(found, abs=0.01)  # its median of an even number is one of the two
 
@@ -41,14 +41,14 @@ def test_flip_of_a_firefly_does_not_move_the_exposures(reference):
     pytest.importorskip("flip_evaluator")
     image = reference.copy()
     image[3, 3] = 1e7
-    mean, errors = perceptual.flip(image, reference)
+    mean, errors = flip.flip(image, reference)
     assert 0 < mean < 0.3 and errors[3, 3] > 0.1 and errors[-1, -1] < 1e-3
 
 
 def test_black_reference_and_sizes(reference):
-    assert perceptual.flip_exposures(0 * reference) == (0.0, 0.0, 2)
+    assert flip.flip_exposures(0 * reference) == (0.0, 0.0, 2)
     with pytest.raises(NgptError, match="different size"):
-        perceptual.flip(reference, reference[:-1])
+        flip.flip(reference, reference[:-1])
 
 
 def test_elpips_without_weights_says_what_is_missing(reference):

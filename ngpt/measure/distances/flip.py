@@ -1,5 +1,5 @@
 """FLIP on tensors: what a viewer sees of an error who flips between two images. It has gradients, so networks can learn
-from it; ``ngpt.measure.perceptual.flip`` is the reference implementation, which judges.
+from it; ``ngpt.measure.flip.flip`` is the reference implementation, which judges.
 
     opponent space -> what the eye resolves (a Gaussian for each channel) -> Lab -> HyAB distance, compressed: colour
     luminance -> edges and points, by derivatives of a Gaussian -> their difference: feature

@@ -7,7 +7,7 @@ from shots import wall, without
 import ngpt
 from ngpt.methods import METHODS
 from ngpt.sequence.flicker import flicker
-from ngpt.sequence.windows import HOP, LENGTH, reconstruct_shot
+from ngpt.sequence.wcv_windows import HOP, LENGTH, reconstruct_shot
 from ngpt.stack import GradientStack
 
 COUNT, SIZE = LENGTH + 4, (16, 20, 3)
