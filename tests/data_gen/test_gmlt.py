@@ -128,8 +128,8 @@ def test_chains_accept_enough(renderer, monkeypatch):
 
     rates, run = [], integrator.run
 
-    def noted(*args):
-        rates.append(run(*args))
+    def noted(*args, **more):
+        rates.append(run(*args, **more))
         return rates[-1]
 
     monkeypatch.setattr(integrator, "run", noted)

@@ -266,12 +266,11 @@ def test_a_pair_moves_as_its_nearer_pixel_does(rng):
 
 def far_differences(room, monkeypatch):
     """Differences of pixels far from each other: their shifts have Jacobians far from 1."""
-    from data_gen.samplers.restir import history as module
-    from data_gen.samplers.restir import layout
+    from data_gen.samplers.restir import history, layout, merging
 
-    right = module.step
+    right = layout.step
     with monkeypatch.context() as patch:
-        for where in (module, layout):
+        for where in (history, layout, merging):
             patch.setattr(where, "step", lambda domain: 8 * right(domain))
         found = [next(iter(room.frames(seed, count=1)))[1]["dx"] for seed in range(2)]
     return np.concatenate(found)[:, :, :-8]
@@ -301,13 +300,13 @@ def without_jacobian(monkeypatch):
 
 
 def with_half_weights(monkeypatch):
-    from data_gen.samplers.restir import history as module
+    from data_gen.samplers.restir import merging as module
 
     monkeypatch.setattr(module, "difference", lambda first, second, side: (second - first) / 2)
 
 
 def with_wrong_side(monkeypatch):
-    from data_gen.samplers.restir import history as module
+    from data_gen.samplers.restir import merging as module
 
     right = module.difference
     monkeypatch.setattr(module, "difference", lambda first, second, side: right(first, second, 1 - side))

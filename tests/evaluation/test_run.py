@@ -140,13 +140,14 @@ def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message
 
 
 def test_a_stack_without_features_is_an_absent_cell(room):
-    folder, config = room
+    folder, _ = room
+    config = read(CONFIG.format(folder=folder / "room").replace("nfor", "nlm"), folder)
     for path in (folder / "room").glob("features-*.exr"):
         path.unlink()
         shutil.copy(path.with_name(path.name.replace("features", "path")), path)
     results = evaluate(config, folder / "out", QUIET, "", service)
     rows = {cell["method"]: cell["absent"] for cell in results["cells"]}
-    assert "method 'nfor' needs layers 'albedo'" in rows["nfor"] and rows["l2"] is None
+    assert "method 'nlm' needs layers 'albedo'" in rows["nlm"] and rows["l2"] is None
 
 
 @pytest.mark.parametrize(
