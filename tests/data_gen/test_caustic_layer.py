@@ -47,6 +47,7 @@ def test_nothing_is_lost(renderer):
     assert not z_test(np.stack([stack["primal"] - stack["caustic"] for stack in stacks]), references).passed
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mutant",
     [
@@ -96,6 +97,7 @@ def test_classes(renderer):
     assert not lit_late(true, false, true)[0] and not lit_late(false, false, false)[0]
 
 
+@pytest.mark.slow
 def test_variances_are_those_of_what_they_belong_to(renderer):
     scene = load(renderer, glass, (32, 32))
     stacks = render_ours(scene, "gpt", batches=64, spp=16)

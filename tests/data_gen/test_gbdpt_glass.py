@@ -106,7 +106,10 @@ class Caustics:
         return uv, active, self.shift(path, uv, active)
 
 
-@pytest.fixture(scope="module", params=LIT)
+# By a lamp and by one direction; the others are slow.
+@pytest.fixture(
+    scope="module", params=[n if n in ("lamp", "sun") else pytest.param(n, marks=pytest.mark.slow) for n in LIT]
+)
 def paths(renderer, request):
     return Caustics(renderer, LIT[request.param])
 
@@ -266,6 +269,7 @@ def z_tests(mi, description, pixels):
     return list(gradient_tests(render_ours(scene, "gbdpt", 16, 64, pixels), references, pixels=pixels))
 
 
+@pytest.mark.slow
 def test_unbiased(renderer, long_passes):
     for name, result in z_tests(renderer, caustics, 1):
         assert result.passed, f"{name}: {result}"
@@ -304,6 +308,7 @@ def test_mutants_fail_the_z_test(renderer, long_passes, monkeypatch, function, m
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
+@pytest.mark.slow
 def test_less_noise_than_without(renderer, long_passes, monkeypatch):
     """Light of one direction, through a ball and by a mirror, and straight onto the floor."""
     from data_gen.samplers.gbdpt import light_shift

@@ -151,6 +151,7 @@ def test_a_wrong_jacobian_of_planes_is_found(renderer, monkeypatch, wrong):
         assert_no_bias(stacks, 4)
 
 
+@pytest.mark.slow
 def test_planes_have_copies_and_differences_little_noise(renderer, monkeypatch):
     """No z-test asks for that: a sampler that rejects every shift is unbiased. Measured, 48x48: 0.02, 66 and 106."""
     from data_gen.render import render_stack

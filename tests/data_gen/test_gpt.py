@@ -58,6 +58,7 @@ def test_agrees_with_the_teaching_sampler(renderer):
         assert result.passed, f"{name}: {result}"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "mutant"),
     [
@@ -89,6 +90,7 @@ def test_mutants_fail_the_z_test(renderer, function, mutant, monkeypatch):
     assert passed["primal"] and not (passed["dx"] and passed["dy"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "mutant", ["emission at the joint", pytest.param("light at the joint", marks=pytest.mark.slow)]
 )
@@ -144,6 +146,7 @@ def wrapped(film, layer):
     return np.where(gradient == 0, np.roll(image, -1, axis=1 if layer == "dx" else 0) - image, gradient), variance
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("mutant", [one_direction, wrapped])
 def test_mutants_of_the_borders_fail_the_z_test(renderer, mutant, monkeypatch):
     from data_gen.film import GradientFilm

@@ -15,7 +15,7 @@ def render_both(mi, scene, batches=16, spp=64, reference_batches=24, reference_s
     return render_ours(scene, "gpt-basic", batches, spp), render_references(mi, scene, reference_batches, reference_spp)
 
 
-@pytest.mark.parametrize("scene", [glass, within_fog])
+@pytest.mark.parametrize("scene", [pytest.param(glass, marks=pytest.mark.slow), within_fog])
 def test_unbiased(renderer, scene):
     stacks, references = render_both(renderer, load(renderer, scene, (32, 32)))
     assert references.mean() > 0.01  # black images agree all too well

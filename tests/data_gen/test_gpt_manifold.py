@@ -43,6 +43,7 @@ def inverted(mi, follow):
     return mutant
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "mutate"),
     [

@@ -30,9 +30,9 @@ from ngpt.testing import z_test
 
 SIZE, PIXELS = (16, 16), 4
 # Not with large budgets: those tell `volpathmis` from `volpath`.
-FAST = [haze, by_mis(colours), by_mis(coloured_smoke), before_the_sky, hiding]
+FAST = [haze, by_mis(colours), before_the_sky]
 SLOW = [haze, forward, colours, dense, milk, nested, smoke, coloured_smoke, before_the_sky, fog, within_fog]
-SLOW += [hiding, hiding_outside]
+SLOW += [hiding, hiding_outside, by_mis(coloured_smoke)]
 
 
 @cache

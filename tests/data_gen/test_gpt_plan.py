@@ -74,6 +74,7 @@ def test_the_general_kernel_renders_the_same(renderer, name, flag, monkeypatch):
         assert off.mean() < 0.01, layer
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scene", [pytest.param(plenty, marks=pytest.mark.slow), glass, "environment"])
 def test_half_vector_copy_is_unbiased(renderer, scene, monkeypatch):
     from data_gen.paths import shift

@@ -118,6 +118,7 @@ def test_agrees_with_the_full_integrator(renderer, stacks):
         assert ours == pytest.approx(theirs, rel=0.25), name
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("function", "mutant"),
     [

@@ -110,6 +110,7 @@ def courtyard(renderer):
     return scene, render_references(renderer, scene, batches=16, spp=128)
 
 
+@pytest.mark.slow
 def test_unbiased_where_densities_differ(courtyard):
     scene, references = courtyard
     for name, result in gradient_tests(render_ours(scene, "gpt-tiles", batches=12), references):
@@ -149,6 +150,7 @@ def test_a_mutant_without_jacobian_fails_the_z_test(renderer, courtyard, monkeyp
     assert not all(result.passed for _, result in gradient_tests(stacks, references, pixels=8))
 
 
+@pytest.mark.slow
 def test_variance_gain(renderer):
     """Over ``gpt`` at equal samples, median of pixels. Measured: 3.4 of the primal and 1.25 of differences."""
     from data_gen.render import render_stack

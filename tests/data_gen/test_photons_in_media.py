@@ -64,14 +64,14 @@ def short(scene, max_depth, rr_depth=5):
 
 
 QUICK = [
-    ("vpm", "wisps", vpm(radius=0.6, photons=40, references=32)),  # grids that fade: their density is not blurred
     ("bre", "colours", bre()),
     ("bre", "milk", bre(block=8, batches=10)),  # liquids in clear and in frosted glass: few photons get there
     ("bre", "wisps", bre(radius=0.3, photons=64, block=8, references=32)),
-    ("beams", "colours", Image()),
 ]
 # Along boundaries that bend nothing, of media within each other, it is too dark by a share that falls like the radius.
 SLOW = [
+    ("vpm", "wisps", vpm(radius=0.6, photons=40, references=32)),  # grids that fade: their density is not blurred
+    ("beams", "colours", Image()),
     *(("vpm", name, vpm()) for name in ("haze", "forward", "colours", "milk")),
     ("vpm", "nested", vpm(radius=0.2, photons=256, block=16)),
     ("bre", "forward", bre()),

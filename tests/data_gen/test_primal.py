@@ -8,6 +8,7 @@ from unbiased import load, render_ours, render_references, right_integrator
 from ngpt.testing import z_test
 
 
+@pytest.mark.slow
 def test_light_on_what_has_holes_is_not_lost(renderer):
     """Mitsuba's ``path`` gives it up when the path goes on through a hole and meets nothing; ``prb`` does not."""
     scene = load(renderer, leaf, (16, 16))
@@ -50,7 +51,9 @@ def test_elsewhere_it_is_the_integrator_itself(renderer, more):
         radiance(scene, Own())(None, None, None, True)
 
 
-@pytest.mark.parametrize("sampler", ["primal", "gpt", "bdpt", "gbdpt"])
+@pytest.mark.parametrize(
+    "sampler", ["primal", "gpt", *(pytest.param(name, marks=pytest.mark.slow) for name in ("bdpt", "gbdpt"))]
+)
 def test_lamps_seen_directly_are_seen_by_four_rays_a_sample(renderer, sampler):
     """A lamp of radiance 2 over parts of pixels: one ray a sample would have variance m (2 - m) / spp."""
     lamp = {"type": "sphere", "radius": 0.6, "emitter": {"type": "area", "radiance": {"type": "rgb", "value": 2.0}}}

@@ -143,7 +143,7 @@ def test_each_kind_renders(tmp_path, monkeypatch):
     assert [line for line in told if line.startswith(str(tmp_path))] == [f"{path} True" for path in paths]
 
 
-@pytest.mark.parametrize("kind", ["fog", "smoke"])
+@pytest.mark.parametrize("kind", [pytest.param("fog", marks=pytest.mark.slow), "smoke"])
 def test_cameras_are_found_beside_media_and_see_through_their_boundaries(renderer, kind):
     """A camera's medium is said once: those in fog stay in it, those outside of smoke stay outside."""
     from data_gen.dataset.cameras import Surroundings, find_view

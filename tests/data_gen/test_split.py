@@ -122,6 +122,7 @@ def test_what_is_not_has_no_diffuse_light(renderer):
     assert stack["specular"].any() and not stack["diffuse"].any() and not stack["diffuse_var"].any()
 
 
+@pytest.mark.slow
 def test_diffuse_light_is_that_of_the_same_materials_without_gloss(renderer):
     """Of light that lamps send to what the camera sees; Mitsuba renders the materials whose gloss is black."""
     stacks = render_ours(load(renderer, shelf(coats(), 2), (32, 32)), "split", spp=32)

@@ -263,6 +263,7 @@ def test_tiles_of_a_host_make_the_whole(weights, name):
     assert np.abs(wrong[..., :40] - whole[..., :40]).max() > 1e-4 * whole.mean(), "statistics would not matter"
 
 
+@pytest.mark.slow
 def test_half_precision_is_within_percents(fast):
     half = network_model(FAST, "half", "float16")
     assert {item.key: item.value for item in half.metadata_props}["ngpt.precision"] == "float16"

@@ -48,6 +48,7 @@ def test_a_network_that_looks_far_gets_what_it_looks_at(monkeypatch):
     assert reach(model) > model.radius / 2
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ngpt-combine"])
 def test_tiles_do_not_show_where_they_overlap_by_less(name):
     """With lights a hundredfold as bright, and by a third of that overlap they do."""
