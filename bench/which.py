@@ -2,7 +2,7 @@
 
     python -m bench.which --folder SCENES --seconds 12 --cache out/which
 
-SCENES has veach-bidir and water-caustic, after Bitterli's resources.
+SCENES has veach-bidir, after Bitterli's resources.
 
 Each row is one scene and one rendering time: path tracing, the same denoised by OIDN, and the sampler's stack by the
 best method for it. Renders are kept in the cache.
@@ -22,7 +22,7 @@ from ngpt.stack import GradientStack
 CASES = (
     ("diffuse", "gpt", "auto"),
     ("veach-bidir/scene.xml", "gbdpt", "auto"),
-    ("water-caustic/scene.xml", "ppm", "primal"),
+    ("bench/scenes/mirror-caustic/scene.xml", "vcm", "oidn"),
     ("haze", "gpt", "auto"),
 )
 
@@ -56,11 +56,11 @@ def rendered(args: argparse.Namespace, scene: str, sampler: str) -> GradientStac
     if not file.exists():
         import data_gen
 
-        path = args.folder / scene if scene.endswith(".xml") else scene
+        path = args.folder / scene if (args.folder / scene).exists() else scene
         stack, _ = data_gen.render_scene(path, sampler=sampler, seconds=args.seconds, size=tuple(args.size))
         ngpt.write(file, stack)
     # Without gradients beside it the reader takes the name "direct" for direct light.
-    return ngpt.read(file, {"direct": "direct"} if sampler in ("primal", "ppm") else None)
+    return ngpt.read(file, {"direct": "direct"} if sampler in ("primal", "vcm") else None)
 
 
 if __name__ == "__main__":
