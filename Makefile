@@ -7,9 +7,11 @@ PY = .venv/bin/python
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
 
-# Half a minute: files, classical methods, denoisers, metrics, losses, docs; little that renders, runs a network or a browser.
+# Less than a minute: files, classical methods, denoisers, metrics, losses, docs; little that renders, runs a network or a browser.
 quick: setup-quick
-	$(PY) -m pytest -q -m "not slow" -k "not memory_per_pixel and not half_a_percent" --ignore tests/report/test_report.py \
+	$(PY) -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "not slow" \
+		-k "not memory_per_pixel and not half_a_percent" --ignore tests/report/test_report.py \
+		--ignore tests/report/test_report_looks.py --ignore tests/report/test_notebook.py --ignore tests/test_what_auto_takes.py \
 		tests/io tests/classical tests/denoisers tests/measure tests/report tests/system tests/network/test_unet.py \
 		tests/training/test_augment.py tests/training/test_losses.py tests/test_*.py
 

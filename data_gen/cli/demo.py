@@ -83,7 +83,8 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    methods = {method: entry for method, entry in METHODS.items() if not entry.variant}
+    # Studies take longer than all others together.
+    methods = {m: entry for m, entry in METHODS.items() if not entry.variant and entry.standing != "study"}
     targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
     with console.progress(f"{name}: stack", "spp") as progress:
