@@ -1,4 +1,19 @@
-"""Random numbers that belong to a sample of a pixel, whatever pass renders it."""
+"""Random numbers that belong to a sample of a pixel, or to a light path, whatever pass renders it.
+
+Two kinds of ``points``. "independent" are those of a random number generator for each sample. "sobol", the default, are
+points of Owen-scrambled Sobol sequences, a new pair of dimensions for each pair of numbers: samples of a pixel, and of
+pixels side by side, keep apart from each other, and errors of pixels and of blocks of pixels fall. Each point alone is
+uniform, so that all estimates stay unbiased; but samples are independent no more.
+
+- A pair of dimensions is the first two of Sobol's sequence, with the order of the points and both coordinates scrambled
+  anew. [Burley 2020, "Practical Hash-based Owen Scrambling"]
+- Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
+  are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
+  via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
+- How many samples there will be is not known, so they come in *rounds*, each as large as all before together: 4, 4, 8,
+  16 ... samples of each pixel. Rounds are independent of each other, which is what ``film`` tells the noise by.
+- Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +23,59 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+# Samples of a pixel in the first round, a power of two
+FIRST_ROUND = 4
+# Of a round at most, as a power of two: with the pixels of a tile, 32 bits number its points.
+_LARGEST = 20
+# Side of a tile of pixels, as a power of two
+_TILE = 6
 
-def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32) -> mi.Sampler:
-    """A sampler whose lanes are the independent streams of sample ``sample`` of pixel ``pixel``.
 
-    ``seed`` is any integer from 0. Mitsuba's own sampler numbers the lanes of a pass instead, so its numbers change
-    with the size of passes, and with them the image.
+def sample_streams(
+    seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int | mi.UInt32 = 0, points: str = "independent"
+) -> mi.Sampler:
+    """A sampler whose lanes are the streams of sample ``sample`` of pixel ``pixel``, of an image of that ``width``.
+
+    ``seed`` is any integer from 0; ``points`` "sobol" or "independent", which needs no ``width``. Mitsuba's own sampler
+    numbers the lanes of a pass instead, so its numbers change with the size of passes, and with them the image.
     """
-    keys = (int(key) for key in np.random.SeedSequence(seed).generate_state(2))
+    if points == "independent":
+        return _independent(seed, pixel, sample)
+    bits = 31 - dr.lzcnt(sample | (FIRST_ROUND - 1))
+    bits = dr.minimum(dr.select(sample < FIRST_ROUND, FIRST_ROUND.bit_length() - 1, bits), _LARGEST)
+    first = dr.select(sample < FIRST_ROUND, 0, sample >> bits << bits)
+    x, y = pixel % width, pixel // width
+    within = (1 << _TILE) - 1
+    number = _apart(x & within) | _apart(y & within) << 1
+    key = _mixed(first ^ _key(seed, 0))
+    key = _mixed(key ^ (x >> _TILE | y >> _TILE << 16))
+    return _sobol_class(mi.variant())(number << bits | sample - first, key, dr.zeros(mi.UInt32, dr.width(key)))
+
+
+def light_streams(seed: int, number: mi.UInt32, turn: int, points: str = "sobol") -> mi.Sampler:
+    """The streams of the light paths ``number`` of a pass, which has number ``turn``; none are those of pixels."""
+    turn = dr.opaque(mi.UInt32, turn)
+    if points == "independent":
+        return _independent(seed, number, turn, of_lights=True)
+    key = _mixed(turn ^ _key(seed, 1)) + dr.zeros(mi.UInt32, dr.width(number))
+    return _sobol_class(mi.variant())(number, key, dr.zeros(mi.UInt32, dr.width(number)))
+
+
+def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False) -> mi.Sampler:
+    """Generators for each (a, b)."""
+    entropy = [seed, 2] if of_lights else seed
+    keys = (int(key) for key in np.random.SeedSequence(entropy).generate_state(2))
     # Enciphered twice, so that the streams of two seeds are not those of one, shifted by some pixels or samples.
-    a, b = mi.sample_tea_32(pixel, sample)
+    a, b = mi.sample_tea_32(a, b)
     a, b = mi.sample_tea_32(*(half ^ dr.opaque(mi.UInt32, key) for half, key in zip((a, b), keys, strict=True)))
     random = mi.PCG32()
     random.seed(mi.UInt64(a) | (mi.UInt64(b) << 32), mi.UInt64(b))
     return _stream_class(mi.variant())(random)
+
+
+def _key(seed: int, what: int) -> mi.UInt32:
+    """32 bits of a seed, others for each kind of streams."""
+    return dr.opaque(mi.UInt32, int(np.random.SeedSequence([seed, 1, what]).generate_state(1)[0]))
 
 
 @cache
@@ -64,3 +118,103 @@ def _stream_class(variant: str) -> type:
             dr.schedule(self.random)
 
     return Stream
+
+
+@cache
+def _sobol_class(variant: str) -> type:
+    """The same of Sobol points."""
+
+    class Points(mi.Sampler):
+        """Point ``index`` of each dimension from ``dimension`` on, scrambled by ``key``. Cloning replays them.
+
+        A pair of numbers takes two dimensions, of which the second is skipped: so pairs and single numbers can be
+        counted alike. Lanes that draw while others do not are ahead of them.
+        """
+
+        def __init__(self, index, key, dimension):
+            super().__init__(mi.Properties())
+            self.index, self.key, self.dimension = mi.UInt32(index), mi.UInt32(key), mi.UInt32(dimension)
+
+        def next_1d(self, active=True):
+            bits = self._scramble()
+            place = _owen(self.index, _mixed(bits))
+            self.dimension = dr.select(active, self.dimension + 1, self.dimension)
+            return _unit(_reversed_owen(place, _mixed(bits ^ 0x68BC21EB)))
+
+        def next_2d(self, active=True):
+            bits = self._scramble()
+            place = _owen(self.index, _mixed(bits))
+            x = _reversed_owen(place, _mixed(bits ^ 0x68BC21EB))
+            y = _reversed_owen(_pascal(place), _mixed(bits ^ 0x02E5BE93))
+            self.dimension = dr.select(active, self.dimension + 2, self.dimension)
+            return mi.Point2f(_unit(x), _unit(y))
+
+        def next_key(self):
+            """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
+            bits = _mixed(self._scramble() ^ _mixed(self.index + 0x967A889B))
+            self.dimension = self.dimension + 1
+            return bits
+
+        def skip(self, count):
+            """Leaves out so many numbers of each lane, UInt32."""
+            self.dimension = self.dimension + count
+
+        def clone(self):
+            return Points(self.index, self.key, self.dimension)
+
+        def at(self, lanes):
+            """The streams of these lanes alone."""
+            return Points(*(dr.gather(mi.UInt32, each, lanes) for each in (self.index, self.key, self.dimension)))
+
+        def schedule_state(self):
+            dr.schedule(self.index, self.key, self.dimension)
+
+        def _scramble(self):
+            return self.key ^ (self.dimension * 0x9E3779B1)
+
+    return Points
+
+
+def _mixed(x: mi.UInt32) -> mi.UInt32:
+    """Other bits for other numbers. [Wellons 2018, "Prospecting for hash functions", lowbias32]"""
+    x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
+    x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)
+    return x ^ (x >> 16)
+
+
+def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+    """Nested uniform scrambling of the digits of ``x``, the first of which is its lowest bit, as 32 bits in usual order.
+
+    Each bit is flipped by those below it. [Laine and Karras 2011, "Stratified sampling for stochastic transparency";
+    constants of Vegdahl 2021, "Building a better LK hash"]
+    """
+    # Not in place: that would change what the caller has.
+    x = x ^ (x * 0x3D20ADEA)
+    x = (x + seed) * ((seed >> 16) | 1)
+    x = x ^ (x * 0x05526C56)
+    x = x ^ (x * 0x53A22864)
+    return dr.brev(x)
+
+
+def _owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
+    """Nested uniform scrambling of ``x``: blocks of 2^n whole numbers from a multiple of 2^n on stay together."""
+    return _reversed_owen(dr.brev(x), seed)
+
+
+def _pascal(x: mi.UInt32) -> mi.UInt32:
+    """Sobol's second dimension, its first digit the lowest bit: Pascal's triangle modulo 2, times the bits of ``x``."""
+    for shift, kept in ((1, 0x55555555), (2, 0x33333333), (4, 0x0F0F0F0F), (8, 0x00FF00FF), (16, 0x0000FFFF)):
+        x = x ^ ((x >> shift) & kept)
+    return x
+
+
+def _apart(x: mi.UInt32) -> mi.UInt32:
+    """The bits of ``x``, up to 8, each with a gap behind it."""
+    for shift, kept in ((4, 0x0F0F), (2, 0x3333), (1, 0x5555)):
+        x = (x | x << shift) & kept
+    return x
+
+
+def _unit(bits: mi.UInt32) -> mi.Float:
+    """In [0, 1)."""
+    return mi.Float(bits >> 8) * 2.0**-24
