@@ -97,6 +97,7 @@ def render_adaptive(
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
     lane_bytes: int = LANE_BYTES,
+    independent: bool = False,
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 
@@ -118,7 +119,16 @@ def render_adaptive(
 
     most = None if spp is None else spp * pixels
     work = UnevenRender(
-        sample, sensor, seed, most, seconds=seconds, memory=memory, stop=stop, lane_bytes=lane_bytes, report=report
+        sample,
+        sensor,
+        seed,
+        most,
+        seconds=seconds,
+        memory=memory,
+        stop=stop,
+        lane_bytes=lane_bytes,
+        report=report,
+        independent=independent,
     )
     report()
     work.add(np.ones(pixels, int), whole=True)

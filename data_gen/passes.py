@@ -13,6 +13,7 @@ import mitsuba as mi
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
 
@@ -50,6 +51,7 @@ def render_passes(
     stop: Callable[[], bool] = lambda: False,
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
+    independent: bool = False,
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
@@ -61,7 +63,8 @@ def render_passes(
 
     How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
     takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
-    depends on the seed, the size and the number of samples alone. With a ``batch``, the samples of a pass depend on
+    depends on the seed, the size, the number of samples and ``spp`` alone: samples are points of a net of ``spp``, or,
+    where that is None, of rounds, unless they are to be ``independent``. With a ``batch``, the samples of a pass depend on
     each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
     ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` tells it where it is.
 
@@ -70,7 +73,8 @@ def render_passes(
     total = spp if spp is not None else 1 << 31
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
-    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead)
+    net = 0 if independent else first_round(spp)
+    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net)
     start = now = time.perf_counter()
 
     def report(finished: bool = False) -> None:
@@ -88,7 +92,7 @@ def render_passes(
         n = left if left < block else block * max(1, min(blocks, most, left // block))
         begin = now
         with recording():
-            sample(CameraSamples(sensor, seed, n, film.samples, min(n, block)), film)
+            sample(CameraSamples(sensor, seed, n, film.samples, min(n, block), net=net), film)
             film.end_pass(min(n, block))
         dr.sync_thread()
         now = time.perf_counter()
@@ -109,14 +113,15 @@ def film_within(
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     instead: Callable[[int], str] = _nothing,
+    net: int = 0,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 
-    ``instead`` is that of ``blocks_within``.
+    ``instead`` is that of ``blocks_within``, ``net`` that of ``CameraSamples``.
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     width, height = (int(n) for n in sensor.film().crop_size())
-    film = GradientFilm(width, height, batches=bool(batch))
+    film = GradientFilm(width, height, batches=bool(batch), net=net)
     block = batch or block_of_samples(film.pixels)
     most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
     return film, block, 1 if batch else most

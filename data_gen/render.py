@@ -12,8 +12,9 @@ from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
-from data_gen.samplers.registry import Entry
+from data_gen.samplers.registry import Entry, own
 from data_gen.scenes.facts import scene_facts
+from data_gen.scenes.lamps import weighed
 from ngpt.errors import NgptError
 from ngpt.io.exr import with_channels
 from ngpt.stack import GradientStack
@@ -66,12 +67,15 @@ def render_stack(
         check_adaptive(adaptive, entry, settings, spp)
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
-    sample, sensor, chosen = entry.make(scene, **settings, **more), scene.sensors()[0], {}
+    sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    if adaptive is None:
-        film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
-    else:
-        film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
+    limits["independent"] = settings["points"] == "independent"
+    with weighed(scene, settings["lamps"]):
+        sample = entry.make(scene, **own(settings), **more)
+        if adaptive is None:
+            film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
+        else:
+            film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
     if adaptive is not None:
         chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
     return stack_of(film, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))

@@ -13,6 +13,7 @@ from data_gen import passes
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, lanes_within, recording
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.streams import ROUND
 from data_gen.samplers.registry import LANE_BYTES
 
 # Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
@@ -26,7 +27,7 @@ class UnevenRender:
     all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
     wherever it is: the same samples in all give the same bits, whatever the passes and whatever ended it.
 
-    ``sample`` must take independent samples; see ``data_gen.passes.render_passes()`` for it, for ``memory`` (MiB) and
+    ``sample`` must take samples that do not depend on those of others; see ``data_gen.passes.render_passes()`` for it, for ``memory`` (MiB) and
     for ``stop``. ``report`` is called after each pass.
     """
 
@@ -42,9 +43,11 @@ class UnevenRender:
         stop: Callable[[], bool] = lambda: False,
         lane_bytes: int = LANE_BYTES,
         report: Callable[[], None] = lambda: None,
+        independent: bool = False,
     ):
         width, height = (int(n) for n in sensor.film().crop_size())
-        self.film = GradientFilm(width, height)
+        self.net = 0 if independent else ROUND
+        self.film = GradientFilm(width, height, net=self.net)
         self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
         self.blocks_left = (most or 1 << 62) // BLOCK
         # Raises NgptError where not even one row's worth fits.
@@ -96,7 +99,9 @@ class UnevenRender:
         within = np.arange(len(some)) - np.repeat(starts, blocks)
         first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
         with recording():
-            self.sample(CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some)), self.film)
+            self.sample(
+                CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), self.net), self.film
+            )
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()
         self.blocks_left -= len(some)

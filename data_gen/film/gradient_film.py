@@ -6,6 +6,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
@@ -28,6 +29,8 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
+# Per strand, of samples before: double means of 15 channels, and counts of all names
+_HALVES_BYTES = 15 * 8 + 10 * 8
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
@@ -43,13 +46,14 @@ class GradientFilm:
     A pass may hold samples of ``some`` pixels alone. Then pixels have samples in different numbers, and so have the two
     ends of a pair of pixels: each direction of a difference is a mean over the base paths of its own end.
 
-    Variances are over samples, which are taken for independent. Where those of a pass are not, because they share
+    Variances are over samples, which are taken for independent. If they are points of rounds, the first of which is
+    a ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where those of a pass are not, because they share
     photons, reservoirs or the state of a chain, or because lanes splat onto pixels of others, the film is made with
     ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over batches.
     """
 
-    def __init__(self, width: int, height: int, batches: bool = False):
-        self.width, self.height, self.batches = width, height, batches
+    def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
+        self.width, self.height, self.batches, self.net = width, height, batches, net
         self.pixels = width * height
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel; of those that were in all passes alone
@@ -58,7 +62,7 @@ class GradientFilm:
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
         # Dr.Jit gives each array the next power of two of bytes.
-        bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0)
+        bytes_each = _STRAND_BYTES + (_BATCH_BYTES if batches else 0) + (_HALVES_BYTES if net else 0)
         self.bytes = bytes_each * (1 << (self.pixels * self.strands - 1).bit_length())
         self.moments: dict[str, Moments] = {}
         self._pass: dict[str, tuple] = {}
@@ -125,9 +129,11 @@ class GradientFilm:
             pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
             strand, pixel = pixel // self.pixels, pixel % self.pixels
             behind = opaque(self.strands - self.blocks % self.strands)
-            first = ((strand + behind) % self.strands * self.pixels + pixel) * opaque(block)
-            dr.eval(first)
-            strands = Strands(first, opaque(lanes), opaque(block), opaque(self.strands * self.pixels * block))
+            turn = (strand + behind) % self.strands
+            first, number = (turn * self.pixels + pixel) * opaque(block), turn * opaque(block) + opaque(self.samples)
+            dr.eval(first, number)
+            stride, further = opaque(self.strands * self.pixels * block), opaque(self.strands * block)
+            strands = Strands(first, opaque(lanes), opaque(block), stride, number, further)
             for name, (components, active) in values.items():
                 self.moments[name] = accumulate(self._moments(name, len(components)), components, active, strands)
                 # One by one: the old moments and the new ones are in memory together.
@@ -151,10 +157,12 @@ class GradientFilm:
 
         # As in passes of all pixels, block b of a pixel goes to strand b mod strands.
         behind = of_job(self.strands - self._blocks_each[pixels] % self.strands)
-        first = (of_job(starts) + (strand + behind) % self.strands) * opaque(block)
+        turn = (strand + behind) % self.strands
+        first, number = ((of_job(n) + turn) * opaque(block) for n in (starts, self._blocks_each[pixels]))
         end, place = of_job((starts + blocks) * block), strand * self.pixels + of_job(pixels)
-        dr.eval(first, end, place)
-        strands = Strands(first, end, opaque(block), opaque(self.strands * block))
+        dr.eval(first, number, end, place)
+        further = opaque(self.strands * block)
+        strands = Strands(first, end, opaque(block), further, number, further)
         for name, (components, active) in values.items():
             old = self._moments(name, len(components))
             new = accumulate(taken(old, place), components, active, strands)
@@ -166,7 +174,7 @@ class GradientFilm:
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
         first = dr.arange(mi.UInt32, self.pixels) * opaque(spp)
-        strands = Strands(first, first + opaque(spp), opaque(spp), opaque(spp))
+        strands = Strands(first, first + opaque(spp), opaque(spp), opaque(spp), opaque(0), opaque(spp))
         for name in dict.fromkeys((*values, *splats)):
             mean, exists, lost = None, mi.Bool(True), mi.UInt32(0)
             if name in values:
@@ -179,7 +187,7 @@ class GradientFilm:
                 # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
-            moments = one_more(self._moments(name, len(mean)), mean, exists)
+            moments = one_more(self._moments(name, len(mean)), mean, exists, opaque(self.blocks))
             moments.lost += lost
             dr.eval(moments)
             self.moments[name] = moments
@@ -192,7 +200,8 @@ class GradientFilm:
     def _moments(self, name: str, channels: int) -> Moments:
         """The statistics so far of what is put under a name."""
         width = self.pixels * self.strands
-        return self.moments.get(name) or no_moments(width, channels, name in _WITH_VARIANCE)
+        variance = name in _WITH_VARIANCE
+        return self.moments.get(name) or no_moments(width, channels, variance, variance and self.net > 0)
 
     @property
     def discarded(self) -> int:
@@ -211,15 +220,15 @@ class GradientFilm:
         for name in self.moments:
             if name not in SHIFTS and name not in DIAGNOSTICS:
                 layers[name] = self._image(self._statistics(name)[1])
-        count, _, variance = self._statistics("primal")
-        variances = {"primal_var": self._image(variance)}
+        count = self._statistics("primal")[0]
+        variances = {"primal_var": self._claimed("primal")}
         if "caustic" in layers:
             # Samplers put it beside a primal without it, whose variance is the one that goes with dx and dy.
             layers["primal"] = layers["primal"] + layers["caustic"]
-            variances["caustic_var"] = self._image(self._statistics("caustic")[2])
+            variances["caustic_var"] = self._claimed("caustic")
         for layer in _SPLIT:
             if layer in layers:
-                variances[f"{layer}_var"] = self._image(self._statistics(layer)[2])
+                variances[f"{layer}_var"] = self._claimed(layer)
         for layer in DIFFERENCES:
             if f"{layer}+" in self.moments:
                 layers[layer], variances[f"{layer}_var"] = self._gradient(layer)
@@ -283,11 +292,46 @@ class GradientFilm:
         _, one, one_var = self._statistics(f"{layer}+")
         if f"{layer}-" not in self.moments:
             gradient[behind], variance[behind] = self._image(one)[behind], self._image(one_var)[behind]
-            return gradient, variance
+            return gradient, self._as_seen(variance, [(f"{layer}+", behind, 1.0)])
         _, other, other_var = self._statistics(f"{layer}-")
         gradient[behind] = 0.5 * (self._image(one)[behind] - self._image(other)[ahead])
         variance[behind] = 0.25 * (self._image(one_var)[behind] + self._image(other_var)[ahead])
-        return gradient, variance
+        return gradient, self._as_seen(variance, [(f"{layer}+", behind, 0.5), (f"{layer}-", ahead, -0.5)])
+
+    def _claimed(self, name: str) -> np.ndarray:
+        """The variance of the pixel mean of what is put under a name."""
+        return self._as_seen(self._image(self._statistics(name)[2]), [(name, np.s_[:, :], 1.0)])
+
+    def _as_seen(self, variance: np.ndarray, terms: list[tuple[str, tuple, float]]) -> np.ndarray:
+        """A sample ``variance`` (H, W, 3), brought to the noise that is seen where samples are points of nets; of the
+        sum of ``terms``: name, which pixels, factor."""
+        if not self.net:
+            return variance
+        seen = sum(factor * self._image(self._halves(name))[pixels] for name, pixels, factor in terms)
+        n = int(self.samples_each.max())
+        of_one_net = (self.blocks if self.batches else n) if n <= self.net else 0
+        return variance * claims.factor(seen, variance[terms[0][1]], of_one_net)
+
+    def _halves(self, name: str) -> np.ndarray:
+        """The later samples of each pixel against the earlier ones, (pixels, C): what has the variance of the mean as
+        its expected square where both are independent."""
+        moments, shape = self.moments[name], (self.strands, self.pixels)
+        counts, earlier, bits = (
+            np.array(field, np.int64).reshape(shape) for field in (moments.count, moments.earlier, moments.bits)
+        )
+        # Strands that have no sample of the last part have all of theirs before it.
+        old = bits < bits.max(axis=0)
+        earlier = np.where(old, counts, earlier)
+        n, n1 = counts.sum(axis=0), earlier.sum(axis=0)
+        columns = []
+        with np.errstate(invalid="ignore", divide="ignore"):
+            for mean, before in zip(moments.mean, moments.before, strict=True):
+                means, befores = np.array(mean).reshape(shape), np.array(before).reshape(shape)
+                befores = np.where(old, means, befores)
+                first = (earlier * befores).sum(axis=0) / n1
+                # last - first, times sqrt(n1 (n - n1)) / n
+                columns.append(((counts * means).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
+        return np.stack(columns, axis=-1)
 
     def _image(self, columns: np.ndarray) -> np.ndarray:
         return columns.reshape(self.height, self.width, -1)

@@ -20,17 +20,24 @@ class Moments:
     lost: mi.UInt32  # samples left out because they were not finite
     mean: list
     m2: list  # sum of squared deviations from the mean; empty where nobody asks for a variance
+    # Of samples before the last one whose number is a power of two (see ``data_gen.film.claims``): how many, their
+    # mean, which is empty where nobody asks for it, and how many bits the number of the last sample has
+    earlier: mi.UInt32
+    before: list
+    bits: mi.UInt32
 
 
-def no_moments(width: int, channels: int, variance: bool) -> Moments:
-    """The statistics of no sample, for ``width`` strands."""
+def no_moments(width: int, channels: int, variance: bool, halves: bool = False) -> Moments:
+    """The statistics of no sample, for ``width`` strands; with ``halves``, also of those ``before``."""
     Float64 = dr.float64_array_t(mi.Float)
-    mean, m2 = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(2))
-    return Moments(dr.zeros(mi.UInt32, width), dr.zeros(mi.UInt32, width), mean, m2 if variance else [])
+    mean, m2, before = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(3))
+    count, lost, earlier, bits = (dr.zeros(mi.UInt32, width) for _ in range(4))
+    return Moments(count, lost, mean, m2 if variance else [], earlier, before if halves else [], bits)
 
 
-def one_more(old: Moments, x: list, exists) -> Moments:
-    """The statistics with one more sample ``x`` for each strand where it ``exists``; one that is not finite is lost."""
+def one_more(old: Moments, x: list, exists, number: mi.UInt32) -> Moments:
+    """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``; one
+    that is not finite is lost."""
     Float64 = dr.float64_array_t(mi.Float)
     finite = dr.all([dr.isfinite(component) for component in x])
     good = exists & finite
@@ -41,31 +48,45 @@ def one_more(old: Moments, x: list, exists) -> Moments:
     mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
     # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
     m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
-    return Moments(count, lost, mean, m2)
+    if not old.before:
+        return Moments(count, lost, mean, m2, old.earlier, [], old.bits)
+    bits = 32 - dr.lzcnt(number)
+    begins = bits != old.bits
+    earlier = dr.select(begins, old.count, old.earlier)
+    before = [dr.select(begins, m, b) for m, b in zip(old.mean, old.before, strict=True)]
+    return Moments(count, lost, mean, m2, earlier, before, bits)
 
 
 @dataclass
 class Strands:
-    """Which samples each strand takes: ``block`` from ``first`` on, again ``stride`` later, all before ``end``."""
+    """Which samples each strand takes: ``block`` from ``first`` on, again ``stride`` later, all before ``end``.
+
+    The first has a ``number`` in its pixel, and the first of its next block one that is ``further`` on.
+    """
 
     first: mi.UInt32
     end: mi.UInt32
     block: mi.UInt32
     stride: mi.UInt32
+    number: mi.UInt32
+    further: mi.UInt32
 
 
 def accumulate(moments: Moments, components: list, active, strands: Strands) -> Moments:
     """Adds samples to each strand's moments."""
     first, end, block, stride = strands.first, strands.end, strands.block, strands.stride
 
-    def add(i: mi.UInt32, n: mi.UInt32, old: Moments):
+    def add(i: mi.UInt32, n: mi.UInt32, number: mi.UInt32, old: Moments):
         x = [dr.gather(mi.Float, component, i) for component in components]
         exists = mi.Bool(True) if active is True else dr.gather(mi.Bool, active, i)
         last = n + 1 == block
         # Not in place: that would move `first` too.
-        return i + dr.select(last, stride - block + 1, 1), dr.select(last, 0, n + 1), one_more(old, x, exists)
+        next_number = number + dr.select(last, strands.further - block + 1, 1)
+        new = one_more(old, x, exists, number)
+        return i + dr.select(last, stride - block + 1, 1), dr.select(last, 0, n + 1), next_number, new
 
-    return dr.while_loop((first, mi.UInt32(0), moments), lambda i, *_: i < end, add, label="film")[2]
+    state = (first, mi.UInt32(0), mi.UInt32(strands.number), moments)
+    return dr.while_loop(state, lambda i, *_: i < end, add, label="film")[3]
 
 
 def taken(moments: Moments, place: mi.UInt32) -> Moments:
@@ -74,7 +95,8 @@ def taken(moments: Moments, place: mi.UInt32) -> Moments:
     def gather(values: list) -> list:
         return [dr.gather(type(value), value, place) for value in values]
 
-    return Moments(*gather([moments.count, moments.lost]), gather(moments.mean), gather(moments.m2))
+    counts = gather([moments.count, moments.lost, moments.earlier, moments.bits])
+    return _of(counts, gather(moments.mean), gather(moments.m2), gather(moments.before))
 
 
 def put_back(moments: Moments, some: Moments, place: mi.UInt32) -> Moments:
@@ -86,5 +108,14 @@ def put_back(moments: Moments, some: Moments, place: mi.UInt32) -> Moments:
         dr.eval(values)
         return values
 
-    counts = scatter([moments.count, moments.lost], [some.count, some.lost])
-    return Moments(*counts, scatter(moments.mean, some.mean), scatter(moments.m2, some.m2))
+    counts = scatter(
+        [moments.count, moments.lost, moments.earlier, moments.bits], [some.count, some.lost, some.earlier, some.bits]
+    )
+    return _of(
+        counts, scatter(moments.mean, some.mean), scatter(moments.m2, some.m2), scatter(moments.before, some.before)
+    )
+
+
+def _of(counts: list, mean: list, m2: list, before: list) -> Moments:
+    count, lost, earlier, bits = counts
+    return Moments(count, lost, mean, m2, earlier, before, bits)

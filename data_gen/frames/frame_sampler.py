@@ -61,7 +61,7 @@ class Remembering:
         if self._sampler is None:
             if reason := self.entry.refuses(scene_facts(scene)):
                 raise NgptError(f"sampler '{self.entry.name}' cannot render this scene: {reason}; use --sampler gpt")
-            self._sampler = self.entry.make(scene, self.seed, self.spp, self.memory, **self.options)
+            self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
         stack = stack_of(film, self.seed, self.entry.name, start, self.diagnostics, more)

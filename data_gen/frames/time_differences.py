@@ -42,7 +42,8 @@ def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None
     for first in range(0, spp, each):
         count = min(each, spp - first)
         with recording():
-            camera = CameraSamples(sensor, seed, count, first)
+            # Independent samples, for the variance of which batches are taken
+            camera = CameraSamples(sensor, seed, count, first, net=0)
             ray, importance, active = camera.rays((0, 0) if motion is None else _partners(camera, motion))
             L = estimate(camera.random.clone(), ray, medium, active)
             L -= emission_seen(scene, integrator, medium, ray, active)

@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.streams import sample_streams
+from data_gen.paths.streams import ROUND, sample_streams
 
 # As in ``data_gen.passes``: rays of lanes side by side are traced together.
 _PACKET = 16
@@ -24,7 +24,7 @@ class CameraSamples:
     its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them, which is what
     correlates a path with its shifted copies.
 
-    ``points`` are "sobol" or "independent": see ``data_gen.paths.streams``.
+    ``net`` is the size of the first round of points, or 0: independent samples. See ``data_gen.paths.streams``.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """
@@ -37,9 +37,9 @@ class CameraSamples:
         first: int | mi.UInt32 = 0,
         block: int | None = None,
         some: mi.UInt32 | None = None,
-        points: str = "sobol",
+        net: int = ROUND,
     ):
-        self.sensor, self.seed, self.first, self.points = sensor, seed, first, points
+        self.sensor, self.seed, self.first, self.net = sensor, seed, first, net
         self.size = mi.ScalarVector2u(sensor.film().crop_size())
         self.pixels = int(dr.prod(self.size)) if some is None else dr.width(some)
         lane = dr.arange(mi.UInt32, self.pixels * spp)
@@ -53,7 +53,7 @@ class CameraSamples:
             pixel, first = dr.gather(mi.UInt32, some, pixel), dr.gather(mi.UInt32, first, pixel)
         self.pixel = pixel
         self.sample = lane // in_block * in_pixel + lane % in_pixel + first
-        self._draw(seed, pixel, self.sample, points)
+        self._draw(seed, pixel, self.sample, net)
         corner = mi.Point2f(pixel % self.size.x, pixel // self.size.x)
         self.position = corner + self.position
         dr.schedule(self.position, self.lens, self.time, self.wavelength)
@@ -62,18 +62,18 @@ class CameraSamples:
 
     @classmethod
     def replayed(
-        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, points: str = "sobol"
+        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, net: int = ROUND
     ) -> Self:
         """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
         camera = cls.__new__(cls)
         camera.sensor, camera.size, camera.pixel = sensor, mi.ScalarVector2u(sensor.film().crop_size()), pixel
-        camera._draw(seed, pixel, sample, points)
+        camera._draw(seed, pixel, sample, net)
         camera.position = place
         return camera
 
-    def _draw(self, seed: int, pixel: mi.UInt32, sample: mi.UInt32, points: str) -> None:
+    def _draw(self, seed: int, pixel: mi.UInt32, sample: mi.UInt32, net: int) -> None:
         """All random numbers of a camera sample; ``position`` is that within the pixel."""
-        self.random = sample_streams(seed, pixel, sample, self.size.x, points)
+        self.random = sample_streams(seed, pixel, sample, int(self.size.x), net)
         self.position = self.random.next_2d()
         self.lens = self.random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
         self.time = self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d()

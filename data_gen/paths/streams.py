@@ -10,8 +10,8 @@ uniform, so that all estimates stay unbiased; but samples are independent no mor
 - Pixels are numbered in Z order, and a pixel's points are side by side, so that the points of aligned blocks of pixels
   are well spread together, too. [Ahmed and Wonka 2020, "Screen-space blue-noise diffusion of Monte Carlo sampling error
   via hierarchical ordering of pixels"] This holds within tiles of 64x64 pixels, which are independent of each other.
-- How many samples there will be is not known, so they come in *rounds*, each as large as all before together: 4, 4, 8,
-  16 ... samples of each pixel. Rounds are independent of each other, which is what ``film`` tells the noise by.
+- Samples come in *rounds*: the first has as many as are asked for, or 16 where that is not known, and each further one
+  as many as there are before it. Rounds are independent of each other.
 - Light paths that are no pixel's own are numbered as they come in a pass; passes are independent of each other.
 """
 
@@ -23,27 +23,33 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-# Samples of a pixel in the first round, a power of two
-FIRST_ROUND = 4
+# Samples of a pixel in the first round, where it is not known how many there will be
+ROUND = 16
 # Of a round at most, as a power of two: with the pixels of a tile, 32 bits number its points.
 _LARGEST = 20
 # Side of a tile of pixels, as a power of two
 _TILE = 6
 
 
-def sample_streams(
-    seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int | mi.UInt32 = 0, points: str = "independent"
-) -> mi.Sampler:
-    """A sampler whose lanes are the streams of sample ``sample`` of pixel ``pixel``, of an image of that ``width``.
+def first_round(samples: int | None) -> int:
+    """Samples of a pixel in the first round, a power of two, where so many are asked for (None: not known)."""
+    return ROUND if samples is None else 1 << min((samples - 1).bit_length(), _LARGEST)
 
-    ``seed`` is any integer from 0; ``points`` "sobol" or "independent", which needs no ``width``. Mitsuba's own sampler
+
+def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 0, net: int = 0) -> mi.Sampler:
+    """A sampler whose lanes are the streams of sample ``sample`` of pixel ``pixel``.
+
+    ``seed`` is any integer from 0. With a ``net`` they are points in an image of that ``width``, the first round of
+    which has ``net`` samples of each pixel, a power of two; without, they are independent. Mitsuba's own sampler
     numbers the lanes of a pass instead, so its numbers change with the size of passes, and with them the image.
     """
-    if points == "independent":
+    if not net:
         return _independent(seed, pixel, sample)
-    bits = 31 - dr.lzcnt(sample | (FIRST_ROUND - 1))
-    bits = dr.minimum(dr.select(sample < FIRST_ROUND, FIRST_ROUND.bit_length() - 1, bits), _LARGEST)
-    first = dr.select(sample < FIRST_ROUND, 0, sample >> bits << bits)
+    width, net = (dr.opaque(mi.UInt32, n) for n in (width, net))
+    bits = dr.minimum(31 - dr.lzcnt(dr.maximum(sample, net)), _LARGEST)
+    # A number of the first round has as many bits as the last of the round, or fewer.
+    bits = dr.select(sample < net, 31 - dr.lzcnt(net), bits)
+    first = dr.select(sample < net, 0, sample >> bits << bits)
     x, y = pixel % width, pixel // width
     within = (1 << _TILE) - 1
     number = _apart(x & within) | _apart(y & within) << 1
@@ -52,10 +58,10 @@ def sample_streams(
     return _sobol_class(mi.variant())(number << bits | sample - first, key, dr.zeros(mi.UInt32, dr.width(key)))
 
 
-def light_streams(seed: int, number: mi.UInt32, turn: int, points: str = "sobol") -> mi.Sampler:
+def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = False) -> mi.Sampler:
     """The streams of the light paths ``number`` of a pass, which has number ``turn``; none are those of pixels."""
     turn = dr.opaque(mi.UInt32, turn)
-    if points == "independent":
+    if independent:
         return _independent(seed, number, turn, of_lights=True)
     key = _mixed(turn ^ _key(seed, 1)) + dr.zeros(mi.UInt32, dr.width(number))
     return _sobol_class(mi.variant())(number, key, dr.zeros(mi.UInt32, dr.width(number)))

@@ -17,6 +17,7 @@ from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
+from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
@@ -70,7 +71,10 @@ class GradientIntegrator(mi.SamplingIntegrator):
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
         entry = SAMPLERS[self.name]
-        return render_passes(self.prepare(scene), sensor, seed, spp, lane_bytes=entry.lane_bytes, batch=entry.batch)
+        limits = {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
+        independent = self.options["points"] == "independent"
+        with weighed(scene, self.options["lamps"]):
+            return render_passes(self.prepare(scene), sensor, seed, spp, independent=independent, **limits)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""

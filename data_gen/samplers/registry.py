@@ -39,6 +39,21 @@ def _from_module(module: str) -> Callable[..., Any]:
     return lambda *args, **options: import_module(module).make(*args, **options)
 
 
+# What every sampler takes beside its own options, and its ``make`` does not see: ``data_gen.render`` does it.
+COMMON = {
+    "points": Option(
+        "sobol",
+        "of the random numbers: Sobol points in Z order of pixels, or independent ones (more noise)",
+        choices=("sobol", "independent"),
+    ),
+    "lamps": Option(
+        "power",
+        "how often each is chosen, where the scene leaves that open: by what it brings, or all alike",
+        choices=("power", "uniform"),
+    ),
+}
+
+
 @dataclass(frozen=True)
 class Entry:
     """What all samplers have.
@@ -48,7 +63,7 @@ class Entry:
     ``module``    where its function ``make`` is, and its Mitsuba classes, which are made anew with each variant
     ``make``      what makes it, where there is no ``module``
     ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
-    ``options``   name -> ``Option``; ``make`` takes all of them
+    ``options``   name -> ``Option``, those of ``COMMON`` included; ``make`` takes all others
     ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
     ``notes``     facts about a scene -> what the user should know about rendering it, a line each
     """
@@ -67,6 +82,7 @@ class Entry:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
         if self.module:
             object.__setattr__(self, "make", _from_module(self.module))
+        object.__setattr__(self, "options", {**self.options, **COMMON})
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """All options, those ``given``, which may be texts, and the others' defaults.
@@ -81,7 +97,12 @@ class Entry:
 
     def made(self, *args: Any, **options: Any) -> Any:
         """What ``make`` makes, with ``options`` that may be texts, and the others' defaults; raises NgptError."""
-        return self.make(*args, **self.settings(options))
+        return self.make(*args, **own(self.settings(options)))
+
+
+def own(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """The ``settings`` that are a sampler's own."""
+    return {name: value for name, value in settings.items() if name not in COMMON}
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import mitsuba as mi
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.light_ends import LightEnds, LightRay
-from data_gen.paths.streams import sample_streams
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.streams import light_streams
 from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
 from data_gen.samplers.common import GradientIntegrator
@@ -29,8 +30,6 @@ CAMERA_BYTES = 256
 MEDIA_MAP_BYTES = MAP_BYTES + VERTICES_PER_PATH * 2 * 8 + 2 * 8
 # More of it with grids: null collisions of each vertex, twice; and Φ / σs
 GRID_BYTES = VERTICES_PER_PATH * (3 + 3 + 3) * 4
-# The streams of light paths are made from random numbers of the camera's samples and this.
-_LIGHT_PATHS = 0x9807
 
 
 @dataclass
@@ -95,17 +94,14 @@ class PhotonIntegrator(GradientIntegrator):
         world = World(scene, lights, materials, fog)
         return Passes(self, world, pixel_width(scene), self.walk and self.walk(self, world))
 
-    def maps(self, passes: Passes, keys: tuple, number: int) -> Iterator[Traced]:
-        """The photon maps of pass ``number``: of ``photons`` light paths for each lane of the ``keys``."""
+    def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
+        """The photon maps of the pass: of ``photons`` light paths for each sample of the ``camera``."""
         world, limits = passes.world, self.limits
         if world.lights.emitters is None or limits.max_depth <= 1:
             return
-        n = dr.width(keys[0]) * self.photons
-        lane = dr.arange(mi.UInt32, n)
-        sample = lane // dr.opaque(mi.UInt32, self.photons)
-        key, other = (dr.gather(mi.UInt32, k, sample) for k in keys)
-        random = sample_streams(_LIGHT_PATHS, key, other ^ (lane % dr.opaque(mi.UInt32, self.photons)))
+        n = dr.width(camera.pixel) * self.photons
+        random = light_streams(camera.seed, dr.arange(mi.UInt32, n), camera.first, independent=not camera.net)
         edges = self.edges and world.fog is not None
         starts, maps = trace(world, random, limits.max_depth - 1, limits.rr_depth, frozen=passes.frozen, edges=edges)
         for photons in maps:
-            yield Traced(photons, starts, n, number, self.options["radius"] * passes.width)
+            yield Traced(photons, starts, n, camera.first, self.options["radius"] * passes.width)

@@ -58,18 +58,15 @@ class Begun:
     """What a pass begins with."""
 
     start: Start
-    keys: tuple[mi.UInt32, mi.UInt32]  # any bits, of which the random numbers of light paths are made
     features: dict  # layers of the film
 
     @classmethod
     def of(cls, passes: Passes, camera: CameraSamples) -> Begun:
         ray, importance, _ = camera.rays()
         random = camera.random.clone()
-        keys = random.next_key(), random.next_key()
-        random.schedule_state()
-        dr.eval(ray, importance, keys)
+        dr.eval(ray, importance)
         layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
-        return cls(Start(ray, importance, random), keys, layers)
+        return cls(Start(ray, importance, random), layers)
 
 
 def refuse_variants(sampler: str) -> None:

@@ -65,7 +65,7 @@ def gradient_pass(passes: Passes, camera: CameraSamples, film: GradientFilm, nea
         longest = dr.opaque(mi.UInt32, integrator.limits.max_depth) - level.depth
         dr.eval(longest)
         together = [dr.zeros(type(total), dr.width(level.lanes)) for total in sums]
-        for traced in integrator.maps(passes, begun.keys, camera.first):
+        for traced in integrator.maps(passes, camera):
             for gathered in near(passes, traced):
                 for part in parts(passes, gathered, level, longest, pairs * n):
                     together = [total + value for total, value in zip(together, part, strict=True)]

@@ -143,7 +143,7 @@ def beside_rays(passes: Passes, traced: Traced) -> Iterator[Along]:
 def media_pass(integrator, passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable) -> None:
     """``image_pass()`` of what is ``near`` (passes, map), where there are media; else of photons on surfaces."""
     begun = Begun.of(passes, camera)
-    maps = integrator.maps(passes, begun.keys, camera.first)
+    maps = integrator.maps(passes, camera)
     if passes.world.fog is None:
         gathered = (Gathering(traced, integrator.limits.max_depth) for traced in maps)
     else:

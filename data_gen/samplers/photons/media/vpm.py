@@ -102,7 +102,7 @@ class VPM(PhotonIntegrator):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         begun = Begun.of(passes, camera)
-        maps = self.maps(passes, begun.keys, camera.first)
+        maps = self.maps(passes, camera)
         image_pass(passes, begun, (self.near(passes.world.fog, traced) for traced in maps), self.light, film)
 
     def near(self, fog: Fog | None, traced: Traced) -> Gathering | InBoth:

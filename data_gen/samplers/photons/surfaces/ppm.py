@@ -96,7 +96,7 @@ class PPM(PhotonIntegrator):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         begun = Begun.of(passes, camera)
-        near = (Gathering(traced, self.limits.max_depth) for traced in self.maps(passes, begun.keys, camera.first))
+        near = (Gathering(traced, self.limits.max_depth) for traced in self.maps(passes, camera))
         image_pass(passes, begun, near, self.light, film)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
