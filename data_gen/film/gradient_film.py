@@ -310,7 +310,10 @@ class GradientFilm:
         seen = sum(factor * self._image(self._halves(name))[pixels] for name, pixels, factor in terms)
         n = int(self.samples_each.max())
         of_one_net = (self.blocks if self.batches else n) if n <= self.net else 0
-        return variance * claims.factor(seen, variance[terms[0][1]], of_one_net)
+        where = terms[0][1]
+        claimed = variance.copy()
+        claimed[where] *= claims.factors(seen, variance[where], of_one_net)
+        return claimed
 
     def _halves(self, name: str) -> np.ndarray:
         """The later samples of each pixel against the earlier ones, (pixels, C): what has the variance of the mean as

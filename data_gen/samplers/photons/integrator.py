@@ -11,8 +11,8 @@ import mitsuba as mi
 
 from data_gen.passes import SamplePass
 from data_gen.paths import media
-from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.light_ends import LightEnds, LightRay
 from data_gen.paths.streams import light_streams
 from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
