@@ -97,7 +97,7 @@ def render_adaptive(
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
     lane_bytes: int = LANE_BYTES,
-    independent: bool = False,
+    points: str = "sobol",
 ) -> tuple[GradientFilm, dict]:
     """The film, and attributes that say what its samples were chosen for.
 
@@ -128,7 +128,7 @@ def render_adaptive(
         stop=stop,
         lane_bytes=lane_bytes,
         report=report,
-        independent=independent,
+        points=points,
     )
     report()
     work.add(np.ones(pixels, int), whole=True)

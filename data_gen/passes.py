@@ -51,7 +51,7 @@ def render_passes(
     stop: Callable[[], bool] = lambda: False,
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
-    independent: bool = False,
+    points: str = "sobol",
 ) -> GradientFilm:
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
@@ -63,9 +63,9 @@ def render_passes(
 
     How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
     takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
-    depends on the seed, the size, the number of samples and ``spp`` alone: samples are points of a net of ``spp``, or,
-    where that is None, of rounds, unless they are to be ``independent``. With a ``batch``, the samples of a pass depend on
-    each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
+    depends on the seed, the size, the number of samples and ``spp`` alone: of that goes the first round of the
+    ``points``, see ``data_gen.paths.streams.first_round``. With a ``batch``, the samples of a pass depend
+    on each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
     ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` tells it where it is.
 
     Raises NgptError where one block of samples does not fit into ``memory``.
@@ -73,7 +73,7 @@ def render_passes(
     total = spp if spp is not None else 1 << 31
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
-    net = 0 if independent else first_round(spp)
+    net = first_round(points, spp)
     film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net)
     start = now = time.perf_counter()
 

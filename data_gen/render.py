@@ -49,7 +49,8 @@ def render_stack(
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
 
-    The same seed and number of samples give the same bits, however they came about. Raises NgptError for options that
+    The same seed, options and number of samples give the same bits, however they came about; where ``spp`` does not say
+    how many there will be, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. Raises NgptError for options that
     do not exist or make no sense, and for a scene that the sampler cannot render.
     """
     check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
@@ -69,7 +70,9 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    limits["independent"] = settings["points"] == "independent"
+    if settings["points"] == "sobol" and (spp is None or adaptive is not None):
+        settings["points"] = "rounds"
+    limits["points"] = settings["points"]
     with weighed(scene, settings["lamps"]):
         sample = entry.make(scene, **own(settings), **more)
         if adaptive is None:

@@ -13,7 +13,7 @@ from data_gen import passes
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, lanes_within, recording
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.streams import ROUND
+from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import LANE_BYTES
 
 # Samples of a pixel come in blocks of a packet of rays, so that no pixel's bits depend on which others are rendered.
@@ -27,8 +27,8 @@ class UnevenRender:
     all that get two, and so on. ``most`` samples, a time of ``seconds`` or ``stop`` cut the sequence
     wherever it is: the same samples in all give the same bits, whatever the passes and whatever ended it.
 
-    ``sample`` must take samples that do not depend on those of others; see ``data_gen.passes.render_passes()`` for it, for ``memory`` (MiB) and
-    for ``stop``. ``report`` is called after each pass.
+    ``sample`` must take samples that do not share anything; see ``data_gen.passes.render_passes()`` for it, for
+    ``memory`` (MiB) and for ``stop``. ``report`` is called after each pass.
     """
 
     def __init__(
@@ -43,10 +43,10 @@ class UnevenRender:
         stop: Callable[[], bool] = lambda: False,
         lane_bytes: int = LANE_BYTES,
         report: Callable[[], None] = lambda: None,
-        independent: bool = False,
+        points: str = "sobol",
     ):
         width, height = (int(n) for n in sensor.film().crop_size())
-        self.net = 0 if independent else ROUND
+        self.net = first_round(points, None)
         self.film = GradientFilm(width, height, net=self.net)
         self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
         self.blocks_left = (most or 1 << 62) // BLOCK

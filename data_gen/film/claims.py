@@ -53,8 +53,8 @@ def factors(seen: np.ndarray, variance: np.ndarray, of_one_net: int) -> np.ndarr
 def _of_one_net(ratio: float, n: int) -> float:
     """The factor where both halves are of one net, and the ``ratio`` is that of halves which are not independent.
 
-    Were the variance of n points c / n^a, halves of a net would differ by 4 c (2^a - 1) / n^a in the mean square, and the
-    ratio would be (2^a - 1)(n - 1) / (n^a - 1), which falls with a from 1 on. The factor is n^(1 - a).
+    Were the variance of n points c / n^a, halves of a net would differ by 4 c (2^a - 1) / n^a in the mean square, and
+    the ratio would be (2^a - 1)(n - 1) / (n^a - 1), which falls with a from 1 on. The factor is n^(1 - a).
     """
     if n < 3 or ratio >= 1:
         return min(ratio, 1.0)

@@ -46,10 +46,11 @@ class GradientFilm:
     A pass may hold samples of ``some`` pixels alone. Then pixels have samples in different numbers, and so have the two
     ends of a pair of pixels: each direction of a difference is a mean over the base paths of its own end.
 
-    Variances are over samples, which are taken for independent. If they are points of rounds, the first of which is
-    a ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where those of a pass are not, because they share
-    photons, reservoirs or the state of a chain, or because lanes splat onto pixels of others, the film is made with
-    ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over batches.
+    Variances are over samples, which are taken for independent. If they are points of rounds, the first of which is a
+    ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where
+    samples of a pass share photons, reservoirs or the state of a chain, or lanes splat onto pixels of others, the film
+    is made with ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over
+    batches.
     """
 
     def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):

@@ -31,9 +31,16 @@ _LARGEST = 20
 _TILE = 6
 
 
-def first_round(samples: int | None) -> int:
-    """Samples of a pixel in the first round, a power of two, where so many are asked for (None: not known)."""
-    return ROUND if samples is None else 1 << min((samples - 1).bit_length(), _LARGEST)
+def first_round(points: str, samples: int | None) -> int:
+    """Samples of a pixel in the first round, a power of two, or 0 where they are independent.
+
+    ``points`` "sobol" has as many as are asked for (None: not known), "rounds" always 16, "independent" none.
+    """
+    if points == "independent":
+        return 0
+    if points == "rounds" or samples is None:
+        return ROUND
+    return 1 << min((samples - 1).bit_length(), _LARGEST)
 
 
 def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 0, net: int = 0) -> mi.Sampler:
@@ -189,7 +196,7 @@ def _mixed(x: mi.UInt32) -> mi.UInt32:
 
 
 def _reversed_owen(x: mi.UInt32, seed: mi.UInt32) -> mi.UInt32:
-    """Nested uniform scrambling of the digits of ``x``, the first of which is its lowest bit, as 32 bits in usual order.
+    """Nested uniform scrambling of the digits of ``x``, the first of which is its lowest bit; bits in usual order.
 
     Each bit is flipped by those below it. [Laine and Karras 2011, "Stratified sampling for stochastic transparency";
     constants of Vegdahl 2021, "Building a better LK hash"]

@@ -71,10 +71,9 @@ class GradientIntegrator(mi.SamplingIntegrator):
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
         entry = SAMPLERS[self.name]
-        limits = {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
-        independent = self.options["points"] == "independent"
+        limits = {"lane_bytes": entry.lane_bytes, "batch": entry.batch, "points": self.options["points"]}
         with weighed(scene, self.options["lamps"]):
-            return render_passes(self.prepare(scene), sensor, seed, spp, independent=independent, **limits)
+            return render_passes(self.prepare(scene), sensor, seed, spp, **limits)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""

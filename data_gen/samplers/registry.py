@@ -43,8 +43,8 @@ def _from_module(module: str) -> Callable[..., Any]:
 COMMON = {
     "points": Option(
         "sobol",
-        "of the random numbers: Sobol points in Z order of pixels, or independent ones (more noise)",
-        choices=("sobol", "independent"),
+        "of random numbers: Sobol's, in rounds where --spp does not say how many, or independent ones (more noise)",
+        choices=("sobol", "rounds", "independent"),
     ),
     "lamps": Option(
         "power",

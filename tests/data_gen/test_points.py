@@ -1,0 +1,287 @@
+"""Points: nets of pixels and of blocks, uniform and independent where they must be, and less noise than without."""
+
+import numpy as np
+import pytest
+from scipy.stats import kstest
+from unbiased import load
+
+SIDE = 16
+
+
+@pytest.fixture
+def streams(renderer):
+    from data_gen.paths import streams
+
+    return streams
+
+
+def of_image(mi, streams, samples, first=0, net=16, seed=3):
+    """Streams of some samples of each pixel of a SIDE x SIDE image, pixel by pixel."""
+    import drjit as dr
+
+    lane = dr.arange(mi.UInt32, SIDE * SIDE * samples)
+    return streams.sample_streams(seed, lane // samples, lane % samples + first, SIDE, net)
+
+
+def pairs(stream, samples):
+    """The next pair of numbers, (SIDE, SIDE, samples, 2)."""
+    return np.array(stream.next_2d()).T.reshape(SIDE, SIDE, samples, 2)
+
+
+def fills(points):
+    """Whether each box of area 1 / n, of any shape that is a power of two each way, has one of the n points."""
+    n = len(points)
+    for k in range(n.bit_length()):
+        i, j = np.floor(points * [1 << k, n >> k]).astype(int).T
+        if len(set(zip(i, j, strict=True))) < n:
+            return False
+    return True
+
+
+@pytest.mark.parametrize(("net", "first", "n"), [(16, 0, 16), (4, 0, 4), (16, 16, 16), (4, 8, 8), (64, 0, 64)])
+def test_a_round_is_a_net_of_each_pixel_and_of_each_aligned_block(renderer, streams, net, first, n):
+    stream = of_image(renderer, streams, n, first, net)
+    for _ in range(3):
+        points = pairs(stream, n)
+        assert all(fills(points[y, x]) for y in (0, 5) for x in (0, 9))
+        assert fills(points[4:6, 8:10].reshape(-1, 2))
+        assert fills(points[8:12, 4:8].reshape(-1, 2))
+        assert not fills(points[1:3, 8:10].reshape(-1, 2))  # not aligned
+
+
+def test_single_numbers_are_stratified_too(renderer, streams):
+    numbers = np.array(of_image(renderer, streams, 16).next_1d()).reshape(-1, 16)
+    assert (np.sort(np.floor(numbers * 16), axis=1) == np.arange(16)).all()
+
+
+def test_each_point_is_uniform_over_seeds(renderer, streams):
+    found = [pairs(of_image(renderer, streams, 4, seed=seed), 4) for seed in range(64)]
+    for sample in range(4):
+        numbers = np.array([points[3, 11, sample] for points in found])
+        # Corrected for eight tests
+        assert min(kstest(numbers[:, 0], "uniform").pvalue, kstest(numbers[:, 1], "uniform").pvalue) > 0.01 / 8
+    everything = np.concatenate([points.reshape(-1, 2) for points in found])
+    assert np.allclose(everything.mean(axis=0), 0.5, atol=1e-3)
+    assert everything.min() >= 0
+    assert everything.max() < 1
+
+
+def test_dimensions_rounds_seeds_and_tiles_are_independent(renderer, streams):
+    import drjit as dr
+
+    mi = renderer
+    stream = of_image(mi, streams, 16)
+    one, other = pairs(stream, 16), pairs(stream, 16)
+    further, again = pairs(of_image(mi, streams, 16, 16), 16), pairs(of_image(mi, streams, 16, seed=4), 16)
+    pixel = dr.arange(mi.UInt32, 64 * 64 * 4)
+    tiles = np.array(streams.sample_streams(3, pixel, mi.UInt32(0), 128, 16).next_1d()).reshape(128, 128)
+    light = np.array(streams.light_streams(3, dr.arange(mi.UInt32, SIDE * SIDE * 16), 0).next_1d())
+    for a, b in (
+        (one[..., 0], one[..., 1]),
+        (one[..., 0], other[..., 0]),
+        (one[..., 0], further[..., 0]),
+        (one[..., 0], again[..., 0]),
+        (tiles[:64, :64], tiles[64:, :64]),
+        (one[..., 0], light),
+    ):
+        # Five standard errors of independent numbers, which nets keep well within
+        assert abs(np.corrcoef(a.ravel(), b.ravel())[0, 1]) < 5 / np.sqrt(a.size)
+
+
+def test_streams_replay_skip_and_gather(renderer, streams):
+    mi = renderer
+    for net in (0, 16):
+        stream = of_image(mi, streams, 4, net=net)
+        copy, ahead = stream.clone(), stream.clone()
+        numbers = [pairs(stream, 4), np.array(stream.next_1d()), pairs(stream, 4)]
+        assert np.array_equal(numbers[0], pairs(copy, 4))
+        ahead.skip(mi.UInt32(3))
+        assert np.array_equal(numbers[2], pairs(ahead, 4))
+        few = copy.at(mi.UInt32([7, 90]))
+        assert np.array_equal(np.array(few.next_1d()), numbers[1][[7, 90]])
+        keys = np.array(copy.next_key())
+        assert len(np.unique(keys)) > 0.99 * len(keys)
+        # Lanes that do not draw stay where they are.
+        stream, copy = of_image(mi, streams, 4, net=net), of_image(mi, streams, 4, net=net)
+        lane = np.arange(SIDE * SIDE * 4)
+        stream.next_2d(mi.Bool(lane % 2 == 0))
+        first = np.array(copy.next_1d())
+        assert np.array_equal(np.array(stream.next_1d())[1::2], first[1::2])
+
+
+def test_a_sample_has_its_points_whatever_is_rendered_with_it(renderer):
+    from data_gen.paths.camera import CameraSamples
+
+    mi = renderer
+    sensor = load(mi, "diffuse", (12, 8)).sensors()[0]
+    whole = CameraSamples(sensor, 5, 32, block=16)
+    part = CameraSamples(sensor, 5, 16, 16)
+    some = CameraSamples(sensor, 5, 16, mi.UInt32([0, 16]), 16, mi.UInt32([17, 17]))
+    numbers = np.array(whole.random.next_1d()).reshape(2, 96, 16)
+    assert np.array_equal(numbers[1].ravel(), np.array(part.random.next_1d()))
+    assert np.array_equal(numbers[:, 17].ravel(), np.array(some.random.next_1d()))
+
+
+def test_first_rounds(streams):
+    assert [streams.first_round("sobol", n) for n in (1, 4, 5, 64, 100, None)] == [1, 4, 8, 64, 128, 16]
+    assert streams.first_round("rounds", 64) == 16
+    assert streams.first_round("independent", 64) == 0
+    assert streams.first_round("sobol", 2**31 - 1) == 2**20
+
+
+@pytest.mark.parametrize("sampler", ["primal", "gpt"])
+def test_points_take_noise_away_and_no_light(renderer, sampler):
+    from data_gen.render import render_stack
+
+    scene, found = load(renderer, "diffuse", (32, 24)), {}
+    for points in ("sobol", "independent"):
+        stacks = [render_stack(scene, 16, seed, sampler, points=points) for seed in range(24)]
+        found[points] = {layer: np.array([stack[layer] for stack in stacks], np.float64) for layer in stacks[0].names}
+    better, before = found["sobol"], found["independent"]
+
+    def block_means(images):
+        n, height, width, channels = images.shape
+        return images.reshape(n, height // 8, 8, width // 8, 8, channels).mean(axis=(2, 4))
+
+    for layer, most, of_blocks in (("primal", 0.9, 0.75), ("dx", 0.98, np.inf)):
+        if layer in better:
+            quiet = np.argsort(before[layer].var(axis=0).ravel())[: int(0.98 * before[layer][0].size)]
+            variances = [images[layer].var(axis=0, ddof=1).ravel()[quiet].mean() for images in (better, before)]
+            assert variances[0] < most * variances[1]
+            blocks = [np.median(block_means(images[layer]).var(axis=0, ddof=1)) for images in (better, before)]
+            assert blocks[0] < of_blocks * blocks[1]
+            means = [block_means(images[layer]).reshape(24, -1) for images in (better, before)]
+            error = np.sqrt(sum(part.var(axis=0, ddof=1) for part in means) / 24)
+            z = (means[0] - means[1]).mean(axis=0) / np.maximum(error, 1e-12)
+            assert np.abs(z).max() < 5
+
+
+def test_a_render_by_time_can_be_had_again_by_its_number_of_samples(renderer):
+    from data_gen.render import render_stack
+
+    scene, calls = load(renderer, "diffuse", (16, 12)), []
+
+    def stop():
+        calls.append(1)
+        return len(calls) > 1
+
+    timed = render_stack(scene, None, 2, "gpt", seconds=60, stop=stop)
+    assert timed.attributes["ngpt:samplerOptions"] == "points=rounds"
+    again = render_stack(scene, timed.attributes["ngpt:spp"], 2, "gpt", points="rounds")
+    assert all(np.array_equal(timed[layer], again[layer], equal_nan=True) for layer in again.names)
+
+
+def test_claims_of_independent_samples_stay(renderer, rng):
+    from data_gen.film import GradientFilm
+
+    samples = rng.normal(size=(64 * 64, 32, 3)).astype(np.float32)
+    claimed = []
+    for net in (0, 16):
+        film = GradientFilm(64, 64, net=net)
+        for part in np.split(samples, (16,), axis=1):
+            film.put("primal", renderer.Color3f(*part.reshape(-1, 3).T))
+            film.end_pass(16)
+        claimed.append(film.develop()["primal_var"])
+    assert np.allclose(claimed[0].mean(), 1 / 32, rtol=0.02)
+    assert np.allclose(claimed[1].mean(), 1 / 32, rtol=0.02)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (8, 8)])
+def test_claims_follow_what_is_seen_between_rounds(renderer, rng, size):
+    """Each round of samples sums to little: what is left of the noise of the mean is that of the rounds."""
+    from data_gen.film import GradientFilm
+
+    pixels, left = size[0] * size[1], 0.2
+    rounds = []
+    for n in (16, 16, 32):
+        part = rng.normal(size=(pixels, n, 1))
+        rounds.append(part - (1 - left**0.5) * part.mean(axis=1, keepdims=True))
+    film = GradientFilm(*size, net=16)
+    for part in np.split(np.repeat(np.concatenate(rounds, axis=1), 3, axis=2), (16, 48), axis=1):
+        for block in np.split(part, part.shape[1] // 16, axis=1):
+            film.put("primal", renderer.Color3f(*block.reshape(-1, 3).T.astype(np.float32)))
+            film.end_pass(16)
+    claimed = film.develop()["primal_var"].mean()
+    prior = 32 / (pixels + 32) * (1 - left) if pixels < 256 else 32 / (256 + 32) * (1 - left)
+    assert left / 64 * 0.8 < claimed < (left + prior) / 64 * 1.3
+
+
+def test_the_law_of_one_net(renderer):
+    from data_gen.film.claims import _of_one_net
+
+    for a in (1.0, 1.2, 2.0):
+        for n in (4, 16, 64):
+            halves = (2**a - 1) * (n - 1) / (n**a - 1)
+            assert np.isclose(_of_one_net(halves, n), n ** (1 - a), rtol=1e-3)
+    assert _of_one_net(1.1, 16) == 1
+    assert _of_one_net(0.5, 2) == 0.5
+
+
+# ------------------------- Lamps -------------------------
+
+
+def room(mi, weights=(None, None, None)):
+    """A floor under a strong lamp and two weak ones."""
+    Transform = mi.ScalarTransform4f
+
+    def lamp(x, radiance, weight):
+        emitter = {"type": "area", "radiance": {"type": "rgb", "value": radiance}}
+        if weight is not None:
+            emitter["sampling_weight"] = weight
+        place = Transform().translate([x, 0, 2]).rotate([1, 0, 0], 180).scale(0.2)
+        return {"type": "rectangle", "to_world": place, "emitter": emitter}
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {
+            "type": "perspective",
+            "to_world": Transform().look_at([0, 4, 1.5], [0, 0, 0], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}},
+        },
+        "floor": {"type": "rectangle", "to_world": Transform().scale(9)},
+        "strong": lamp(0.0, 90.0, weights[0]),
+        "weak": lamp(1.0, 1.0, weights[1]),
+        "other": lamp(-1.0, 1.0, weights[2]),
+    }
+
+
+def test_lamps_are_chosen_by_what_they_bring_and_left_as_they_were(renderer):
+    from data_gen.scenes.lamps import lamp_weights, weighed
+
+    scene = renderer.load_dict(room(renderer))
+    weights = lamp_weights(scene)
+    assert weights.max() > 0.8
+    assert np.isclose(weights.sum(), 1)
+    assert weights.min() > 0.05
+    with weighed(scene, "power"):
+        chosen = [float(scene.pdf_emitter(i)[0]) for i in range(3)]
+        assert np.allclose(chosen, weights, atol=1e-3)
+    assert [emitter.sampling_weight() for emitter in scene.emitters()] == [1, 1, 1]
+    assert np.allclose([float(scene.pdf_emitter(i)[0]) for i in range(3)], 1 / 3)
+    with weighed(scene, "uniform"):
+        assert np.allclose([float(scene.pdf_emitter(i)[0]) for i in range(3)], 1 / 3)
+    assert np.array_equal(lamp_weights(scene), weights)
+
+
+def test_weights_that_a_scene_gives_are_honoured(renderer):
+    from data_gen.scenes.lamps import weighed
+
+    scene = renderer.load_dict(room(renderer, (1.0, 0.0, 3.0)))
+    with weighed(scene, "power"):
+        assert sorted(float(scene.pdf_emitter(i)[0]) for i in range(3)) == [0, 0.25, 0.75]
+
+
+@pytest.mark.parametrize("sampler", ["primal", "gpt", "gbdpt"])
+def test_lamps_take_noise_away_and_no_light(renderer, sampler):
+    from data_gen.render import render_stack
+
+    scene, found = renderer.load_dict(room(renderer)), []
+    for lamps in ("power", "uniform"):
+        stacks = [render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps) for seed in range(16)]
+        found.append(np.array([stack["primal"] for stack in stacks], np.float64).mean(axis=-1))
+    better, before = found
+    assert np.median(better.var(axis=0, ddof=1)) < 0.6 * np.median(before.var(axis=0, ddof=1))
+    means = [images.reshape(16, -1).mean(axis=1) for images in found]
+    z = (means[0].mean() - means[1].mean()) / np.sqrt(sum(part.var(ddof=1) for part in means) / 16)
+    assert abs(z) < 4
