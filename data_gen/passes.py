@@ -13,7 +13,7 @@ import mitsuba as mi
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.streams import first_round
+from data_gen.paths.streams import ROUND, first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
 
@@ -74,7 +74,7 @@ def render_passes(
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
-    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net)
+    film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net=net)
     start = now = time.perf_counter()
 
     def report(finished: bool = False) -> None:
@@ -113,7 +113,8 @@ def film_within(
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     instead: Callable[[int], str] = _nothing,
-    net: int = 0,
+    *,
+    net: int = ROUND,
 ) -> tuple[GradientFilm, int, int]:
     """An empty film for ``spp`` samples per pixel, samples of a block, and how many blocks may make a pass.
 

@@ -49,9 +49,10 @@ def render_stack(
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
 
-    The same seed, options and number of samples give the same bits, however they came about; where ``spp`` does not say
-    how many there will be, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. Raises NgptError for options that
-    do not exist or make no sense, and for a scene that the sampler cannot render.
+    The same seed, options and number of samples give the same bits, however they came about. Where ``spp`` does not say
+    how many there will be, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says.
+
+    Raises NgptError for options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
     check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(scene)

@@ -100,7 +100,7 @@ class UnevenRender:
         first = mi.UInt32(np.repeat(self.film.samples_each[pixels], blocks) + BLOCK * within)
         with recording():
             self.sample(
-                CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), self.net), self.film
+                CameraSamples(self.sensor, self.seed, BLOCK, first, BLOCK, mi.UInt32(some), net=self.net), self.film
             )
             self.film.end_pass(BLOCK, some)
         dr.sync_thread()

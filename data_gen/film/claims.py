@@ -15,15 +15,17 @@ taken: where little light is found by luck, points help much, and where all is, 
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from scipy.ndimage import uniform_filter
 
 # Pixels of about the same noise: so many groups at most, of so many pixels at least
-_GROUPS, _LEAST = 32, 256
+_GROUPS, _LEAST = 64, 64
 # Side of the square of pixels that tells how much noise there is around the one in its middle
 _AROUND = 5
 # So many pixels of a group are taken for those of independent samples, lest few pixels say it by chance.
-_PRIOR = 32.0
+_PRIOR = 4.0
 
 
 def factors(seen: np.ndarray, variance: np.ndarray, of_one_net: int) -> np.ndarray:
@@ -51,15 +53,15 @@ def factors(seen: np.ndarray, variance: np.ndarray, of_one_net: int) -> np.ndarr
 
 
 def _of_one_net(ratio: float, n: int) -> float:
-    """The factor where both halves are of one net, and the ``ratio`` is that of halves which are not independent.
+    """The factor where both halves are of one net of ``n``, and the ``ratio`` is that of halves which are not
+    independent.
 
-    Were the variance of n points c / n^a, halves of a net would differ by 4 c (2^a - 1) / n^a in the mean square, and
-    the ratio would be (2^a - 1)(n - 1) / (n^a - 1), which falls with a from 1 on. The factor is n^(1 - a).
+    Were the variance of n points c / n^a, halves of a net would differ by 4 c (2^a - 1) / n^a in the mean square. The
+    ratio would be (2^a - 1)(n - 1) / (n^a - 1), and the factor n^(1 - a): a power of the ratio, whose exponent hardly
+    depends on a. It is taken at a = 3/2, the rate of steps.
     """
-    if n < 3 or ratio >= 1:
-        return min(ratio, 1.0)
-    low, high = 1.0, 3.0
-    for _ in range(40):
-        a = (low + high) / 2
-        low, high = (a, high) if (2**a - 1) * (n - 1) / (n**a - 1) > ratio else (low, a)
-    return float(n ** (1 - low))
+    if n < 3:
+        return ratio
+    rate = 1.5
+    exponent = math.log(n ** (1 - rate)) / math.log((2**rate - 1) * (n - 1) / (n**rate - 1))
+    return ratio**exponent

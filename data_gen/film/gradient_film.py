@@ -188,7 +188,8 @@ class GradientFilm:
                 # Where nothing was put, splats are all there is; where all that was put is lost, the pixel is unknown.
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
-            moments = one_more(self._moments(name, len(mean)), mean, exists, opaque(self.blocks))
+            number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
+            moments = one_more(self._moments(name, len(mean)), mean, exists, number)
             moments.lost += lost
             dr.eval(moments)
             self.moments[name] = moments

@@ -42,8 +42,7 @@ def light(scene: mi.Scene, seed: int, spp: int, motion: np.ndarray | None = None
     for first in range(0, spp, each):
         count = min(each, spp - first)
         with recording():
-            # Independent samples, for the variance of which batches are taken
-            camera = CameraSamples(sensor, seed, count, first, net=0)
+            camera = CameraSamples(sensor, seed, count, first)
             ray, importance, active = camera.rays((0, 0) if motion is None else _partners(camera, motion))
             L = estimate(camera.random.clone(), ray, medium, active)
             L -= emission_seen(scene, integrator, medium, ray, active)

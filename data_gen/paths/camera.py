@@ -9,7 +9,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.streams import ROUND, sample_streams
+from data_gen.paths.streams import sample_streams
 
 # As in ``data_gen.passes``: rays of lanes side by side are traced together.
 _PACKET = 16
@@ -24,7 +24,7 @@ class CameraSamples:
     its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them, which is what
     correlates a path with its shifted copies.
 
-    ``net`` is the size of the first round of points, or 0: independent samples. See ``data_gen.paths.streams``.
+    ``net`` is the size of the first round of points, or 0 (default): independent samples. See ``data_gen.paths.streams``.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """
@@ -37,7 +37,8 @@ class CameraSamples:
         first: int | mi.UInt32 = 0,
         block: int | None = None,
         some: mi.UInt32 | None = None,
-        net: int = ROUND,
+        *,
+        net: int = 0,
     ):
         self.sensor, self.seed, self.first, self.net = sensor, seed, first, net
         self.size = mi.ScalarVector2u(sensor.film().crop_size())
@@ -62,7 +63,7 @@ class CameraSamples:
 
     @classmethod
     def replayed(
-        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, net: int = ROUND
+        cls, sensor: mi.Sensor, seed: int, pixel: mi.UInt32, sample: mi.UInt32, place: mi.Point2f, *, net: int = 0
     ) -> Self:
         """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
         camera = cls.__new__(cls)

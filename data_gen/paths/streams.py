@@ -62,7 +62,7 @@ def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 
     number = _apart(x & within) | _apart(y & within) << 1
     key = _mixed(first ^ _key(seed, 0))
     key = _mixed(key ^ (x >> _TILE | y >> _TILE << 16))
-    return _sobol_class(mi.variant())(number << bits | sample - first, key, dr.zeros(mi.UInt32, dr.width(key)))
+    return _sobol_class(mi.variant())((number << bits | sample - first, key, dr.zeros(mi.UInt32, dr.width(key))))
 
 
 def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = False) -> mi.Sampler:
@@ -71,7 +71,7 @@ def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = F
     if independent:
         return _independent(seed, number, turn, of_lights=True)
     key = _mixed(turn ^ _key(seed, 1)) + dr.zeros(mi.UInt32, dr.width(number))
-    return _sobol_class(mi.variant())(number, key, dr.zeros(mi.UInt32, dr.width(number)))
+    return _sobol_class(mi.variant())((number, key, dr.zeros(mi.UInt32, dr.width(number))))
 
 
 def _independent(seed: int, a: mi.UInt32, b: mi.UInt32, of_lights: bool = False) -> mi.Sampler:
@@ -96,11 +96,15 @@ def _stream_class(variant: str) -> type:
     """The sampler's class; Mitsuba's own classes, and so those derived from them, belong to a variant."""
 
     class Stream(mi.Sampler):
-        """Independent random numbers. Cloning replays them."""
+        """Independent random numbers. Cloning replays them. From ``state`` a stream can be made anew."""
 
-        def __init__(self, random):
+        def __init__(self, state):
             super().__init__(mi.Properties())
-            self.random = mi.PCG32(random)
+            self.random = mi.PCG32(state)
+
+        @property
+        def state(self):
+            return self.random
 
         def next_1d(self, active=True):
             return self.random.next_float32(active)
@@ -144,9 +148,13 @@ def _sobol_class(variant: str) -> type:
         counted alike. Lanes that draw while others do not are ahead of them.
         """
 
-        def __init__(self, index, key, dimension):
+        def __init__(self, state):
             super().__init__(mi.Properties())
-            self.index, self.key, self.dimension = mi.UInt32(index), mi.UInt32(key), mi.UInt32(dimension)
+            self.index, self.key, self.dimension = (mi.UInt32(each) for each in state)
+
+        @property
+        def state(self):
+            return self.index, self.key, self.dimension
 
         def next_1d(self, active=True):
             bits = self._scramble()
@@ -173,14 +181,14 @@ def _sobol_class(variant: str) -> type:
             self.dimension = self.dimension + count
 
         def clone(self):
-            return Points(self.index, self.key, self.dimension)
+            return Points(self.state)
 
         def at(self, lanes):
             """The streams of these lanes alone."""
-            return Points(*(dr.gather(mi.UInt32, each, lanes) for each in (self.index, self.key, self.dimension)))
+            return Points([dr.gather(mi.UInt32, each, lanes) for each in self.state])
 
         def schedule_state(self):
-            dr.schedule(self.index, self.key, self.dimension)
+            dr.schedule(self.state)
 
         def _scramble(self):
             return self.key ^ (self.dimension * 0x9E3779B1)

@@ -1,6 +1,7 @@
 """``python -m data_gen.samplers``: the table of samplers in docs/use/rendering.md."""
 
 from data_gen.samplers import by_standing
+from data_gen.samplers.registry import own
 from ngpt.options import written
 
 # Standing -> what the table calls it
@@ -13,7 +14,7 @@ def table() -> str:
     for standing, title in GROUPS.items():
         lines += [f"| | *{title}* | |"] if title else []
         for name, entry in by_standing(standing).items():
-            options = ", ".join(f"`{option}={written(value.default)}`" for option, value in entry.options.items())
+            options = ", ".join(f"`{option}={written(value.default)}`" for option, value in own(entry.options).items())
             lines.append(f"| `{name}` | {entry.summary} | {options} |")
     return "\n".join(lines)
 

@@ -39,7 +39,7 @@ def _from_module(module: str) -> Callable[..., Any]:
     return lambda *args, **options: import_module(module).make(*args, **options)
 
 
-# What every sampler takes beside its own options, and its ``make`` does not see: ``data_gen.render`` does it.
+# What every sampler of single images takes beside its own options; ``data_gen.render`` sees to it, and not ``make``.
 COMMON = {
     "points": Option(
         "sobol",
@@ -63,7 +63,7 @@ class Entry:
     ``module``    where its function ``make`` is, and its Mitsuba classes, which are made anew with each variant
     ``make``      what makes it, where there is no ``module``
     ``standing``  one of ``STANDINGS``: which samplers help shows first, and which laws run in `make test`
-    ``options``   name -> ``Option``, those of ``COMMON`` included; ``make`` takes all others
+    ``options``   name -> ``Option``; ``make`` takes all of them, but for those of ``COMMON``
     ``refuses``   facts about a scene -> why the sampler cannot render it, "" if it can
     ``notes``     facts about a scene -> what the user should know about rendering it, a line each
     """
@@ -82,7 +82,6 @@ class Entry:
             raise NgptError(f"sampler '{self.name}': standing '{self.standing}' is none of {', '.join(STANDINGS)}")
         if self.module:
             object.__setattr__(self, "make", _from_module(self.module))
-        object.__setattr__(self, "options", {**self.options, **COMMON})
 
     def settings(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """All options, those ``given``, which may be texts, and the others' defaults.
@@ -107,7 +106,7 @@ def own(settings: Mapping[str, Any]) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Sampler(Entry):
-    """What renders the layers of a gradient stack.
+    """What renders the layers of a gradient stack. Its options are its own, and those of ``COMMON``.
 
     ``make``        (scene, options) -> what takes the samples of a pass (``data_gen.passes.SamplePass``); raises
                     NgptError for a scene it cannot render
@@ -133,6 +132,10 @@ class Sampler(Entry):
     together: bool = field(default=False, kw_only=True)
     lane_bytes: int = field(default=LANE_BYTES, kw_only=True)
     biased: bool = field(default=False, kw_only=True)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "options", {**self.options, **COMMON})
 
     @property
     def even(self) -> bool:

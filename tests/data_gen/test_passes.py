@@ -42,7 +42,7 @@ def test_samples_are_independent(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (24, 16))
-    stacks = [render_stack(scene, 64, seed, "primal") for seed in range(24)]
+    stacks = [render_stack(scene, 64, seed, "primal", points="independent") for seed in range(24)]
     # If samples, pixels or seeds shared their numbers, means would vary more than the variance of samples says.
     images = np.stack([stack["primal"] for stack in stacks])
     predicted = np.mean([stack["primal_var"] for stack in stacks], axis=0)
@@ -62,7 +62,7 @@ def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
     assert calls[0] == (0, 2) and calls[-1] == (2, 2)
     spp = stack.attributes["ngpt:spp"]
     assert spp > 1
-    same(stack, render_stack(scene, spp, 3))
+    same(stack, render_stack(scene, spp, 3, points="rounds", sampler="gpt"))
     assert render_stack(scene, 2, seconds=100).attributes["ngpt:spp"] == 2
     assert render_stack(scene, None, seconds=1e-6).attributes["ngpt:spp"] >= 1  # at least something
 
@@ -71,9 +71,9 @@ def test_stopping_keeps_the_samples_done(renderer):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", (256, 256))
-    stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True)
+    stack = render_stack(scene, 1 << 20, 3, "primal", stop=lambda: True, points="rounds")
     assert 1 <= stack.attributes["ngpt:spp"] < 100
-    same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal"))
+    same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal", points="rounds"))
 
 
 def test_sizes_that_memory_cannot_hold(renderer):

@@ -35,7 +35,7 @@ def test_defaults_are_allowed_and_other_values_are_not(name, option):
         ("gpt", {"shift": "half-vektor"}, "it takes replay, half-vector, manifold; did you mean 'half-vector'"),
         ("gpt", {"roughness_threshold": "x"}, "'x' is not allowed; it takes a number of 0 or more"),
         ("gpt", {"reus": True}, "sampler 'gpt' has no option 'reus'; did you mean 'reuse'"),
-        ("split", {"reuse": True}, "sampler 'split' has no option 'reuse'; it has: none"),
+        ("split", {"reuse": True}, "sampler 'split' has no option 'reuse'; it has: points, lamps"),
     ],
 )
 def test_errors_come_before_the_plugin_and_say_what_goes(renderer, name, options, message):

@@ -161,7 +161,9 @@ def gains(renderer, name, full=True):
     spp = (16 if SAMPLERS[name].batch == 1 else 256) if full else passes_of(name, 8, 64)
     # In a ball there are few photons, and often none.
     options = {"photons": 8} if name == "gvpm" else {}
-    layers = render_ours(load(renderer, quick(renderer, name), (48, 48)), name, batches=1, spp=spp, **options)[0]
+    layers = render_ours(
+        load(renderer, quick(renderer, name), (48, 48)), name, batches=1, spp=spp, points="independent", **options
+    )[0]
     found = []
     for layer, pixels in zip(("dx", "dy"), variances_of_differences(GradientStack.from_arrays(**layers)), strict=True):
         pixels, ours = pixels.sum(axis=-1), layers[f"{layer}_var"].sum(axis=-1)
@@ -205,13 +207,14 @@ def test_a_sampler_that_rejects_every_shift_falls_through_the_floor(renderer, mo
 
 @pytest.mark.parametrize(("name", "full"), cases(dear=lambda entry: True))
 def test_variances_are_those_over_seeds(renderer, name, full):
-    """The law that every weight of a reconstruction rests on."""
+    """The law that every weight of a reconstruction rests on; of nets of points, see ``test_points``."""
     from data_gen.passes import render_passes
 
     scene, entry = scene_for(renderer, name, (24, 16)), SAMPLERS[name]
     # Where a sample is a pass, few of them: passes of one sample take long to start.
     spp = (6 if entry.batch == 1 else 16) if full else passes_of(name, 3, 16)
     sample, sensor, more = entry.made(scene), scene.sensors()[0], {"lane_bytes": entry.lane_bytes, "batch": entry.batch}
+    more["points"] = "independent"
     stacks = [render_passes(sample, sensor, seed, spp, **more).develop() for seed in range(64 if full else 24)]
     low, high = (0.88, 1.12) if full else (0.8, 1.25)
     for layer in ("primal", "dx", "dy"):

@@ -36,7 +36,10 @@ def test_even_counts_are_the_render_of_ever(renderer, sampler):
     from data_gen.render import render_stack
 
     scene = load(renderer, "diffuse", SIZE)
-    same(render(renderer, scene, np.full(PIXELS, 2), 3, sampler), render_stack(scene, 48, 3, sampler).layers)
+    same(
+        render(renderer, scene, np.full(PIXELS, 2), 3, sampler),
+        render_stack(scene, 48, 3, sampler, points="rounds").layers,
+    )
 
 
 def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng):
@@ -47,7 +50,7 @@ def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng):
     counts = 16 * (1 + blocks.reshape(SIZE[::-1]))
     assert np.array_equal(layers["samples"][..., 0], counts)
     for n in np.unique(counts):
-        even, here = render_stack(scene, int(n), 3, "gpt").layers, counts == n
+        even, here = render_stack(scene, int(n), 3, "gpt", points="rounds").layers, counts == n
         for name in ("primal", "primal_var", "albedo"):
             assert np.array_equal(layers[name][here], even[name][here], equal_nan=True)
         pairs = here[:, :-1] & here[:, 1:]

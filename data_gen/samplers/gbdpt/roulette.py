@@ -85,7 +85,6 @@ def survivors(
     share = SHARE * worth / dr.gather(mi.Float, threshold, pixel)
     p = dr.select(kept & (share < 1), dr.fmax(share, LEAST), 1)
     # Numbers that no path has drawn
-    state = dr.gather(mi.UInt64, camera.random.random.state, lane)
-    u = mi.sample_tea_float32(mi.UInt32(state >> 32), mi.UInt32(state) + depth)
+    u = mi.sample_tea_float32(camera.random.at(lane).next_key(), depth)
     few = dr.compress(u < p)
     return dr.gather(mi.UInt32, lane, few), dr.gather(mi.UInt32, depth, few), dr.gather(mi.Float, dr.rcp(p), few)

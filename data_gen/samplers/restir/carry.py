@@ -98,7 +98,7 @@ class Carry:
         lost = surface & ~(known & x.is_valid() & (stretch > 0) & dr.isfinite(stretch))
 
         behind = known & ~lost & ((kind == RC_LIGHT) | (kind == SUFFIX))
-        camera = CameraSamples.replayed(target.sensor, seed, record.pixel, record.sample, record.place, net=0)
+        camera = CameraSamples.replayed(target.sensor, seed, record.pixel, record.sample, record.place)
         # rc's own numbers come behind those of the vertices that are replayed and of the one before it.
         random = camera.random
         random.skip(mi.UInt32(DRAWN) * (record.replayed + 1))

@@ -111,7 +111,7 @@ class History:
         motions = pair_motions(np.zeros((height, width, 2)) if motion is None else motion, depth, STEPS.values())
         with recording():
             self.at = Layout(self.size, self.chains, RESERVOIRS if self.pairs else 1, motions, self.confidence)
-            camera = CameraSamples(self.stage.sensor, self.seed, self.chains, self.frames * self.chains, net=0)
+            camera = CameraSamples(self.stage.sensor, self.seed, self.chains, self.frames * self.chains)
             sample = (
                 dr.opaque(mi.UInt32, self.frames * self.chains) + dr.arange(mi.UInt32, self.at.lanes) % self.at.chains
             )

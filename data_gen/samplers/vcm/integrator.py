@@ -133,7 +133,7 @@ class VCM(BDPT):
         """Fills the ``empty`` map and the ``sums`` of splats; with them random numbers, and the splatter's state."""
         splatter = self.splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
         path, random, state = light_path(self.plan(world, η=η), sight, Keeper(splatter, η, empty))
-        return replace(empty, count=path.count), random.random, state, sums
+        return replace(empty, count=path.count), random.state, state, sums
 
     # ------------------------ Camera paths: joins, and merges ------------------------
 

@@ -72,7 +72,7 @@ class CameraPaths:
         calls the functions that make kernels.
         """
         n, stream = dr.width(rays[0][0].o), type(random)
-        start = Level([], dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, 1, n), dr.opaque(mi.Float, 1, n), random.random)
+        start = Level([], dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, 1, n), dr.opaque(mi.Float, 1, n), random.state)
         dr.eval(start)
         level, number = frozen(self.begun, start, stream(start.numbers), rays, fixed=True), 1
         while True:
@@ -108,7 +108,7 @@ class CameraPaths:
         paths = [path for path, _ in steps]
         η = dr.select(paths[0].alive, level.η * steps[0][1], level.η)
         survive(paths, u_survival, level.depth >= self.limits.rr_depth, η)
-        return replace(level, paths=paths, depth=level.depth + 1, η=η, numbers=random.random, behind=[])
+        return replace(level, paths=paths, depth=level.depth + 1, η=η, numbers=random.state, behind=[])
 
     def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
         """Those of these ``lanes``, up to what their rays hit."""
@@ -145,7 +145,7 @@ class CameraPaths:
         """The ``level`` with these ``paths`` and ``random`` numbers, of some of its ``lanes``."""
         channel = None if level.channel is None else taken(level.channel, lanes)
         of_samples, depth, η = (taken(value, lanes) for value in (level.lanes, level.depth, level.η))
-        return Level(paths, of_samples, depth, η, random.random, channel)
+        return Level(paths, of_samples, depth, η, random.state, channel)
 
 
 def scattered(path: Path, materials: Materials, u_lobe, u_direction) -> tuple[Path, mi.Float]:

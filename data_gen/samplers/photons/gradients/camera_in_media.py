@@ -79,7 +79,7 @@ class PathsByPieces(CameraPaths):
                 η = dr.select(path.alive, η * eta, η)
         survive(after, u_survival, ~passes & (depth >= self.limits.rr_depth), η)
         depth = dr.select(passes, depth, depth + 1)
-        return replace(level, paths=after, depth=depth, η=η, numbers=random.random)
+        return replace(level, paths=after, depth=depth, η=η, numbers=random.state)
 
     def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
         scene, depth, pieces = self.world.scene, taken(level.depth, lanes), []

@@ -59,7 +59,7 @@ class PathsBySegments(CameraPaths):
             if fog.media.grids:
                 Le = self.integrator.behind_grids(self.world.scene, fog.media, segment)
                 behind.append(flights[-1].β * Le * dr.select(path.alive, mi.Float(1), 0))
-        return replace(start, paths=flights, numbers=random.random, channel=channel, behind=behind)
+        return replace(start, paths=flights, numbers=random.state, channel=channel, behind=behind)
 
     def onward(self, level: Level, random) -> Level:
         """The paths behind their next event, in the medium that they go into."""
@@ -73,7 +73,7 @@ class PathsBySegments(CameraPaths):
             if k == 0:
                 η = dr.select(path.alive, η * eta, η)
         survive(after, u_survival, level.depth >= self.limits.rr_depth, η)
-        return replace(level, paths=after, depth=level.depth + 1, η=η, numbers=random.random, behind=[])
+        return replace(level, paths=after, depth=level.depth + 1, η=η, numbers=random.state, behind=[])
 
     def further(self, level: Level, random, lanes: mi.UInt32) -> Level:
         random, media_of_scene, flights = random.at(lanes), self.world.fog.media, []

@@ -90,7 +90,7 @@ def _start(world: World, random) -> tuple:
     start = world.lights.sample(world.scene, random, mi.Float(0), dr.zeros(mi.Ray3f).wavelengths)
     if world.fog:
         channel, medium = media.choose_channel(random.next_1d()), world.fog.around(world.scene, start.ray.o)
-    return start, channel, medium, random.random
+    return start, channel, medium, random.state
 
 
 def _maps(world: World, paths: Paths, random, depths: tuple, frozen: Callable, edges: bool) -> Iterator[Any]:
@@ -204,7 +204,7 @@ def _walk(world: World, paths: Paths, random, depths: tuple, photons, places: tu
         alive &= bounce <= max_depth
     ray = mi.Ray3f(ray.o, ray.d)
     on = Paths(ray, β, brightest, density, survival, parent, bounce, alive, channel, medium)
-    return on, random.random, photons
+    return on, random.state, photons
 
 
 def _enter(photons, values: dict, place: mi.UInt32, active) -> None:

@@ -151,11 +151,12 @@ def first_numbers(camera: CameraSamples) -> dr.Local:
     for i, x in enumerate(numbers):
         vector.write(x, mi.UInt32(i))
 
-    def draw(i, vector, random):
-        vector.write(random.next_float32(), i)
-        return i + 1, vector, random
+    def draw(i, vector, state):
+        further = type(random)(state)
+        vector.write(further.next_1d(), i)
+        return i + 1, vector, further.state
 
-    state = (mi.UInt32(len(numbers)), vector, random.random)
+    state = (mi.UInt32(len(numbers)), vector, random.state)
     return dr.while_loop(state, lambda i, *_: i < REMEMBERED, draw, label="numbers")[1]
 
 
