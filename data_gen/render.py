@@ -71,9 +71,9 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    if settings["points"] == "sobol" and (spp is None or adaptive is not None):
+    if settings.get("points") == "sobol" and (spp is None or adaptive is not None):
         settings["points"] = "rounds"
-    limits["points"] = settings["points"]
+    limits["points"] = settings.get("points", "independent")
     with weighed(scene, settings["lamps"]):
         sample = entry.make(scene, **own(settings), **more)
         if adaptive is None:

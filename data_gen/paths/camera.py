@@ -24,7 +24,7 @@ class CameraSamples:
     its sample. ``random`` holds the random numbers of the paths to come. Cloning it replays them, which is what
     correlates a path with its shifted copies.
 
-    ``net`` is the size of the first round of points, or 0 (default): independent samples. See ``data_gen.paths.streams``.
+    ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
     """

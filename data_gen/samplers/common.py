@@ -71,7 +71,11 @@ class GradientIntegrator(mi.SamplingIntegrator):
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
         entry = SAMPLERS[self.name]
-        limits = {"lane_bytes": entry.lane_bytes, "batch": entry.batch, "points": self.options["points"]}
+        limits = {
+            "lane_bytes": entry.lane_bytes,
+            "batch": entry.batch,
+            "points": self.options.get("points", "independent"),
+        }
         with weighed(scene, self.options["lamps"]):
             return render_passes(self.prepare(scene), sensor, seed, spp, **limits)
 

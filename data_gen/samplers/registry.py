@@ -120,6 +120,7 @@ class Sampler(Entry):
                     has so many, and variances are over passes
     ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
+    ``counts``      whether it replays numbers one by one, so that they must be independent: it takes no ``points``
     ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
     """
 
@@ -132,10 +133,12 @@ class Sampler(Entry):
     together: bool = field(default=False, kw_only=True)
     lane_bytes: int = field(default=LANE_BYTES, kw_only=True)
     biased: bool = field(default=False, kw_only=True)
+    counts: bool = field(default=False, kw_only=True)
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        object.__setattr__(self, "options", {**self.options, **COMMON})
+        common = {name: option for name, option in COMMON.items() if name != "points" or not self.counts}
+        object.__setattr__(self, "options", {**self.options, **common})
 
     @property
     def even(self) -> bool:

@@ -31,7 +31,7 @@ def verdict(stacks, images, name):
 @pytest.mark.parametrize("scene", [glass, *(pytest.param(s, marks=pytest.mark.slow) for s in ("glossy", plenty))])
 def test_differences_are_those_of_the_rest(renderer, scene):
     scene = load(renderer, scene, (32, 32))
-    stacks, images = render_ours(scene, "gpt"), others(scene)
+    stacks, images = render_ours(scene, "gpt", 24), others(scene)
     assert np.mean([stack["caustic"] for stack in stacks]) > 1e-4
     for name in ("dx", "dy"):
         result = verdict(stacks, images, name)

@@ -73,7 +73,7 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
     """Of light paths in a scene: r(T(x)) r(x) = 1, T(T(x)) = x, and Φ'' = Φ."""
     import drjit as dr
 
-    from data_gen.paths.streams import sample_streams
+    from data_gen.paths.camera import CameraSamples
     from data_gen.samplers import find
     from data_gen.samplers.photons.media.gbre import Beside
     from data_gen.samplers.photons.media.gplanes import copied
@@ -81,9 +81,8 @@ def test_copies_of_planes_are_planes_and_their_copies_are_the_planes(renderer, n
 
     mi, rng, n = renderer, np.random.default_rng(0), 1 << 12
     made = find("gplanes").made(load(mi, getattr(media_scenes, name), (8, 8)), planes=n)
-    lane = dr.arange(mi.UInt32, n)
-    random = sample_streams(0, lane, mi.UInt32(0))
-    traced = next(made.integrator.maps(made, (random.next_key(), random.next_key()), 0))
+    camera = CameraSamples(made.world.scene.sensors()[0], 0, n // 64)
+    traced = next(made.integrator.maps(made, camera))
     planes = planes_of(made, traced).planes
     k = len(planes)
     eye = mi.Point3f(made.world.fog.eye)

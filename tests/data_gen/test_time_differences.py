@@ -74,7 +74,7 @@ def test_of_a_camera_at_rest_it_is_that_of_the_pixels(renderer, monkeypatch):
     paired, _, _, _ = estimates(shot, 16, 16)
 
     def frames(frame, seed):
-        layers = render_stack(shot.at(frame), 64, seed, "gpt-basic").layers
+        layers = render_stack(shot.at(frame), 64, seed, "gpt-basic", points="independent").layers
         return layers["primal"] - layers["direct"]
 
     later = [frames(1, seed) for seed in range(8)]

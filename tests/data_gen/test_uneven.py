@@ -15,7 +15,9 @@ def render(mi, scene, blocks, seed=0, sampler="gpt", memory=1000, **limits):
     from data_gen.samplers import find
     from data_gen.uneven import UnevenRender
 
-    work = UnevenRender(find(sampler).made(scene), scene.sensors()[0], seed, memory=memory, **limits)
+    work = UnevenRender(
+        find(sampler).made(scene), scene.sensors()[0], seed, memory=memory, points="independent", **limits
+    )
     work.add(np.ones(PIXELS, int), whole=True)
     work.add(blocks)
     return work.film.develop()
@@ -38,8 +40,23 @@ def test_even_counts_are_the_render_of_ever(renderer, sampler):
     scene = load(renderer, "diffuse", SIZE)
     same(
         render(renderer, scene, np.full(PIXELS, 2), 3, sampler),
-        render_stack(scene, 48, 3, sampler, points="rounds").layers,
+        render_stack(scene, 48, 3, sampler, points="independent").layers,
     )
+
+
+def test_each_pixel_has_its_points_of_rounds(renderer, rng):
+    from data_gen.render import render_stack
+    from data_gen.samplers import find
+    from data_gen.uneven import UnevenRender
+
+    scene, blocks = load(renderer, "glossy", SIZE), uneven(rng)
+    work = UnevenRender(find("gpt").made(scene), scene.sensors()[0], 3)
+    work.add(np.ones(PIXELS, int), whole=True)
+    work.add(blocks)
+    layers, counts = work.film.develop(), 16 * (1 + blocks.reshape(SIZE[::-1]))
+    for n in np.unique(counts):
+        even, here = render_stack(scene, int(n), 3, "gpt", points="rounds").layers, counts == n
+        assert np.array_equal(layers["primal"][here], even["primal"][here])
 
 
 def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng):
@@ -50,7 +67,7 @@ def test_each_pixel_has_the_bits_of_its_own_samples(renderer, rng):
     counts = 16 * (1 + blocks.reshape(SIZE[::-1]))
     assert np.array_equal(layers["samples"][..., 0], counts)
     for n in np.unique(counts):
-        even, here = render_stack(scene, int(n), 3, "gpt", points="rounds").layers, counts == n
+        even, here = render_stack(scene, int(n), 3, "gpt", points="independent").layers, counts == n
         for name in ("primal", "primal_var", "albedo"):
             assert np.array_equal(layers[name][here], even[name][here], equal_nan=True)
         pairs = here[:, :-1] & here[:, 1:]

@@ -53,6 +53,7 @@ register(
         refuses=surfaces_alone("gmlt"),
         notes=_notes_on_chains,
         batch=8,
+        counts=True,
         lane_bytes=SPLATTING_BYTES,
     )
 )
