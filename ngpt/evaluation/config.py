@@ -168,12 +168,14 @@ def scene_name(scene: str) -> str:
 def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
 
-    ``samplers`` may be tables of options: those of samplers with gradients are compared, others are for ``rivals``.
+    ``samplers`` may be tables of options: those of samplers with gradients are compared, others are for ``rivals``, and
+    those that a variant names are for this variant alone.
     """
     values = read_toml(path)
     if isinstance(tables := values.get("samplers"), dict):
         check(tables, {str: dict}, f"{path}: samplers")
         gradients = find_renderer().gradients
-        with_gradients = [name for name, table in tables.items() if gradients(table.get("sampler", name))]
+        own = {table.get("sampler") for table in values.get("variants", {}).values()}
+        with_gradients = [n for n, table in tables.items() if n not in own and gradients(table.get("sampler", n))]
         values |= {"samplers": with_gradients or [KINDS["gradients"]], "sampler_options": tables}
     return from_table(Config, values, str(path))

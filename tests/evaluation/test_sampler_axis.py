@@ -77,6 +77,25 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         read_config(tmp_path / "eval.toml")
 
 
+def test_samplers_that_variants_name_are_theirs_alone(tmp_path):
+    text = """
+        scenes = ["diffuse"]
+        methods = ["wcv", "wcv-before"]
+        [samplers.gpt-before]
+        sampler = "gpt"
+        points = "independent"
+        [variants.wcv-before]
+        method = "wcv"
+        sampler = "gpt-before"
+    """
+    (tmp_path / "eval.toml").write_text(text)
+    columns = read_config(tmp_path / "eval.toml").columns()
+    assert {column.name: column.render.name for column in columns} == {
+        "wcv": "gradients",
+        "wcv-before": "gradients gpt points=independent",
+    }
+
+
 def test_options_of_samplers_reach_the_stacks(renderer, tmp_path):
     config = Config(
         scenes=("diffuse",),
