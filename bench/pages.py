@@ -4,7 +4,7 @@
     python -m bench.pages out/eval
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
-docs/lab/RESULTS.md, docs/methods/methods.md and the model cards. Without a folder it writes
+docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards. Without a folder it writes
 them anew from that file.
 """
 
@@ -27,8 +27,22 @@ GROUPS = {
     "watched": ("lamp", "staircase", "glass-of-water"),
     "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
 }
-COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn")
-PAIRS = (("ngpt-combine", "oidn"), ("ngpt-primal", "oidn"), ("ngpt-fast", "oidn"), ("ngpt-combine", "ngpt-primal"))
+# What a user would take instead, and the same denoiser on our own samples
+RIVALS = {"mitsuba": "Mitsuba + OIDN", "oidn": "OIDN"}
+COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn", "mitsuba")
+PAIRS = (
+    *((method, rival) for rival in RIVALS for method in ("ngpt-combine", "ngpt-primal", "ngpt-fast")),
+    ("ngpt-combine", "ngpt-primal"),
+    ("oidn", "mitsuba"),
+)
+# Better samples and those of before, by columns that differ in nothing else
+BETTER = {
+    "`ngpt-combine`": ("ngpt-combine", "ngpt-combine-before"),
+    "`ngpt-fast`": ("ngpt-fast", "ngpt-fast-before"),
+    "`wcv`": ("wcv", "wcv-before"),
+    "OIDN": ("oidn", "mitsuba"),
+    "`ngpt-primal`": ("ngpt-primal", "ngpt-primal-before"),
+}
 EVERYONE = tuple(scene for scenes in GROUPS.values() for scene in scenes)
 # Among which gradients are judged by scenes that no network was trained on
 KNOWN = {
@@ -36,7 +50,9 @@ KNOWN = {
     "rooms, watched": GROUPS["rooms"] + GROUPS["watched"],
     "other views": GROUPS["other views"],
 }
-LISTED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "oidn")
+# No constant of points or lamps was chosen by looking at them
+APART = tuple(s for s in EVERYONE if s not in ("diffuse", "glossy", "coffee", "living-room", "staircase"))
+LISTED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "oidn", "mitsuba")
 # Ratios over OIDN from which a loss is listed by name
 LOSS = 1.1
 
@@ -58,8 +74,9 @@ def marks(name: str) -> tuple[str, str]:
 def kept(results: dict) -> dict:
     """Of an evaluation what the tables need: medians over seeds, and what gradients are worth."""
     results["settings"]["groups"] = KNOWN
-    worth = worth_of_gradients(results)
-    table = worth_tables(results | {"worth": worth})
+    before = {name for pair in BETTER.values() for name in pair[1:]}
+    now = results | {key: [row for row in results[key] if row["method"] not in before] for key in ("summary", "cells")}
+    table = worth_tables(now | {"worth": worth_of_gradients(now)})
     facts = {name: results[name] for name in ("command", "date", "metadata")}
     return {"benchmark": "main", **facts, "cells": cells_of(results), "worth": list(table.values())}
 
@@ -77,12 +94,13 @@ def blocks(result: dict) -> dict[tuple[str, str], str]:
         ("README.md", "cells"): cells_of_readme(table),
         ("README.md", "worth"): worth_by_group(result["worth"][0], ("all", "rooms, watched")),
         ("docs/methods/methods.md", "errors"): errors_by_method(table),
+        ("docs/samplers/points.md", "better"): better(table),
         (card("combine"), "over primal"): over_primal(table),
         (card("combine"), "losses"): losses(table, "ngpt-combine"),
         (card("primal"), "losses"): losses(table, "ngpt-primal"),
     }
     for name in ("fast", "combine", "primal"):
-        made[card(name), "results"] = over_oidn(table, f"ngpt-{name}")
+        made[card(name), "results"] = over_rivals(table, f"ngpt-{name}")
     return made
 
 
@@ -127,30 +145,46 @@ def by_group(table: Cells) -> str:
     return "\n".join(lines)
 
 
-def over_oidn(table: Cells, method: str) -> str:
-    """Of a model card: errors and FLIP over OIDN's for each group of scenes."""
+def over_rivals(table: Cells, method: str) -> str:
+    """Of a model card: errors and FLIP over those of both rivals for each group of scenes."""
     spp = ", ".join(map(str, table.counts))
-    over = "error over OIDN's at", "FLIP over OIDN's at"
-    lines = heading("scenes", "less error than OIDN", f"{over[0]} {spp} spp", "less FLIP", f"{over[1]} {spp} spp")
+    heads = [(f"less error than {name}", f"error over its at {spp} spp", "FLIP") for name in RIVALS.values()]
+    lines = heading("scenes", *(text for head in heads for text in head))
     for name, scenes in {**GROUPS, "all": EVERYONE}.items():
-        ratios = [
-            ", ".join(f"{table.over(scenes, n, method, 'oidn', key):.2f}" for n in table.counts)
-            for key in ("error", "FLIP")
-        ]
-        won = [table.below(scenes, method, "oidn", key) for key in ("error", "FLIP")]
+        cells = []
+        for rival in RIVALS:
+            cells.append(table.below(scenes, method, rival))
+            for key in ("error", "FLIP"):
+                cells.append(", ".join(f"{table.over(scenes, n, method, rival, key):.2f}" for n in table.counts))
         shown = f"{name}: {', '.join(scenes)}" if name != "all" else f"all {len(scenes)}"
-        lines.append(f"| {shown} | {won[0]} | {ratios[0]} | {won[1]} | {ratios[1]} |")
+        lines.append(f"| {shown} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def eye(table: Cells) -> str:
-    """By FLIP: in how many scenes a network has less than OIDN, and the mean ratio."""
+    """By FLIP: in how many scenes a network has less than each rival, and the mean ratio."""
     lines = heading("FLIP, all scenes", *(f"{n} spp" for n in table.counts), "all cells")
-    for method in ("ngpt-combine", "ngpt-primal", "ngpt-fast"):
-        won = [table.below(EVERYONE, method, "oidn", "FLIP", n) for n in (*table.counts, 0)]
-        ratios = [f", {table.over(EVERYONE, n, method, 'oidn', 'FLIP'):.2f}" for n in table.counts]
+    for method, rival in PAIRS[: 3 * len(RIVALS)]:
+        won = [table.below(EVERYONE, method, rival, "FLIP", n) for n in (*table.counts, 0)]
+        ratios = [f", {table.over(EVERYONE, n, method, rival, 'FLIP'):.2f}" for n in table.counts]
         cells = [f"{count}{ratio}" for count, ratio in zip(won, [*ratios, ""], strict=True)]
-        lines.append(f"| `{method}` less than `oidn`, and mean over its | {' | '.join(cells)} |")
+        lines.append(f"| `{method}` less than {RIVALS[rival]}, and mean over its | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def better(table: Cells) -> str:
+    """Better samples over those of before: error and FLIP, all scenes and those apart; the worst scene in brackets."""
+    groups = {f"all {len(EVERYONE)} scenes": EVERYONE, f"the {len(APART)} apart": APART}
+    lines = heading("new over old", "", *(f"{n} spp" for n in table.counts))
+    for name, (now, before) in BETTER.items():
+        for group, scenes in groups.items():
+            cells = []
+            for n in table.counts:
+                worst = max(table.over((scene,), n, now, before) for scene in scenes)
+                error, flip = (table.over(scenes, n, now, before, key) for key in ("error", "FLIP"))
+                cells.append(f"{error:.2f} ({worst:.2f}), FLIP {flip:.2f}")
+            lines.append(f"| {name} | {group} | {' | '.join(cells)} |")
+            name = ""
     return "\n".join(lines)
 
 
@@ -182,13 +216,13 @@ def errors_by_method(table: Cells) -> str:
 
 
 def errors_of_readme(table: Cells) -> str:
-    methods = {"oidn": "OIDN", "ngpt-combine": "`ngpt-combine`", "ngpt-fast": "`ngpt-fast`"}
-    heads = [f"{'classroom, blind: ' if name == 'OIDN' else ''}{name}" for name in methods.values()]
-    heads += [f"{'all 14 scenes: ' if name == 'OIDN' else ''}{name}" for name in methods.values()]
+    methods = {**RIVALS, "ngpt-combine": "`ngpt-combine`", "ngpt-fast": "`ngpt-fast`"}
+    firsts = {"classroom, blind: ": GROUPS["blind"], "all 14 scenes: ": EVERYONE}
+    heads = [f"{first if name == 'mitsuba' else ''}{text}" for first in firsts for name, text in methods.items()]
     lines = heading("spp of gradients", *heads)
     for n in table.counts:
         cells = []
-        for scenes in (GROUPS["blind"], EVERYONE):
+        for scenes in firsts.values():
             means = [table.mean(scenes, n, method) for method in methods]
             cells += [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
         lines.append(f"| {n} | {' | '.join(cells)} |")
@@ -201,11 +235,13 @@ def cells_of_readme(table: Cells) -> str:
         "ngpt-primal": "uses OIDN, no gradients",
         "ngpt-fast": "uses gradients, no OIDN",
     }
-    lines = heading("network", "less error than OIDN: classroom", "three other rooms", "all scenes", "less FLIP")
+    groups = {"classroom": GROUPS["blind"], "three other rooms": GROUPS["rooms"], "all scenes": EVERYONE}
+    lines = heading("network", "less than", *(f"error: {name}" for name in groups), "FLIP: all scenes")
     for method, what in told.items():
-        won = [table.below(scenes, method, "oidn") for scenes in (GROUPS["blind"], GROUPS["rooms"], EVERYONE)]
-        won.append(table.below(EVERYONE, method, "oidn", "FLIP"))
-        lines.append(f"| `{method}` ({what}) | {' | '.join(won)} |")
+        for rival, text in RIVALS.items():
+            won = [table.below(scenes, method, rival) for scenes in groups.values()]
+            won.append(table.below(EVERYONE, method, rival, "FLIP"))
+            lines.append(f"| `{method}` ({what}) | {text} | {' | '.join(won)} |")
     return "\n".join(lines)
 
 

@@ -5,12 +5,11 @@
     python -m bench.tables                                   # all tables anew, from the numbers that are kept
 
 Numbers are kept in bench/results/NAME.json: medians over seeds of the primary metric and of FLIP, cell by cell, and
-what a sample of each sampler costs. ``PAGES`` says which page a table is in, and which of three kinds it is of:
+what a sample of each sampler costs. ``PAGES`` says which page a table is in, and which of two kinds it is of:
 
     by_scene   errors over the least of the scene, bold where it is the least; below, what that is, and the costs of a
                sample over those of `primal`
     means      geometric means over the scenes at each number of samples; the least is bold
-    ratios     of columns that differ in their samples alone, and over what a user would take instead
 """
 
 import argparse
@@ -67,37 +66,7 @@ def means(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
-# What is compared with what in the table of better samples
-_BETTER = (
-    ("ngpt-combine (gpt)", "ngpt-combine (gpt-before)"),
-    ("ngpt-fast (gpt)", "ngpt-fast (gpt-before)"),
-    ("wcv (gpt)", "wcv (gpt-before)"),
-    ("oidn (primal)", "oidn (mitsuba)"),
-    ("ngpt-primal (primal)", "ngpt-primal (mitsuba)"),
-    ("ngpt-combine (gpt)", "oidn (mitsuba)"),
-    ("ngpt-primal (primal)", "oidn (mitsuba)"),
-)
-
-
-def ratios(result: dict[str, Any]) -> str:
-    """Errors and FLIP of one column over those of another, geometric means over scenes; the worst scene in brackets."""
-    counts = sorted({cell["spp"] for cell in result["cells"]})
-    lines = heading("error of / over that of", *(f"{n} spp" for n in counts))
-    of = {(cell["scene"], cell["spp"], cell["method"]): cell for cell in result["cells"]}
-    scenes = list(dict.fromkeys(cell["scene"] for cell in result["cells"]))
-    for one, other in _BETTER:
-        texts = []
-        for n in counts:
-            error, flip = (
-                [of[scene, n, one][key] / of[scene, n, other][key] for scene in scenes] for key in ("error", "FLIP")
-            )
-            texts.append(f"{mean(error):.2f} ({max(error):.2f}), FLIP {mean(flip):.2f}")
-        lines.append(f"| `{one}` / `{other}` | {' | '.join(texts)} |")
-    return "\n".join(lines)
-
-
 PAGES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
-    "points": ("docs/samplers/points.md", ratios),
     "bidirectional": ("docs/samplers/bidirectional.md", by_scene),
     "photons": ("docs/samplers/photons.md", by_scene),
     "photons-media": ("docs/samplers/photons.md", by_scene),
