@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.common import save, write_page
-from bench.tables import cells_of, heading
+from bench.tables import RIVALS, cells_of, heading
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 
 ROOT = Path(__file__).parents[1]
@@ -27,8 +27,6 @@ GROUPS = {
     "watched": ("lamp", "staircase", "glass-of-water"),
     "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
 }
-# What a user would take instead, and the same denoiser on our own samples
-RIVALS = {"mitsuba": "Mitsuba + OIDN", "oidn": "OIDN"}
 COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn", "mitsuba")
 PAIRS = (
     *((method, rival) for rival in RIVALS for method in ("ngpt-combine", "ngpt-primal", "ngpt-fast")),

@@ -5,11 +5,12 @@
     python -m bench.tables                                   # all tables anew, from the numbers that are kept
 
 Numbers are kept in bench/results/NAME.json: medians over seeds of the primary metric and of FLIP, cell by cell, and
-what a sample of each sampler costs. ``PAGES`` says which page a table is in, and which of two kinds it is of:
+what a sample of each sampler costs. ``PAGES`` says which page a table is in, and which of three kinds it is of:
 
     by_scene   errors over the least of the scene, bold where it is the least; below, what that is, and the costs of a
                sample over those of `primal`
     means      geometric means over the scenes at each number of samples; the least is bold
+    rivals     errors over those of OIDN on our samples and on Mitsuba's, means over all cells
 """
 
 import argparse
@@ -66,7 +67,30 @@ def means(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+# Columns of evaluations, and what tables call them: OIDN on our own samples, and what a user would take instead
+RIVALS = {"oidn": "OIDN", "mitsuba": "Mitsuba + OIDN"}
+
+
+def rivals(result: dict[str, Any]) -> str:
+    of = {(cell["scene"], cell["spp"], cell["method"]): cell for cell in result["cells"]}
+    methods = [name for name in dict.fromkeys(method for *_, method in of) if name not in RIVALS]
+    places = list(dict.fromkeys((scene, spp) for scene, spp, _ in of))
+    lines = heading(f"{len(places)} cells", *(f"`{method}`" for method in methods))
+    for rival, text in RIVALS.items():
+        over = {
+            (method, key): [of[*p, method][key] / of[*p, rival][key] for p in places if (*p, method) in of]
+            for method in methods
+            for key in ("error", "FLIP")
+        }
+        less = [f"{sum(r < 1 for r in over[m, 'error'])} of {len(over[m, 'error'])}" for m in methods]
+        lines.append(f"| less error than {text} | {' | '.join(less)} |")
+        for key in ("error", "FLIP"):
+            lines.append(f"| {key} over its | {' | '.join(short(mean(over[m, key])) for m in methods)} |")
+    return "\n".join(lines)
+
+
 PAGES: dict[str, tuple[str, Callable[[dict[str, Any]], str]]] = {
+    "media": ("docs/samplers/media.md", rivals),
     "bidirectional": ("docs/samplers/bidirectional.md", by_scene),
     "photons": ("docs/samplers/photons.md", by_scene),
     "photons-media": ("docs/samplers/photons.md", by_scene),
