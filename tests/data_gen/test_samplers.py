@@ -162,7 +162,7 @@ def test_points_change_noise_alone(renderer, name, points):
     """The mean stays, and blocks of pixels have no more noise: dimensions that hang together would add some."""
     scene, found = scene_for(renderer, name, (24, 24)), []
     for kind, first in ((points, 0), ("independent", 100)):
-        stacks = render_ours(scene, name, batches=16, spp=32, seed=first, points=kind)
+        stacks = render_ours(scene, name, batches=16, spp=16, seed=first, points=kind)
         found.append({layer: np.stack([stack[layer] for stack in stacks]) for layer in LAYERS if layer in stacks[0]})
     ratios = []
     for layer in found[0]:
