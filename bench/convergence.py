@@ -86,19 +86,21 @@ def slope(counts: list[int], errors: list[float]) -> float:
 
 
 def picture(rows: list[dict], counts: list[int]) -> str:
-    """Errors of `primal` over those of independent points at one sample, geometric means over scenes."""
+    """Errors of `primal` over those of pixels with independent points at one sample, geometric means over scenes."""
     found = {}
     for area in AREAS:
         for points in POINTS:
             of_scenes = [
                 np.divide(row["errors"], base["errors"][0])
                 for row, base in zip(
-                    *(of(rows, sampler="primal", points=p, of=area) for p in (points, "independent")), strict=True
+                    of(rows, sampler="primal", points=points, of=area),
+                    of(rows, sampler="primal", points="independent", of="pixels"),
+                    strict=True,
                 )
             ]
             means = np.exp(np.mean(np.log(of_scenes), axis=0))
             found[f"{points}, {area}"] = list(zip(counts, means, strict=True)), math.nan
-    return curves.draw(found, "samples per pixel", "RMSE over that of 1 independent sample")
+    return curves.draw(found, "samples per pixel", "RMSE over pixels of 1 sample")
 
 
 def of(rows: list[dict], **wanted: str) -> Iterator[dict]:
