@@ -12,7 +12,7 @@ from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 640, 360, 70, 46, 16, 150
-COLORS = ("#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#777777")
+COLORS = ("#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#777777", "#111111")
 
 
 def read_curve(run: Path) -> tuple[list[tuple[int, float]], float]:
@@ -28,7 +28,11 @@ def read_curve(run: Path) -> tuple[list[tuple[int, float]], float]:
     return [(entry["step"], entry["relMSE"] / entry["relMSE primal"]) for entry in scored], base
 
 
-def draw(curves: dict[str, tuple[list[tuple[int, float]], float]]) -> str:
+def draw(
+    curves: dict[str, tuple[list[tuple[int, float]], float]],
+    across: str = "training steps",
+    up: str = "trimmed relMSE over the primal's",
+) -> str:
     """An SVG of curves by name."""
     steps = [step for curve, _ in curves.values() for step, _ in curve]
     values = [v for curve, base in curves.values() for v in (*(e for _, e in curve), base) if math.isfinite(v)]
@@ -64,10 +68,10 @@ def draw(curves: dict[str, tuple[list[tuple[int, float]], float]]) -> str:
                 f'<text x="{WIDTH - RIGHT + 8}" y="{y(base) + 4:.1f}" fill="{color}">its base</text>'
             )
     middle = (LEFT + WIDTH - RIGHT) / 2
-    parts.append(f'<text x="{middle}" y="{HEIGHT - 10}" text-anchor="middle">training steps</text>')
+    parts.append(f'<text x="{middle}" y="{HEIGHT - 10}" text-anchor="middle">{across}</text>')
     parts.append(
         f'<text transform="translate(16 {(HEIGHT - BOTTOM + TOP) / 2}) rotate(-90)" text-anchor="middle">'
-        "trimmed relMSE over the primal's</text></svg>"
+        f"{up}</text></svg>"
     )
     return "\n".join(parts) + "\n"
 

@@ -1,0 +1,58 @@
+"""The same noise before and after: independent points and uniform lamps beside better samples, and both denoised.
+
+    python -m bench.noise lamp.xml
+
+writes docs/images/points.jpg. Numbers are the relative RMSE of the crop that is shown, against many samples.
+"""
+
+import argparse
+import os
+from pathlib import Path
+
+import numpy as np
+
+from bench import panels
+from ngpt.methods import reconstruct
+from ngpt.report.display import auto_exposure, to_srgb8
+
+BEFORE = {"points": "independent", "lamps": "uniform"}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", help="a scene file or a built-in scene")
+    parser.add_argument("--size", type=int, nargs=2, default=(144, 96), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--crop", type=int, nargs=4, default=(36, 24, 72, 48), metavar=("X", "Y", "WIDTH", "HEIGHT"))
+    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--reference", type=int, default=1024)
+    parser.add_argument("--method", default="oidn")
+    parser.add_argument("--picture", type=Path, default=Path("docs/images/points.jpg"))
+    args = parser.parse_args()
+
+    from data_gen.backend import use_variant
+
+    use_variant()
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(os.fspath(args.scene), tuple(args.size))
+    x, y, width, height = args.crop
+    crop = np.s_[y : y + height, x : x + width]
+    reference = render_stack(scene, args.reference, 1, "primal", features=False)["primal"][crop]
+    exposure = auto_exposure(reference)
+    headings, tiles = [], []
+    for name, options in (("before", BEFORE), ("better samples", {})):
+        stack = render_stack(scene, args.spp, 0, "primal", **options)
+        images = [stack["primal"][crop], reconstruct(stack, args.method).image[crop]]
+        errors = [np.sqrt(np.square(image - reference).mean()) / reference.mean() for image in images]
+        headings.append([name, f"error {errors[0]:.3f}", f"{args.method}: {errors[1]:.3f}"])
+        tiles.append([panels.scaled(to_srgb8(image, exposure), (5 * width, 5 * height)) for image in images])
+        print(*headings[-1])
+    headings.append(["reference", f"{args.reference} spp", ""])
+    blank = np.full((5 * height, 5 * width, 3), 255, np.uint8)
+    tiles.append([panels.scaled(to_srgb8(reference, exposure), (5 * width, 5 * height)), blank])
+    panels.save(args.picture, panels.columns(headings, tiles))
+
+
+if __name__ == "__main__":
+    main()
