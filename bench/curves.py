@@ -12,7 +12,7 @@ from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output
 
 WIDTH, HEIGHT, LEFT, BOTTOM, TOP, RIGHT = 640, 360, 70, 46, 16, 150
-COLORS = ("#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#777777", "#111111")
+COLORS = ("#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#777777")
 
 
 def read_curve(run: Path) -> tuple[list[tuple[int, float]], float]:

@@ -1,6 +1,6 @@
 """The same noise before and after: independent points and uniform lamps beside better samples, and both denoised.
 
-    python -m bench.noise lamp.xml
+    python -m bench.noise diffuse
 
 writes docs/images/points.jpg. Numbers are the relative RMSE of the crop that is shown, against many samples.
 """
@@ -21,9 +21,9 @@ BEFORE = {"points": "independent", "lamps": "uniform"}
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", help="a scene file or a built-in scene")
-    parser.add_argument("--size", type=int, nargs=2, default=(144, 96), metavar=("WIDTH", "HEIGHT"))
-    parser.add_argument("--crop", type=int, nargs=4, default=(36, 24, 72, 48), metavar=("X", "Y", "WIDTH", "HEIGHT"))
-    parser.add_argument("--spp", type=int, default=16)
+    parser.add_argument("--size", type=int, nargs=2, default=(360, 240), metavar=("WIDTH", "HEIGHT"))
+    parser.add_argument("--crop", type=int, nargs=4, default=(120, 70, 120, 80), metavar=("X", "Y", "WIDTH", "HEIGHT"))
+    parser.add_argument("--spp", type=int, default=4)
     parser.add_argument("--reference", type=int, default=1024)
     parser.add_argument("--method", default="oidn")
     parser.add_argument("--picture", type=Path, default=Path("docs/images/points.jpg"))
@@ -46,11 +46,11 @@ def main() -> None:
         images = [stack["primal"][crop], reconstruct(stack, args.method).image[crop]]
         errors = [np.sqrt(np.square(image - reference).mean()) / reference.mean() for image in images]
         headings.append([name, f"error {errors[0]:.3f}", f"{args.method}: {errors[1]:.3f}"])
-        tiles.append([panels.scaled(to_srgb8(image, exposure), (5 * width, 5 * height)) for image in images])
+        tiles.append([panels.scaled(to_srgb8(image, exposure), (3 * width, 3 * height)) for image in images])
         print(*headings[-1])
     headings.append(["reference", f"{args.reference} spp", ""])
-    blank = np.full((5 * height, 5 * width, 3), 255, np.uint8)
-    tiles.append([panels.scaled(to_srgb8(reference, exposure), (5 * width, 5 * height)), blank])
+    blank = np.full((3 * height, 3 * width, 3), 255, np.uint8)
+    tiles.append([panels.scaled(to_srgb8(reference, exposure), (3 * width, 3 * height)), blank])
     panels.save(args.picture, panels.columns(headings, tiles))
 
 
