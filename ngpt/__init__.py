@@ -11,6 +11,7 @@ temporal = ngpt.Temporal()                                      # frames of a sh
 help(ngpt.denoise) lists the methods, what they need, and their options.
 """
 
+import os
 from importlib import import_module
 from typing import TYPE_CHECKING
 
@@ -25,6 +26,10 @@ if TYPE_CHECKING:
     from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.sequence.history import Temporal
     from ngpt.stack import GradientStack
+
+# Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this once, as it is loaded, and
+# who loads it first may not be us: exporters of PyTorch do, too.
+os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 __all__ = [
     "METHODS",

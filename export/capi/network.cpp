@@ -2,6 +2,7 @@
 
 #include <algorithm>
 #include <chrono>
+#include <cstdlib>
 #include <filesystem>
 #include <fstream>
 #include <future>
@@ -31,6 +32,12 @@ bool ends_with(const std::string &text, const std::string &end) {
 void find_runtime() {
     static std::once_flag once;
     std::call_once(once, [] {
+        // Official builds send telemetry by themselves, unless this is set before the first environment is made.
+#ifdef _WIN32
+        _putenv_s("ORT_DISABLE_TELEMETRY", "1");
+#else
+        setenv("ORT_DISABLE_TELEMETRY", "1", 0);
+#endif
         const OrtApi *api = OrtGetApiBase()->GetApi(ORT_API_VERSION);
         if (!api)
             throw Failure(NGPT_FAILED, std::string("ONNX Runtime ") + OrtGetApiBase()->GetVersionString() +
@@ -68,6 +75,7 @@ Network::Network(const std::string &path, int threads) : path(path) {
     find_runtime();
     // What goes wrong comes as an exception; in the log it would stand a second time.
     environment_ = Ort::Env(ORT_LOGGING_LEVEL_FATAL, "ngpt");
+    environment_.DisableTelemetryEvents();
     image_ = load(path, threads);
     Ort::AllocatorWithDefaultOptions allocator;
     const Ort::ModelMetadata about = image_.session.GetModelMetadata();

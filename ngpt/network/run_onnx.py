@@ -204,6 +204,8 @@ def session(path: str, _modified: int, device: str, threads: int):
         raise NgptError("ONNX Runtime is not installed: pip install onnxruntime") from error
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
+    # Off already where ngpt was imported before it
+    onnxruntime.disable_telemetry_events()
     provider, available = DEVICES[device], onnxruntime.get_available_providers()
     if provider not in available:
         have = [name for name, provider in DEVICES.items() if provider in available]

@@ -19,6 +19,8 @@ async function main([path, folder, output, tile = "0", runs = "1"]) {
     console.error("usage: node host.mjs MODEL.onnx FOLDER OUTPUT.pfm [TILE [RUNS]]");
     return 2;
   }
+  // Official builds send telemetry by themselves, unless this is set before they are loaded.
+  process.env.ORT_DISABLE_TELEMETRY ??= "1";
   // In node_modules beside this file, or where NODE_PATH says.
   const ort = createRequire(import.meta.url)("onnxruntime-node");
   const model = await Model.open(ort, readFileSync(path), readFileSync(path.replace(SUFFIX, ".statistics.onnx")));
