@@ -3,7 +3,7 @@
 import numpy as np
 
 from ngpt.classical.controlvariates import SWEEPS, decay
-from ngpt.classical.variances import FLOOR
+from ngpt.classical.variances import FLOOR, SHARED
 from ngpt.export.builder import Value, channels, op, repeat
 from ngpt.export.graphs import variances
 
@@ -24,7 +24,7 @@ def wcv(
     smooth, inside = variances.smoothed(primal, *variance)
     noisy = op.Greater(mean, 0.0)
     relative = op.Where(noisy, smooth / op.Where(noisy, mean, 1.0) + FLOOR, 1.0)
-    v = channels(relative, 0, 1)
+    v = channels(relative, 0, 1) / SHARED
     vx, vy = (
         op.Where(op.And(op.Greater(channels(inside, i, i + 1), 0.0), known), channels(relative, i, i + 1), _NEVER)
         for i, known in ((1, trusted[0]), (2, trusted[1]))
