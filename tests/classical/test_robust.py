@@ -7,7 +7,7 @@ from solvers import noisy_stack
 from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.classical.energy import MOST, keep_energy
 from ngpt.classical.gradients import forward_differences
-from ngpt.classical.variances import TYPICAL, smooth_variances
+from ngpt.classical.variances import SHARED, TYPICAL, smooth_variances
 from ngpt.measure.metrics import relmse
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -85,7 +85,7 @@ def test_no_difference_is_believed_for_its_luck():
     variances[1][4, 5] = 0
     _, (x, _) = smooth_variances(*variances)
     assert x[0, 4, 5] > 0.5 * x[0, 0, 0]
-    assert x[0, 0, 0] == pytest.approx(TYPICAL * smooth_variances(*variances)[0][0, 0, 0], rel=0.01)
+    assert x[0, 0, 0] == pytest.approx(TYPICAL * SHARED * smooth_variances(*variances)[0][0, 0, 0], rel=0.01)
 
 
 @pytest.mark.parametrize("name", WEIGHTED)
