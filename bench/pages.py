@@ -214,7 +214,12 @@ def errors_by_method(table: Cells) -> str:
 
 
 def errors_of_readme(table: Cells) -> str:
-    methods = {**RIVALS, "ngpt-combine": "`ngpt-combine`", "ngpt-fast": "`ngpt-fast`"}
+    methods = {
+        "mitsuba": RIVALS["mitsuba"],
+        "oidn": RIVALS["oidn"],
+        "ngpt-combine": "`ngpt-combine`",
+        "ngpt-fast": "`ngpt-fast`",
+    }
     firsts = {"classroom, blind: ": GROUPS["blind"], "all 14 scenes: ": EVERYONE}
     heads = [f"{first if name == 'mitsuba' else ''}{text}" for first in firsts for name, text in methods.items()]
     lines = heading("spp of gradients", *heads)
