@@ -5,7 +5,12 @@ import pytest
 from scipy.stats import kstest
 from unbiased import load
 
+from data_gen.samplers import SAMPLERS
+from ngpt.errors import NgptError
+
 SIDE = 16
+# What gathers photons alone
+BY_PHOTONS = ("ppm", "gpm", "vpm", "gvpm", "bre", "gbre", "beams", "gbeams", "planes", "gplanes")
 
 
 @pytest.fixture
@@ -306,3 +311,70 @@ def test_lamps_take_noise_away_and_no_light(renderer, sampler):
     means = [images.reshape(16, -1).mean(axis=1) for images in found]
     z = (means[0].mean() - means[1].mean()) / np.sqrt(sum(part.var(ddof=1) for part in means) / 16)
     assert abs(z) < 4
+
+
+def box(mi, weight):
+    """Within a grey box, two lamps beside each other, a ball and a square; the ball is chosen by ``weight``."""
+    Transform = mi.ScalarTransform4f
+
+    def glows(lamp, radiance, weight, place):
+        emitter = {"type": "area", "id": lamp, "sampling_weight": weight}
+        return {"emitter": emitter | {"radiance": {"type": "rgb", "value": radiance}}, "to_world": place}
+
+    return {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 3},
+        "sensor": {
+            "type": "perspective",
+            "to_world": Transform().look_at([0, -0.9, 0], [0, 1, -0.3], [0, 0, 1]),
+            "film": {"type": "hdrfilm", "width": 24, "height": 16, "rfilter": {"type": "box"}},
+        },
+        "walls": {"type": "cube", "flip_normals": True},
+        "ball": {"type": "sphere"} | glows("hidden", 4.0, weight, Transform().translate([-0.5, -0.2, 0.6]).scale(0.3)),
+        "square": {"type": "rectangle"}
+        | glows("seen", 4.0, 1.0, Transform().translate([0.5, -0.2, 0.98]).rotate([1, 0, 0], 180).scale(0.4)),
+    }
+
+
+def in_fog(description):
+    """The same seen by a camera in fog."""
+    fog = {"type": "homogeneous", "id": "fog", "albedo": 0.7, "sigma_t": 0.3}
+    scene = {name: part for name, part in description.items() if name != "type"}
+    scene["sensor"] = scene["sensor"] | {"medium": {"type": "ref", "id": "fog"}}
+    return {"type": "scene", "fog": fog} | scene | {"integrator": {"type": "volpath", "max_depth": 3}}
+
+
+@pytest.fixture(scope="module")
+def light_of_box(renderer):
+    """Means of images, where both lamps are chosen."""
+    scene = renderer.load_dict(box(renderer, 1.0))
+    return np.array([np.array(renderer.render(scene, spp=256, seed=100 + seed)).mean() for seed in range(8)])
+
+
+@pytest.mark.parametrize("sampler", SAMPLERS)
+def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, light_of_box, sampler):
+    from data_gen.render import render_stack
+    from data_gen.scenes.facts import scene_facts
+
+    scene = renderer.load_dict(box(renderer, 0.0))
+    if SAMPLERS[sampler].refuses(scene_facts(scene)):
+        scene = renderer.load_dict(in_fog(box(renderer, 0.0)))
+    if sampler in BY_PHOTONS:
+        with pytest.raises(
+            NgptError, match=f"sampler '{sampler}' .*'hidden' has sampling_weight 0; give it a positive"
+        ):
+            render_stack(scene, 1, 0, sampler)
+        return
+    means = np.array([render_stack(scene, 32, seed, sampler)["primal"].mean() for seed in range(8)])
+    z = (means.mean() - light_of_box.mean()) / np.sqrt((means.var(ddof=1) + light_of_box.var(ddof=1)) / 8)
+    assert abs(z) < 5  # about p = 0.001 of so few images
+    assert abs(means.mean() / light_of_box.mean() - 1) < 0.1
+
+
+def test_a_point_that_is_chosen_never_is_off(renderer):
+    from data_gen.render import render_stack
+
+    description = box(renderer, 1.0) | {"point": {"type": "point", "position": [0, 0, 0], "sampling_weight": 0.0}}
+    without = render_stack(renderer.load_dict(box(renderer, 1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
+    found = render_stack(renderer.load_dict(description), 64, 0, "ppm")["primal"].mean()
+    assert found == pytest.approx(without, rel=0.05)

@@ -13,6 +13,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.light_ends import LightEnds, LightRay
+from data_gen.paths.lights import visible
 from data_gen.paths.streams import light_streams
 from data_gen.paths.vertex import Materials
 from data_gen.paths.world import World
@@ -81,6 +82,7 @@ class PhotonIntegrator(GradientIntegrator):
     def prepare(self, scene) -> SamplePass:
         refuse_variants(self.name)
         lights = LightEnds(scene, self.name)
+        _refuse_lamps_never_chosen(scene, self.name)
         fog = Fog(scene, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
         if fog is None and self.instead_of_media:
             raise NgptError(
@@ -105,3 +107,16 @@ class PhotonIntegrator(GradientIntegrator):
         starts, maps = trace(world, random, limits.max_depth - 1, limits.rr_depth, frozen=passes.frozen, edges=edges)
         for photons in maps:
             yield Traced(photons, starts, n, camera.first, self.options["radius"] * passes.width)
+
+
+def _refuse_lamps_never_chosen(scene, sampler: str) -> None:
+    """No photons start at a lamp of weight 0, so that its light would be missing. Mitsuba's paths meet it by chance.
+
+    Points and single directions of weight 0 are met by nothing: they are off, in Mitsuba as well.
+    """
+    for index, emitter in enumerate(scene.emitters()):
+        if visible(emitter) and scene.pdf_emitter(mi.UInt32(index))[0] == 0:
+            raise NgptError(
+                f"sampler '{sampler}' cannot render this scene: its photons start at lamps that are chosen, and "
+                f"emitter '{emitter.id()}' has sampling_weight 0; give it a positive one, or use --sampler gpt"
+            )
