@@ -30,10 +30,10 @@ FLOOR = 3e-3
 # Of 2, 3 and 4 wcv has the least error with 2, by 1 %, and wl2 with 3.
 TYPICAL = 3
 
-# What a difference's variance counts beside the primal's. Neighbouring pixels share paths, so that errors of differences
-# cancel in sums, which is what a reconstruction makes of them: means over blocks of 8x8 have .56 to .92 of the variance
-# that independent ones would have (docs/samplers/points.md), those of the primal .8 to 1. Of 1, .7, .5 and .35, wcv and
-# wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on.
+# What a difference's variance counts beside the primal's. Neighbouring pixels share paths, so that errors of
+# differences cancel in sums, which is what a reconstruction makes of them: means over blocks of 8x8 have .56 to .92 of
+# the variance that independent ones would have (docs/samplers/points.md), those of the primal .8 to 1. Of 1, .7, .5 and
+# .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on (docs/lab/log).
 SHARED = 0.6
 
 # What counts as no variance, so that derivatives of roots are finite.
