@@ -28,7 +28,7 @@ from scipy.sparse import csr_matrix
 
 from ngpt.classical.controlvariates import SWEEPS, decay
 from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
-from ngpt.classical.variances import FLOOR, smoothed
+from ngpt.classical.variances import FLOOR, SHARED, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
 
 # Times the squared difference of two interpolations, what is added to the variance of dt. Of 3, 10 and 30 the one of
@@ -121,7 +121,8 @@ class _Still:
     def divide(self, level: float) -> None:
         """Variances are relative to those of the whole window from here on."""
         self.primal, self.x, self.y = (
-            _relative(v, level)[..., None].astype(self.dtype) for v in (self.primal, self.x, self.y)
+            (share * _relative(v, level))[..., None].astype(self.dtype)
+            for share, v in ((1, self.primal), (SHARED, self.x), (SHARED, self.y))
         )
         if self.trusted is not None:
             self.x[~self.trusted[0][:, :-1]] = np.inf

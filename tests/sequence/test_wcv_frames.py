@@ -5,9 +5,10 @@ import pytest
 
 from ngpt.classical.controlvariates import decay, wcv
 from ngpt.classical.gradients import forward_differences
+from ngpt.classical.variances import FLOOR, SHARED
 from ngpt.sequence import wcv_frames as module
 from ngpt.sequence.warp import bilinear_taps, warped
-from ngpt.sequence.wcv_frames import FLOOR, Frame, Link, wcv_frames
+from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
 
 SIZE = (12, 16, 3)
 
@@ -81,6 +82,7 @@ def test_it_is_the_iteration_of_its_equation_pixel_by_pixel(rng, monkeypatch):
     counts = [height * width, height * (width - 1), (height - 1) * width]
     level = (counts[0] * sums["p"] + (counts[1] + counts[2]) * sums["d"]) / sum(counts)
     p, d, t = (v / level + FLOOR for v in (sums["p"], sums["d"], flat[2]))
+    d *= SHARED
     u = [np.array(f.image) for f in frames]
     for factor in decay(3):
         own, new = factor * p, [np.array(v) for v in u]
