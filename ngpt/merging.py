@@ -43,8 +43,9 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp``, ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all
     other attributes are those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in
-    size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or ``ngpt:seed``, results of a
-    reconstruction, and channels of unknown meaning.
+    size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are
+    negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no numbers, results of a reconstruction, and
+    channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -69,7 +70,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     }
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
-            attributes[name] = sum(stack.attributes[name] for stack in stacks)
+            attributes[name] = sum(_number(stack, name) for stack in stacks)
     merged = GradientStack({name: layer.astype(np.float32) for name, layer in layers.items()}, attributes)
     further = [pass_through(stack) for stack in stacks]
     if not further[0]:
@@ -80,7 +81,17 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
 def _counts(stack: GradientStack, spp: int) -> np.ndarray:
     """Samples of each pixel, (H, W, 1) double precision."""
     if "samples" in stack:
-        return stack["samples"].astype(np.float64)
+        counts = stack["samples"].astype(np.float64)
+        wrong = ~(np.isfinite(counts) & (counts >= 0))
+        if wrong.any():
+            y, x, _ = np.argwhere(wrong)[0]
+            raise NgptError(
+                f"{stack.path}: layer 'samples' has {counts[y, x, 0]:g} at pixel ({x}, {y}), and {int(wrong.sum())} of "
+                f"{wrong.size} pixels are no number of samples; render it again"
+            )
+        if not counts.any():
+            raise NgptError(f"{stack.path}: layer 'samples' is 0 in all pixels; there is nothing to merge")
+        return counts
     return np.full((stack.height, stack.width, 1), float(spp))
 
 
@@ -186,6 +197,14 @@ def _samples(stack: GradientStack) -> int:
     if not isinstance(spp, int | np.integer) or spp < 1:
         raise NgptError(f"{stack.path}: has no attribute 'ngpt:spp', so its weight is not known; render it with ngpt")
     return int(spp)
+
+
+def _number(stack: GradientStack, name: str) -> float:
+    value = stack.attributes[name]
+    # Files of elsewhere may hold anything under our names.
+    if not isinstance(value, int | float | np.number) or not np.isfinite(value) or value < 0:
+        raise NgptError(f"{stack.path}: attribute '{name}' is {value!r}, and no number that could be summed; remove it")
+    return value
 
 
 def _seeds(stack: GradientStack) -> list[str]:
