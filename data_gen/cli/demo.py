@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--scene", action="append", metavar="NAME", help="built-in scene; may be repeated (default: all without media)"
     )
     parser.add_argument("--spp", type=positive, default=16, help="paths per pixel of the stacks (default: 16)")
-    parser.add_argument("--reference-spp", type=positive, default=2048, help="of the references (default: 2048)")
+    parser.add_argument("--reference-spp", type=positive, default=1024, help="of the references (default: 1024)")
     parser.add_argument("--size", type=size, default=(240, 160), metavar="WxH", help="pixels (default: 240x160)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb)")
     add_force(parser)
