@@ -7,10 +7,12 @@ import re
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from ngpt.stack import GradientStack
 
-TUTORIAL = Path(__file__).parents[2] / "docs" / "start" / "tutorial.ipynb"
+DOCS = Path(__file__).parents[2] / "docs"
+TUTORIAL = DOCS / "start" / "tutorial.ipynb"
 
 
 def rows(html):
@@ -38,12 +40,12 @@ def test_a_stack_without_primal_or_numbers_shows_itself_too():
     assert rows(stack._repr_html_()) == {"depth": ["nan", "nan", "nan", "1"]}
 
 
-def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
-    """Each cell as a notebook runs it: all in one namespace, the last expression shown."""
-    cells = json.loads(TUTORIAL.read_text())["cells"]
+def run(notebook, folder, monkeypatch):
+    """Each cell as a notebook runs it: all in one namespace, which is returned, and what last expressions show."""
+    cells = json.loads(notebook.read_text())["cells"]
     assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells if cell["cell_type"] == "code")
-    monkeypatch.chdir(tmp_path)
-    made, shown = {}, []
+    monkeypatch.chdir(folder)
+    made, shown = {"__name__": "__main__"}, []
     for cell in cells:
         if cell["cell_type"] == "code":
             *statements, last = ast.parse("".join(cell["source"])).body
@@ -52,6 +54,11 @@ def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
                 shown.append(eval(compile(ast.Expression(last.value), cell["id"], "eval"), made))
             else:
                 exec(compile(ast.Module([*statements, last], []), cell["id"], "exec"), made)
+    return made, shown
+
+
+def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
+    made, shown = run(TUTORIAL, tmp_path, monkeypatch)
     first, second = (value for value in shown if isinstance(value, GradientStack))
     assert {"dx", "primal_var"} <= rows(first._repr_html_()).keys() and {"primal"} == rows(second._repr_html_()).keys()
     errors = dict(re.findall(r"^(\S+) +relMSE (\S+)", capsys.readouterr().out, re.M))
@@ -60,8 +67,31 @@ def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
     assert made["difference"] < 1e-4
 
 
-def test_links_of_the_tutorial_lead_somewhere():
-    links = re.findall(
-        r"\]\(([^)]+)\)", "".join(text for cell in json.loads(TUTORIAL.read_text())["cells"] for text in cell["source"])
-    )
-    assert len(links) > 5 and [link for link in links if not (TUTORIAL.parent / link).exists()] == []
+def test_a_sampler_of_ones_own(renderer, tmp_path, monkeypatch):
+    from data_gen.samplers import SAMPLERS
+
+    with monkeypatch.context() as patched:
+        patched.setitem(SAMPLERS, "mine", None)  # which takes it out again
+        del SAMPLERS["mine"]
+        made, _ = run(DOCS / "samplers" / "own-sampler.ipynb", tmp_path, patched)
+    assert "mine" not in SAMPLERS
+    assert abs(made["z"]) < 4.5 and made["gains"]["gpt"] < made["gains"]["mine"] < 1
+
+
+def test_a_shot(renderer, tmp_path, monkeypatch):
+    made, _ = run(DOCS / "use" / "shot.ipynb", tmp_path, monkeypatch)
+    assert made["found"]["with history"] < 0.85 * made["found"]["frame by frame"]
+
+
+@pytest.mark.slow
+def test_training_on_ones_own_scenes(renderer, tmp_path, monkeypatch):
+    made, shown = run(DOCS / "train" / "own-scenes.ipynb", tmp_path, monkeypatch)
+    assert [value for value in shown if isinstance(value, int)] == [0, 0, 0]
+    assert made["image"].shape == (64, 96, 3) and np.isfinite(made["image"]).all()
+
+
+@pytest.mark.parametrize("notebook", sorted(DOCS.rglob("*.ipynb")), ids=lambda path: path.stem)
+def test_links_of_notebooks_lead_somewhere(notebook):
+    text = "".join(line for cell in json.loads(notebook.read_text())["cells"] for line in cell["source"])
+    links = re.findall(r"\]\(([^)]+)\)", text)
+    assert links and [link for link in links if not (notebook.parent / link).exists()] == []
