@@ -1,11 +1,11 @@
-"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error beside that of plain ``--time T``.
+"""Whether ``ngpt render --time T --for auto`` keeps its word: its time, and its error beside that of plain ``--time``.
 
     python -m bench.auto diffuse glossy SCENE.xml ... --times 10 30 60 [--cold] [--beside 1]
 
 Each command runs in a process of its own, and so does the denoising, by what the stack says (``ngpt:for``), or by
-``auto``. Seconds are of the wall, from the start of `ngpt render` to the end of `ngpt denoise`, over the time asked for.
-Errors are trimmed relMSE against two halves of a reference. ``--cold``: no kernel is kept from another run. ``--beside``:
-so many other processes are busy at the same time.
+``auto``. Seconds are of the wall, from the start of `ngpt render` to the end of `ngpt denoise`, over the time that was
+asked for. Errors are trimmed relMSE against two halves of a reference. ``--cold``: no kernel is kept from another run.
+``--beside``: so many other processes are busy at the same time.
 """
 
 import argparse
@@ -94,9 +94,7 @@ def beside(processes: int):
 
 
 def line(row: dict) -> str:
-    told = [
-        f"{name}: {v['sampler']} {v['spp']} {v['method']}, {v['took']:.2f}" for name, v in row.items() if name in FORS
-    ]
+    told = ["{}: {sampler} {spp} {method}, {took:.2f}".format(name, **row[name]) for name in FORS]
     where = f"{row['scene']}, {row['time']:g} s{', cold' if row['cold'] else ''}, beside {row['beside']}"
     return f"{where}: {'; '.join(told)}; error {row['auto']['error'] / row['plain']['error']:.2f}"
 
