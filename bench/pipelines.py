@@ -196,7 +196,7 @@ def _trial(kept: Kept, scene, name: str, limit: float):
     made = []
 
     def make() -> dict:
-        trial = try_out(scene, name, time.process_time, limit)
+        trial, _ = try_out(scene, name, time.process_time, limit)
         if trial is not None:
             made.extend(trial.stacks)
             for i, stack in enumerate(trial.stacks):

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -55,6 +56,7 @@ def render_scene(
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
     chosen: Callable[[Plan], None] = lambda plan: None,
+    said: Callable[[str], None] = lambda line: None,
     **options: Any,
 ) -> Rendered:
     """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
@@ -74,6 +76,7 @@ def render_scene(
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
                     ``stop_on_ctrl_c``
     ``chosen``      called before the render with what a pilot or the scene's description has chosen
+    ``said``        called with a line on each sampler that a pilot tries
 
     The same seed and number of samples give the same bits. Raises NgptError for options that do not exist or make no
     sense, and for scenes that cannot be loaded or that the sampler cannot render.
@@ -92,8 +95,9 @@ def render_scene(
     check_options(sampler, options)
     scene = _loaded(scene, size, parameters)
     pilot = sharing is None and sampler == "auto"
-    plan = _plan(scene, spp, seconds, method if pilot else None, memory) if pilot else None
-    if plan is not None:
+    plan = None
+    if pilot:
+        plan = _plan(scene, spp, seconds, method, memory, said, stop)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
         sharing = _adaptive(None, "auto") if plan.shared else None
@@ -252,10 +256,10 @@ def _adaptive(error: float | None, method: str) -> Adaptive:
     return Adaptive(error, method)
 
 
-def _plan(scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int) -> Plan:
+def _plan(scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int, *told: Any) -> Plan:
     """By a pilot: of the sampler and the method for so many ``seconds``, or, without a ``method``, of the sampler."""
     from data_gen.choosing.plans import plan, plan_sampler
 
     if method is None or seconds is None:
-        return plan_sampler(scene, spp, seconds, memory)
-    return plan(scene, seconds, method, memory)
+        return plan_sampler(scene, spp, seconds, memory, *told)
+    return plan(scene, seconds, method, memory, time.perf_counter, *told)

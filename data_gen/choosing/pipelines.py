@@ -31,8 +31,9 @@ from ngpt.methods import METHODS, reconstruct
 from ngpt.stack import GradientStack
 
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
-WITH_GRADIENTS = ("wcv", "l1", "ngpt-fast", "ngpt-combine")
-WITHOUT = ("primal", "oidn", "ngpt-primal")
+# Those that are best most often come first: where time is short, the others are not measured.
+WITH_GRADIENTS = ("ngpt-combine", "ngpt-fast", "wcv", "l1")
+WITHOUT = ("ngpt-primal", "oidn", "primal")
 # These numbers are those of python -m bench.pipelines on scenes not apart.
 # The powers of the samples by which errors usually fall, of methods that use gradients and of denoisers; the share that
 # the pilot has in such a power, and the steepest and flattest that it may be
@@ -144,17 +145,21 @@ def measure(
     clock: Callable[[], float] = time.perf_counter,
     methods: Callable[[str], list[str]] | None = None,
     shared: bool = True,
+    goes_on: Callable[[], bool] = lambda: True,
 ) -> list[Pipeline]:
     """The pipelines of trials by name of sampler: every method that runs here on every stack that it can use.
 
-    Or those of the ``methods`` that are given for a sampler; samples are ``shared`` out too, or only even.
+    Or those of the ``methods`` that are given for a sampler; samples are ``shared`` out too, or only even. Each sampler
+    has one method at least, and further ones as long as it ``goes_on``.
     """
     witnesses = Witnesses.of(trials)
     found = []
     for name, trial in trials.items():
         halves = [merge(trial.stacks[:2]), merge(trial.stacks[2:])]
         need = None
-        for method in (methods or methods_for)(name):
+        for i, method in enumerate((methods or methods_for)(name)):
+            if i and not goes_on():
+                break
             single, double, after = [], [], []
             for half in range(2):
                 single.append([reconstruct(stack, method).image for stack in trial.stacks[2 * half : 2 * half + 2]])
@@ -171,6 +176,8 @@ def measure(
             pipeline = Pipeline(name, method, spp, two, math.log2(two / one), trial.seconds, min(after), doubt=doubt)
             found.append(pipeline)
             if shared and not SAMPLERS[name].even:
+                if need is None and not goes_on():
+                    continue
                 if need is None:
                     need = _need(merge(halves), clock)
                 found.append(replace(pipeline, adaptive=need[0], choosing=need[1]))

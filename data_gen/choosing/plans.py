@@ -24,10 +24,14 @@ from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
 from ngpt.errors import NgptError
 
-# Of the time that there is, after which no further sampler is tried, and what each may take: of an image and of a
-# render, whose seconds are not all there are
-SHARE, DEAREST = 0.1, 0.2
-_SHARE_OF_RENDER, _DEAREST_OF_RENDER = 0.05, 0.15
+# Of the time that there is, what trials of samplers may take together, and those and the methods: of an image, and
+# of a render, where no method is measured but the quickest
+SHARE, SHARE_WITH_METHODS = 0.2, 0.3
+_SHARE_OF_RENDER = 0.15
+# Seconds for an image below which a pilot costs more than it could gain
+LEAST_SECONDS = 25.0
+# What a method takes that no pilot has measured: to begin, and for a million pixels
+_METHOD_BEGINS, _METHOD_SECONDS = 0.5, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
 # Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
@@ -35,6 +39,19 @@ LONG, LEAST_PIXELS = 200.0, 1 / 16
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.1
+
+
+Said = Callable[[str], None]
+Stop = Callable[[], bool]
+
+
+def silent(line: str) -> None:
+    """Nobody is told."""
+
+
+def never() -> bool:
+    """Nobody asks to stop."""
+    return False
 
 
 @dataclass(frozen=True)
@@ -61,19 +78,35 @@ def explore(
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
     clock: Callable[[], float] = time.perf_counter,
+    said: Said = silent,
+    stop: Stop = never,
 ) -> list[Pipeline]:
-    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them."""
+    """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
+    into the time."""
+    start = clock()
+    able = _able(scene, method)
+    _check_memory(scene, able[0], None, memory)
+    pixels = round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))
+    with at_most(scene, pixels) as scale:
+        trials = try_all(scene, able, lambda _: SHARE * seconds, SHARE * seconds, clock, said, stop)
+    if not trials or stop():
+        return []
+    found = measure(
+        trials,
+        clock,
+        lambda sampler: methods_for(sampler, method),
+        goes_on=lambda: clock() - start < SHARE_WITH_METHODS * seconds and not stop(),
+    )
+    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+
+
+def _able(scene: mi.Scene, method: str) -> list[str]:
+    """The samplers to try, whose stacks the method can use: the one that the description stands for first."""
     names = candidates(scene)
     able = [n for n in sorted(dict.fromkeys([*names, "primal"]), key=_turn(names[0])) if methods_for(n, method)]
     if not able:
         raise NgptError(f"method '{method}' cannot use what the samplers of this scene render; name another, or auto")
-    _check_memory(scene, able[0], None, memory)
-    pixels = round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))
-    trials, scale = _tried(scene, able, 2, pixels, lambda *_: (SHARE * seconds, DEAREST * seconds), clock)
-    if not trials:
-        raise NgptError(f"none of the samplers {', '.join(able)} can render the scene")
-    found = measure(trials, clock, lambda sampler: methods_for(sampler, method))
-    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+    return able
 
 
 def plan(
@@ -82,31 +115,46 @@ def plan(
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
     clock: Callable[[], float] = time.perf_counter,
+    said: Said = silent,
+    stop: Stop = never,
 ) -> Plan:
     """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
 
     Of the ``method`` alone if it is not "auto". The pilot tries the sampler that the scene's description stands for,
-    then ``primal``, then all unbiased others that ``--sampler auto`` compares, and begins none after a tenth of the
-    time. The less time, the smaller are its images. What it measures changes from run to run. Raises NgptError for a
-    method that does not run here or cannot use any of the stacks, and where nothing fits into the time.
+    then ``primal``, then all unbiased others that ``--sampler auto`` compares, as far as they fit into a fifth of the
+    time, compilation included. The less time, the smaller are its images. Where there is no time for a pilot, and where
+    it finds that nothing fits, the description decides, and what is left of the time is rendered. ``said`` is told what
+    is tried; ``stop`` ends the pilot. What it measures changes from run to run. Raises NgptError for a method that does
+    not run here or cannot use any of the stacks.
     """
     start = clock()
-    whole = explore(scene, seconds, method, memory, clock)
+    able = _able(scene, method)
+    whole: list[Pipeline] = []
+    if seconds >= LEAST_SECONDS and not stop():
+        whole = explore(scene, seconds, method, memory, clock, said, stop)
     left = seconds - (clock() - start)
-    ranked = choose(whole, left)
-    if not ranked:
-        raise NgptError(f"nothing fits into {seconds:g} s, of which a pilot took {seconds - left:.2g} s; give more")
-    first = ranked[0]
-    return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+    if ranked := choose(whole, left):
+        first = ranked[0]
+        return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+    after = _METHOD_BEGINS + _METHOD_SECONDS * _pixels(scene) / 1e6
+    why = f"{samplers.choose(scene_facts(scene))[1]}; there is no time for a pilot"
+    return Plan(able[0], method, False, max(left - after, 1e-3), why)
 
 
-def plan_sampler(scene: mi.Scene, spp: int | None, seconds: float | None, memory: int = DEFAULT_MEMORY) -> Plan:
+def plan_sampler(
+    scene: mi.Scene,
+    spp: int | None,
+    seconds: float | None,
+    memory: int = DEFAULT_MEMORY,
+    said: Said = silent,
+    stop: Stop = never,
+) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
     The description alone decides, at no cost, where one sampler alone can render the scene, and where the render is too
     short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has the bits
-    of ``--sampler NAME``. Raises NgptError where no sampler with gradients can render the scene, and before anything is
-    tried where the image does not fit into ``memory`` (MiB).
+    of ``--sampler NAME``. ``said`` and ``stop`` are as of ``plan``. Raises NgptError where no sampler with gradients
+    can render the scene, and before anything is tried where the image does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     sampler, reason = samplers.choose(scene_facts(scene))
@@ -114,51 +162,31 @@ def plan_sampler(scene: mi.Scene, spp: int | None, seconds: float | None, memory
     names = candidates(scene, biased=True)
     if len(names) == 1:
         return described
-    pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-    if (spp is not None and spp * pixels < _LEAST_PATHS) or (seconds is not None and seconds < _LEAST_SECONDS):
+    short = spp is not None and spp * _pixels(scene) < _LEAST_PATHS
+    if short or (seconds is not None and seconds < _LEAST_SECONDS):
         return replace(described, reason=f"{reason}; the render is too short to try others")
     _check_memory(scene, sampler, spp, memory)
+    longest = math.inf if seconds is None else seconds
+    with at_most(scene, PIXELS) as scale:
 
-    def whole(trials: dict[str, Trial], scale: float) -> float:
-        """Seconds of the render, should the scene's own sampler do it; 0 where it cannot."""
-        if sampler not in trials:
-            return 0.0
-        by_samples = math.inf if spp is None else trials[sampler].seconds * spp * scale
-        return min(by_samples, math.inf if seconds is None else seconds)
+        def whole(trials: dict[str, Trial]) -> float:
+            """Seconds of the render, should the scene's own sampler do it; 0 where it cannot."""
+            if sampler not in trials:
+                return 0.0
+            return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
-    def limits(trials: dict[str, Trial], scale: float) -> tuple[float, float]:
-        return _SHARE_OF_RENDER * whole(trials, scale), _DEAREST_OF_RENDER * whole(trials, scale)
-
-    trials, scale = _tried(scene, names, 1, PIXELS, limits)
+        share = _SHARE_OF_RENDER
+        trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, said=said, stop=stop)
     found = (sampler, reason)
-    if trials:
-        found = best_of(
-            measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials, scale) / scale
-        )
+    if sampler in trials and not stop():
+        found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)
     # However long the pilot took, the render is begun.
     left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
     return replace(described, sampler=found[0], reason=found[1], render=left)
 
 
-def _tried(
-    scene: mi.Scene,
-    names: Sequence[str],
-    always: int,
-    pixels: int,
-    limits: Callable[[dict[str, Trial], float], tuple[float, float]],
-    clock: Callable[[], float] = time.perf_counter,
-) -> tuple[dict[str, Trial], float]:
-    """Trials of samplers by name in images of at most so many ``pixels``, and how many times more the scene's own has.
-
-    The first few, ``always``, are tried in any case. ``limits``, asked with their trials and that factor, are the
-    seconds after which no other is begun, and what each of the others may take.
-    """
-    start = clock()
-    with at_most(scene, pixels) as scale:
-        trials = try_all(scene, names[:always], clock=clock)
-        end, dearest = limits(trials, scale)
-        trials |= try_all(scene, names[always:], lambda: clock() - start < end, dearest, clock)
-    return trials, scale
+def _pixels(scene: mi.Scene) -> int:
+    return math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
 
 
 def _check_memory(scene: mi.Scene, sampler: str, spp: int | None, memory: int) -> None:

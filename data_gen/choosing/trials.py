@@ -61,39 +61,60 @@ def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
 def try_all(
     scene: mi.Scene,
     samplers: Sequence[str],
-    goes_on: Callable[[], bool] = lambda: True,
-    limit: float = math.inf,
+    budget: Callable[[dict[str, Trial]], float] = lambda trials: math.inf,
+    first: float = math.inf,
     clock: Callable[[], float] = time.perf_counter,
+    said: Callable[[str], None] = lambda line: None,
+    stop: Callable[[], bool] = lambda: False,
 ) -> dict[str, Trial]:
-    """Trials of those that can render the scene, by name, as far as there is time: each may take ``limit`` seconds of
-    the ``clock``."""
-    trials = {}
-    for name in samplers:
-        if not goes_on():
+    """Trials of those that can render the scene, by name.
+
+    All of them together may take as many seconds of the ``clock`` as the ``budget`` says, which is asked with the
+    trials that there are: one that would not fit into the rest is left out, by what it takes to compile and to render.
+    The ``first`` has a budget of its own, and is compiled in any case. ``said`` is told what is tried, and ``stop``
+    asked whether to end there.
+    """
+    start, slow, trials = clock(), 1.0, {}
+    for i, name in enumerate(samplers):
+        rest = (budget(trials) if i else first) - (clock() - start)
+        compiles = SAMPLERS[name].compiles
+        if i and slow * compiles > rest:
+            continue
+        said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
+        begins = clock()
+        trial, compiled = try_out(scene, name, clock, rest, stop)
+        if stop():
             break
-        if (trial := try_out(scene, name, clock, limit)) is not None:
+        # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
+        # another render nothing is learnt.
+        slow = max(slow, (compiled - begins) / compiles)
+        if trial is not None:
             trials[name] = trial
     return trials
 
 
 def try_out(
-    scene: mi.Scene, sampler: str, clock: Callable[[], float] = time.perf_counter, limit: float = math.inf
-) -> Trial | None:
-    """Four small stacks by a sampler; None where it finds, of this scene, that it cannot render it, and where they are
-    expected to take longer than the ``limit``."""
+    scene: mi.Scene,
+    sampler: str,
+    clock: Callable[[], float] = time.perf_counter,
+    limit: float = math.inf,
+    stop: Callable[[], bool] = lambda: False,
+) -> tuple[Trial | None, float]:
+    """Four small stacks by a sampler, and when its kernels were compiled.
+
+    None for the stacks where it finds, of this scene, that it cannot render it, where they are expected to end later
+    than the ``limit`` from now, and where ``stop`` says so.
+    """
+    begins = clock()
     batch = SAMPLERS[sampler].batch
     spp, seed = max(SPP, 2 * batch), SEED + 8 * list(SAMPLERS).index(sampler)
     # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
     other = batch or 2 * SPP
     try:
-        render_stack(scene, 1, seed, sampler)  # compiles
+        render_stack(scene, 1, seed, sampler)
     except NgptError:
-        return None
-    if limit < math.inf:
-        start = clock()
-        render_stack(scene, max(1, batch), seed, sampler)
-        if (4 * spp + 2 * other) / max(1, batch) * (clock() - start) > limit:
-            return None
+        return None, clock()
+    compiled = clock()
 
     def timed(n: int, seed: int) -> tuple[GradientStack, float]:
         start = clock()
@@ -101,12 +122,16 @@ def try_out(
 
     made, others = [], []
     for i in range(4):
+        if stop():
+            return None, compiled
         made.append(timed(spp, seed + i))
+        if i == 0 and (4 + 2 * other / spp) * made[0][1] > limit - (compiled - begins):
+            return None, compiled
         if i % 2:
             others.append(timed(other, seed + 4 + i)[1])
     seconds = statistics.median(took for _, took in made)
     each = (statistics.median(others) - seconds) / (other - spp)
-    return Trial([stack for stack, _ in made], max(each, 0.2 * seconds / spp))
+    return Trial([stack for stack, _ in made], max(each, 0.2 * seconds / spp)), compiled
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define))
-    found = rows_of(explore(scene, args.seconds or LONG), args.seconds, args.error)
+    # Its own time is not part of the time that it advises on.
+    seen = explore(scene, max(args.seconds or LONG, LONG), said=console.say)
+    if not seen:
+        raise NgptError(f"{args.scene}: no sampler ended its trial within {LONG:g} s; give a smaller --size")
+    found = rows_of(seen, args.seconds, args.error)
     console.say(f"{args.scene}: pilot of {time.perf_counter() - start:.1f} s with compilation")
     if args.json:
         film = scene.sensors()[0].film().crop_size()

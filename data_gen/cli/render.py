@@ -156,6 +156,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
             progress=progress,
             stop=stop,
             chosen=chosen,
+            said=console.say,
             **asked(args),
         )
     if stack.attributes["ngpt:discarded"]:

@@ -114,6 +114,7 @@ class Sampler(Entry):
     ``rank``        "auto" takes the sampler of least rank that can render the scene; 0: never
     ``tried``       whether the pilot of "auto" compares it with others, where it can render the scene: those that were
                     seen to be chosen where they are best (``data_gen.choosing.plans``)
+    ``compiles``    seconds that a core takes to compile its kernels, of most scenes; told for those that are ``tried``
     ``finds``       what light it finds that paths from the camera hardly find: of ``FINDS``
     ``diagnoses``   whether it counts failed shifts, which ``--diagnostics`` writes: ``make`` takes ``diagnostics=True``
     ``batch``       0 if all samples are independent. Else samples per pixel that depend on each other, or splat: a pass
@@ -127,6 +128,7 @@ class Sampler(Entry):
     gradients: bool = field(default=True, kw_only=True)
     rank: int = field(default=0, kw_only=True)
     tried: bool = field(default=False, kw_only=True)
+    compiles: float = field(default=2.0, kw_only=True)
     finds: tuple[str, ...] = field(default=(), kw_only=True)
     diagnoses: bool = field(default=False, kw_only=True)
     batch: int = field(default=0, kw_only=True)

@@ -22,7 +22,7 @@ def seen(renderer, monkeypatch):
         Pipeline("gpt", "wcv", 16, 0.01, usual["wcv"], 0.002, 0.01, adaptive=0.5, choosing=0.001),
         Pipeline("gpt", "l1", 16, 0.05, usual["l1"], 0.002, 0.01),
     ]
-    monkeypatch.setattr(plans, "explore", lambda scene, seconds: found)
+    monkeypatch.setattr(plans, "explore", lambda scene, seconds, **options: found)
     return found
 
 

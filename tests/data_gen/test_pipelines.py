@@ -130,12 +130,26 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
     assert tuple(scene.sensors()[0].film().size()) == (48, 32)
     with pytest.raises(NgptError, match="there is no method 'none'"):
         plans.plan(scene, 200.0, "none")
-    with pytest.raises(NgptError, match="nothing fits into"):
-        plans.plan(scene, 1.0, "wcv", clock=ticking(0.1))
+    # Where there is no time for a pilot the description decides, and what is left is rendered.
+    found = plans.plan(scene, 1.0, "wcv", clock=ticking(0.1))
+    assert (found.sampler, found.method, found.shared) == ("gpt", "wcv", False) and 0 < found.render < 1
+    assert "no time for a pilot" in found.reason
+    found = plans.plan(scene, 30.0, clock=ticking(5.0))
+    assert (found.sampler, found.method) == ("gpt", "auto") and 0 < found.render < 30
+
+
+def test_stop_ends_a_pilot_and_the_render_begins(renderer, monkeypatch):
+    from data_gen.choosing import plans
+
+    scene = load(renderer, "diffuse", (48, 32))
+    told = []
+    found = plans.plan(scene, 200.0, said=told.append, stop=lambda: len(told) > 1)
+    assert [line.split(";")[0] for line in told] == ["pilot: trying 'gpt'", "pilot: trying 'primal'"]
+    assert (found.sampler, found.method) == ("gpt", "auto") and found.render > 0
 
 
 def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
-    """The first two always; and the less time there is, the smaller the images."""
+    """All trials together have a fifth of the time; and the less time, the smaller the images."""
     from data_gen.choosing import plans, trials
 
     scene = load(renderer, "diffuse", (48, 32))
@@ -143,29 +157,47 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
     tried, sizes = [], []
 
-    def try_out(scene, name, clock, limit):
-        assert limit == (math.inf if len(tried) < 2 else 0.2 * seconds)
+    def try_out(scene, name, clock, limit, stop):
+        tried.append((name, limit))
         for _ in range(8):
-            clock()
-        tried.append(name)
+            compiled = clock()
         sizes.append(tuple(int(n) for n in scene.sensors()[0].film().size()))
+        return None, compiled
 
     monkeypatch.setattr(trials, "try_out", try_out)
-    for seconds, names, size in ((20.0, 2, (8, 5)), (250.0, 3, (24, 16)), (300.0, 4, (24, 16))):
+    for seconds, names, size in ((30.0, 1, (9, 6)), (100.0, 2, (17, 11)), (250.0, 3, (24, 16)), (500.0, 4, (24, 16))):
         tried.clear()
-        with pytest.raises(NgptError, match="none of the samplers"):
-            plans.plan(scene, seconds, clock=ticking(1.0))
-        assert tried == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
+        found = plans.plan(scene, seconds, clock=ticking(1.0))
+        assert found.sampler == "gpt" and "no time for a pilot" in found.reason
+        assert [name for name, _ in tried] == ["gpt", "primal", "bdpt", "gbdpt"][:names] and sizes[-1] == size
+        assert all(0 < limit < 0.2 * seconds for _, limit in tried)
+
+
+def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
+    """gbdpt takes three times as long as gpt: where that took 20 s, it is not begun in a rest of 40."""
+    from data_gen.choosing import trials
+
+    scene, tried = load(renderer, "diffuse", (16, 12)), []
+    for took, names in ((20.0, ["gpt"]), (10.0, ["gpt", "gbdpt"])):
+        tried.clear()
+
+        def try_out(scene, name, clock, limit, stop, took=took):
+            tried.append(name)
+            return None, clock() + took
+
+        monkeypatch.setattr(trials, "try_out", try_out)
+        trials.try_all(scene, ["gpt", "gbdpt"], lambda _: 40.0, clock=ticking(0.1))
+        assert tried == names
 
 
 def test_a_sampler_that_takes_too_long_is_not_tried(renderer):
     from data_gen.choosing.trials import try_out
 
     scene = load(renderer, "diffuse", (16, 12))
-    # One look at the clock before a render of a sample, one after it: four renders of 8 and two of 16 take 64 times
-    # that.
-    assert try_out(scene, "primal", ticking(1.0), 63.0) is None
-    assert len(try_out(scene, "primal", ticking(1.0), 65.0).stacks) == 4
+    # A second to compile; a render of 8 samples takes another, and there are four of these and two of 16.
+    assert try_out(scene, "primal", ticking(1.0), 8.5)[0] is None
+    assert len(try_out(scene, "primal", ticking(1.0), 9.5)[0].stacks) == 4
+    assert try_out(scene, "primal", stop=lambda: True)[0] is None
 
 
 def test_a_method_is_tried_where_it_can_run(renderer):

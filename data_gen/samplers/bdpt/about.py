@@ -28,6 +28,7 @@ register(
         options={"joined_depth": joined_depth(10)},
         gradients=False,
         tried=True,
+        compiles=2.0,
         finds=("hidden lamps",),
         batch=4,
     )

@@ -36,6 +36,7 @@ register(
         notes=_notes,
         options={"joined_depth": joined_depth(10), "roughness_threshold": CONNECTABLE},
         tried=True,
+        compiles=6.0,
         finds=("hidden lamps",),
         batch=8,
         lane_bytes=SPLATTING_BYTES + _ROULETTE_BYTES,

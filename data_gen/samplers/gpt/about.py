@@ -53,5 +53,6 @@ register(
         rank=1,
         diagnoses=True,
         tried=True,
+        compiles=2.0,
     )
 )

@@ -28,6 +28,7 @@ _by_photons(
     options=_GATHERED,
     gradients=False,
     tried=True,
+    compiles=3.0,
     finds=("caustics",),
 )
 _by_photons(
