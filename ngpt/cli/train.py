@@ -9,7 +9,7 @@ from ngpt.cli.arguments import add_config
 from ngpt.errors import NgptError
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, exclusive
+from ngpt.system.files import atomic_output, check_output, exclusive
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -21,6 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", help="folder of the run: checkpoint, weights, log; made if it is not there")
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, for example run.steps=1000"
+    )
+    parser.add_argument(
+        "--init",
+        metavar="FILE",
+        help="write the configuration to this file, with all that could be set, and stop there",
     )
     parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
 
@@ -37,6 +42,16 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.training.trainer import Trainer, show
 
     settings = read_settings(config, args.set)
+    if args.init:
+        if args.set:
+            raise NgptError("--init writes what can be set by hand then; leave --set out")
+        from ngpt.training.parameters import template
+
+        target = check_output(args.init)
+        with atomic_output(target) as temporary:
+            temporary.write_text(template(config.read_text()))
+        console.say(f"{target}: {args.config}, and all that could be set; ngpt train --config {target} --out DIR")
+        return 0
     if args.dry_run:
         print(cost(settings))
         return 0
@@ -62,7 +77,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams, say=say)
         if trainer.checkpoint.exists():
             trainer.resume()
-            say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
+            if trainer.step >= settings.run.steps:
+                say(f"{out} has all its {settings.run.steps} steps; --set run.steps=N goes on with it")
+            else:
+                say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
         if processes.rank == 0:
             with atomic_output(out / "settings.json", overwrite=True) as temporary:
                 temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")

@@ -5,6 +5,8 @@ in the first sentence of its file.
 """
 
 import re
+import textwrap
+import tomllib
 from dataclasses import MISSING, Field, fields
 from inspect import cleandoc
 from typing import Any, get_type_hints
@@ -54,6 +56,35 @@ def parameter_tables() -> str:
             defaults = ", ".join(_default(known[name]) for name in names)
             told = meaning.replace("``", "`").replace("|", "\\|")
             lines.append(f"| {keys} | {described(hints[names[0]])} | {defaults} | {told} |")
+    return "\n".join(lines)
+
+
+def template(text: str) -> str:
+    """A configuration, with a comment for every parameter that it leaves at its default: what it means, and what that
+    is. What is set by it stays as it is."""
+    given = tomllib.loads(text)
+    sections = re.split(r"^(?=\[\w+\])", text, flags=re.M)
+    present = [match[1] if (match := re.match(r"\[(\w+)\]", section)) else "" for section in sections]
+    for table in TABLES:
+        if table not in present:
+            sections.append(f"[{table}]\n")
+            present.append(table)
+    lines = []
+    for table, section in zip(present, sections, strict=True):
+        rest = _commented(table, given.get(table, {}) if table else given) if table in TABLES else ""
+        lines.append(f"{section.rstrip()}\n{rest}\n")
+    return "\n".join(line.rstrip("\n") + "\n" for line in lines)
+
+
+def _commented(table: str, given: dict[str, Any]) -> str:
+    """Lines for the parameters of a table that are not ``given``."""
+    known: dict[str, Field] = {field.name: field for field in fields(TABLES[table])}
+    lines = []
+    for names, meaning in entries(TABLES[table]):
+        others = [name for name in names if name not in given]
+        if others:
+            told = textwrap.wrap(meaning.replace("``", ""), 116, initial_indent="# ", subsequent_indent="#   ")
+            lines += [*told, *(f"# {name} = {_toml(known[name].default)}" for name in others)]
     return "\n".join(lines)
 
 

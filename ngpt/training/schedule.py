@@ -15,15 +15,20 @@ def learning_rate(settings: OptimizerSettings, step: int, steps: int) -> float:
              then halves in every ``half_life`` steps [Kettunen et al. 2019, section 5.3, and their code]
     cosine   grows linearly until ``warmup``, then falls as half a cosine to 1 % at the last step
     """
-    rate = settings.learning_rate
+    rate, warmup = settings.learning_rate, warmup_of(settings, steps)
     if settings.schedule == "paper":
-        if step < settings.warmup:
-            return rate * 1e-4 ** (1 - step / settings.warmup)
+        if step < warmup:
+            return rate * 1e-4 ** (1 - step / warmup)
         return rate * 0.5 ** (max(0, step - settings.flat) / settings.half_life)
-    if step < settings.warmup:
-        return rate * (step + 1) / settings.warmup
-    done = (step - settings.warmup) / max(1, steps - 1 - settings.warmup)
+    if step < warmup:
+        return rate * (step + 1) / warmup
+    done = (step - warmup) / max(1, steps - 1 - warmup)
     return rate * (0.01 + 0.99 * 0.5 * (1 + math.cos(math.pi * min(1.0, done))))
+
+
+def warmup_of(settings: OptimizerSettings, steps: int) -> int:
+    """The steps of the warm-up: a tenth of a run that would otherwise end within it, and never learn at its rate."""
+    return settings.warmup if settings.warmup < steps else steps // 10
 
 
 @torch.no_grad()

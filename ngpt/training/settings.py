@@ -38,7 +38,8 @@ class OptimizerSettings:
     ``learning_rate``  the largest of the schedule
     ``betas``      decays of Adam's two moments
     ``schedule``   "paper" (warm-up, flat, exponential decay) or "cosine" (warm-up, half a cosine to 1 % at the end)
-    ``warmup``, ``flat``  steps until the learning rate is reached, and until which it stays ("paper")
+    ``warmup``     steps until the learning rate is reached; a tenth of a run that would end before
+    ``flat``       steps until which it stays ("paper")
     ``half_life``  steps in which it then halves ("paper")
     ``clip``       largest norm of the gradient; 0 does not clip
     ``ema``        decay per step of the average of the weights that is validated and shipped; 0 keeps none
@@ -113,6 +114,21 @@ def from_dict(values: dict[str, Any], path: str) -> Settings:
     settings = from_table(Settings, values, path)
     _check(settings, path)
     return settings
+
+
+def changed(before: Settings, now: Settings) -> list[str]:
+    """What differs, a text "table.key: before -> now" each."""
+    one, other = _flat(before.to_dict()), _flat(now.to_dict())
+    names = dict.fromkeys([*one, *other])
+    return [f"{name}: {one.get(name)} -> {other.get(name)}" for name in names if one.get(name) != other.get(name)]
+
+
+def _flat(values: dict[str, Any]) -> dict[str, Any]:
+    """Of "table.key" their value."""
+    found: dict[str, Any] = {}
+    for table, value in values.items():
+        found |= {f"{table}.{key}": one for key, one in value.items()} if isinstance(value, dict) else {table: value}
+    return found
 
 
 def _check(settings: Settings, path: str) -> None:

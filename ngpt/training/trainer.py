@@ -28,8 +28,8 @@ from ngpt.system.files import atomic_output
 from ngpt.system.records import check
 from ngpt.training.distributed import Processes
 from ngpt.training.examples import JITTER, Examples
-from ngpt.training.schedule import learning_rate, update_average
-from ngpt.training.settings import Settings, from_dict
+from ngpt.training.schedule import learning_rate, update_average, warmup_of
+from ngpt.training.settings import Settings, changed, from_dict
 from ngpt.training.validation import validate, views
 from ngpt.version import __version__
 
@@ -94,6 +94,9 @@ class Trainer:
             raise NgptError(
                 f"run.batch = {settings.run.batch}: must be a multiple of the {self.processes.count} processes"
             )
+        steps, warmup = settings.run.steps, warmup_of(settings.optimizer, settings.run.steps)
+        if warmup < settings.optimizer.warmup:
+            say(f"the run's {steps} steps would end within its warm-up of {settings.optimizer.warmup}: taking {warmup}")
         self._stop = False
         # The number of the signal that ended it, if one did.
         self.signal: int | None = None
@@ -103,7 +106,8 @@ class Trainer:
         return self.out / "checkpoint.safetensors"
 
     def resume(self) -> None:
-        """Continues from the checkpoint in ``out``; raises NgptError if it belongs to another model."""
+        """Continues from the checkpoint in ``out``, and says which settings have changed since; raises NgptError if it
+        belongs to another model."""
         tensors, header = weights.read_tensors(self.checkpoint)
         if header.get("kind") != "checkpoint":
             raise NgptError(f"{self.checkpoint}: holds {header.get('kind')}, not a checkpoint")
@@ -125,6 +129,8 @@ class Trainer:
             first, second = (parts[moment][name].to(self.device) for moment in ("adam1", "adam2"))
             step = torch.tensor(float(self.step))
             self.optimizer.state[p] = {"step": step, "exp_avg": first, "exp_avg_sq": second}
+        for change in changed(before, self.settings):
+            self.say(f"changed since the checkpoint: {change}")
         # What was logged after the checkpoint will be logged again.
         _keep_lines(self.out / "log.jsonl", self.step)
 

@@ -178,3 +178,18 @@ def test_the_smallest_set_trains_the_smallest_network_as_the_page_says(renderer,
     assert "finished at step 2" in output and "relMSE" in output
     ngpt.write("stack.exr", full_stack(18, 26))
     assert main(commands[2].split()) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ("tiny", "fast", "paper", "kpcn"))
+def test_a_configuration_to_start_from(train, tmp_path, name):
+    """It is the one that was named; and every line that it offers, taken in, is one that could be set."""
+    path = tmp_path / "mine.toml"
+    assert train("--config", name, "--init", str(path))[0] == 0
+    assert read_settings(path) == read_settings(Path("configs") / f"{name}.toml")
+    offered = tmp_path / "offered.toml"
+    offered.write_text(re.sub(r"^# (\w+ = .*)$", r"\1", path.read_text(), flags=re.M))
+    all_set, plain = read_settings(offered), read_settings(path)
+    assert len(offered.read_text().splitlines()) > 30 and replace(all_set, loss={}) == replace(plain, loss={})
+    assert make_loss(all_set.loss).settings == make_loss(plain.loss).settings
+    status, _, error = train("--config", name, "--init", str(path))
+    assert status != 0 and "exists already" in error

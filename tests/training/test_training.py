@@ -260,6 +260,9 @@ def test_scenes_are_held_out_whole():
     training, held_out = examples.split(CROPS, ("scene1", "scene5"))
     assert [crop.scene for crop in held_out] == ["scene1", "scene5"] and len(training) == 4
     assert examples.split(CROPS, ()) == (CROPS, [])
+    with pytest.raises(NgptError, match="no scene has a name that begins with 'nosuch'; there are scene0, scene1"):
+        examples.split(CROPS, ("scene1", "nosuch"))
+    assert examples.split([], ("scene1",)) == ([], [])  # all crops are rendered while it trains
 
 
 def test_folders_of_stacks_are_crops(tmp_path):
@@ -294,6 +297,27 @@ def test_the_cosine_schedule():
     rates = [learning_rate(s, i, 110) for i in range(110)]
     assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
     assert all(a >= b for a, b in pairwise(rates[10:]))
+
+
+@pytest.mark.parametrize("schedule", ("paper", "cosine"))
+def test_a_short_run_reaches_its_learning_rate(schedule):
+    """A run that would end within its warm-up has one of a tenth of its steps; others keep theirs."""
+    s = OptimizerSettings(learning_rate=1.0, schedule=schedule, warmup=100)
+    rates = [learning_rate(s, i, 30) for i in range(30)]
+    assert max(rates[:5]) == 1 and rates[0] < 1
+    assert max(learning_rate(s, i, 101) for i in range(99)) < 1
+
+
+def test_a_run_says_what_has_changed_since_its_checkpoint(tmp_path):
+    trainer(tmp_path, run_steps=2).run()
+    said = []
+    other = trainer(tmp_path, run_steps=4, optimizer_learning_rate=0.125)
+    other.say = said.append
+    other.resume()
+    assert [line for line in said if "changed" in line] == [
+        "changed since the checkpoint: optimizer.learning_rate: 0.01 -> 0.125",
+        "changed since the checkpoint: run.steps: 2 -> 4",
+    ]
 
 
 def test_settings_are_checked(tmp_path):
