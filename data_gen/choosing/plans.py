@@ -86,7 +86,7 @@ def explore(
     start = clock()
     able = _able(scene, method)
     _check_memory(scene, able[0], None, memory)
-    pixels = round(PIXELS * min(1.0, max(seconds / LONG, LEAST_PIXELS)))
+    pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
         trials = try_all(scene, able, lambda _: SHARE * seconds, SHARE * seconds, clock, said, stop)
     if not trials or stop():
