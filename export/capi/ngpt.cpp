@@ -29,9 +29,8 @@ namespace {
 constexpr int DEFAULT_MEMORY = 2048, LARGEST = 65536;
 
 constexpr int MOST_THREADS = 1024, MOST_CHANNELS = 65536;
-// Bytes of a pixel: of the image that is kept until all of it is made; of the statistics of a whole image, without and
-// with what another denoiser is to be given (measured, rounded up).
-constexpr uint64_t BYTES_OF_IMAGE = 12, BYTES_OF_STATISTICS = 140, BYTES_OF_PREPARED = 310;
+// Of the image that is kept until all of it is made.
+constexpr uint64_t BYTES_OF_PIXEL = 12;
 
 // Copies what is wrong to the caller. A handler that threw would end the process, even for lack of memory.
 ngpt_status tell(char *message, size_t size, ngpt_status status, const char *text) noexcept {
@@ -120,6 +119,9 @@ void check_addresses(const Network &network, const Layers &layers, const Layers 
     for (const auto &[name, view] : layers) check_addresses(name, view, width, height, network.input(name)->channels);
     for (const auto &[name, view] : outputs) check_addresses(name, view, width, height, 3);
 }
+
+// Of the statistics of a whole image: ONNX Runtime's and our copies of the layers, measured and rounded up.
+uint64_t bytes_of_statistics(const Network &network) { return network.prepared.empty() ? 300 : 700; }
 
 // What is left of memory beside so many bytes for each pixel, in MiB. Asked before: where memory is promised that is
 // not there, the system ends the process when it is written to.
@@ -257,7 +259,7 @@ ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress pro
         for (const std::string &name : network.prepared)
             if (outputs.count(name)) names.push_back(name);
         check_addresses(network, layers, outputs, width, height);
-        left_beside(width, height, names.empty() ? BYTES_OF_STATISTICS : BYTES_OF_PREPARED);
+        left_beside(width, height, bytes_of_statistics(network));
         Progress asked(progress, user);
         asked.advance(0);
         Images images = network.prepare(names, layers, width, height, asked.cancelled());
@@ -282,9 +284,10 @@ ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_prog
 
         std::vector<float> shared = std::exchange(job->statistics, {});
         if (job->width != width || job->height != height) shared.clear();
-        const int64_t most = std::min<int64_t>(memory ? memory : DEFAULT_MEMORY, left_beside(width, height, BYTES_OF_IMAGE));
+        const int64_t most = std::min<int64_t>(memory ? memory : DEFAULT_MEMORY, left_beside(width, height, BYTES_OF_PIXEL));
         const Tiles tiles = network.plan(width, height, most, layers.count("base"));
-        if (tiles.count() > 1 && shared.empty()) left_beside(width, height, BYTES_OF_IMAGE + BYTES_OF_STATISTICS);
+        if (tiles.count() > 1 && shared.empty())
+            left_beside(width, height, BYTES_OF_PIXEL + bytes_of_statistics(network));
         Progress asked(progress, user);
         asked.advance(0);
         std::vector<float> image(size_t(3) * size_t(width) * size_t(height));

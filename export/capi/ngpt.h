@@ -122,15 +122,15 @@ typedef int (*ngpt_progress)(void *user, double fraction);
  * width, height  1 to 65536
  * memory         MiB that a tile may take, 0 for 2048; less where the machine has less left. Smaller tiles take
  *                longer, and give the same image to 1e-5. The whole image takes 12 bytes a pixel beside, and, if it is
- *                cut into tiles, 140 more for their statistics. What the machine has no room for is refused before
- *                anything is made.
+ *                cut into tiles, 300 for their statistics (700 where the network corrects another denoiser). What the
+ *                machine has no room for is refused before anything is made.
  * progress       may be NULL; `user` is passed to it */
 NGPT_API ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user);
 
 /* Only for networks that correct another denoiser, which read "denoised": makes what that is to be given, those of
  * "oidn_primal", "oidn_albedo", "oidn_normal" and "oidn_base" that are set as outputs. Call it, then the denoiser, then
  * set "denoised" (and "denoised_base", and oidn_base as "base"), and call `ngpt_run`, which takes over the statistics.
- * It works on the whole image at once, and takes up to 310 bytes a pixel. */
+ * It works on the whole image at once, and takes up to 700 bytes a pixel. */
 NGPT_API ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress progress, void *user);
 
 #ifdef __cplusplus
