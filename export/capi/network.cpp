@@ -1,4 +1,5 @@
 #include "network.hpp"
+#include "text.hpp"
 
 #include <algorithm>
 #include <chrono>
@@ -69,7 +70,7 @@ int64_t Network::number(const std::string &key, int64_t least, int64_t most) con
     std::istringstream text(value(key));
     int64_t number = 0;
     if (text >> number && text.eof() && number >= least && number <= most) return number;
-    throw Failure(NGPT_BAD_NETWORK, path + ": its " + key + " is '" + value(key) + "'; it must be " +
+    throw Failure(NGPT_BAD_NETWORK, path + ": its " + key + " is '" + one_line(value(key), 40) + "'; it must be " +
                                         std::to_string(least) + " to " + std::to_string(most) + ": export it anew");
 }
 
