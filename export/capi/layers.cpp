@@ -42,7 +42,8 @@ template <typename Access> void each(const View &view, int64_t width, const Wind
     for (int c = 0; c < channels; c++)
         for (int64_t y = 0; y < window.height; y++) {
             char *at = static_cast<char *>(view.pixels) + c * channel + (window.top + y) * row + window.left * pixel;
-            for (int64_t x = 0; x < window.width; x++, at += pixel) access(at);
+            // Not by steps: the one beyond the last pixel may be no address.
+            for (int64_t x = 0; x < window.width; x++) access(at + x * pixel);
         }
 }
 
