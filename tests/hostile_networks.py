@@ -3,8 +3,6 @@
 from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
-
 METADATA = {
     "ngpt.inputs": "primal",
     "ngpt.alignment": "4",
@@ -35,7 +33,6 @@ def network(
     ``more``      further inputs
     ``metadata``  replaced or, where None, taken out
     """
-    import onnx
     from onnx import TensorProto, helper
 
     kind = getattr(TensorProto, kind)
@@ -72,7 +69,6 @@ def statistics(path: Path, kind: str = "FLOAT", count: int = 5, name: str = "sta
 
 
 def save(graph, path: Path, metadata: dict) -> None:
-    import onnx
     from onnx import helper
 
     model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)

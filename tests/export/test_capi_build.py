@@ -1,12 +1,14 @@
 """The C library as a package: its header, its symbols, find_package and pkg-config, the program of the docs."""
 
 import os
+import platform
 import re
 import subprocess
 import sys
 
 import pytest
-from capi import FAST, HEADER, PRIMAL, SOURCE, Network, command, example, install, result, those, tool
+from capi import HEADER, PRIMAL, SOURCE, Network, command, example, result, those, tool
+from processes import left_in_home
 
 import ngpt
 
@@ -65,9 +67,57 @@ def test_the_program_of_the_docs(renderer_project, program):
     assert outcome.returncode == 0, outcome.stderr
     assert 0.7 < float(outcome.stdout) < 1.3
     assert outcome.stderr.startswith("reads primal, 3 channels, always\nreads direct, 3 channels, if there is one")
-    assert outcome.stderr.endswith("100 %\n")
+    assert outcome.stderr.endswith("\n  0 %\n100 %\n") and outcome.stderr.count("%") == 2
     outcome = subprocess.run([renderer_project / program, "none.onnx"], capture_output=True, text=True, timeout=100)
     assert outcome.returncode == 1 and outcome.stderr == "none.onnx: cannot be read, or is empty\n"
+
+
+def test_nothing_is_left_in_a_home(renderer_project, tmp_path):
+    """ONNX Runtime's telemetry is off before it begins."""
+    call = renderer_project / "in-c", PRIMAL.with_name("ngpt-fast.onnx")
+    assert left_in_home(tmp_path, *call) == []
+    if not left_in_home(tmp_path / "on", *call, ORT_DISABLE_TELEMETRY="0"):
+        pytest.skip("this build of ONNX Runtime sends no telemetry")
+
+
+def test_pkg_config_tells_where_it_is(prefix, tmp_path):
+    environment = os.environ | {"PKG_CONFIG_PATH": f"{prefix}/lib/pkgconfig"}
+    words = [tool("pkg-config"), "--print-errors", "ngpt"]
+    assert command(*words, "--modversion", env=environment).strip() == ngpt.__version__
+    networks = command(*words, "--variable=networks", env=environment).strip()
+    flags = command(*words, "--cflags", "--libs", env=environment).split()
+    (tmp_path / "program.c").write_text(re.search(r"```c\n(.*?)```", DOCS.read_text(), re.S)[1])
+    command(
+        tool("gcc", "clang"), tmp_path / "program.c", *flags, f"-Wl,-rpath,{prefix}/lib", "-o", tmp_path / "program"
+    )
+    assert 0.7 < float(command(tmp_path / "program", f"{networks}/ngpt-fast.onnx")) < 1.3
+
+
+def configured(folder, *options) -> str:
+    """What CMake says without ONNX Runtime of the system."""
+    machine = f"{platform.machine()}-linux-gnu"
+    of_system = [f"{at}/{folder}" for at in ("/usr", "/usr/local") for folder in ("include", "lib", f"lib/{machine}")]
+    ignored = ";".join([*of_system, f"/lib/{machine}", "/lib", "/usr/include/onnxruntime"])
+    words = [tool("cmake"), "-S", SOURCE, "-B", folder, f"-DCMAKE_IGNORE_PATH={ignored}", *options]
+    outcome = subprocess.run([str(word) for word in words], capture_output=True, text=True, timeout=100)
+    return " ".join((outcome.stdout + outcome.stderr).split())
+
+
+def test_cmake_tells_where_to_get_what_is_missing(runtime, tmp_path):
+    tool("g++", "clang++")
+    (tmp_path / "include").symlink_to(runtime / "include")
+    told = configured(tmp_path / "none")
+    assert "headers (onnxruntime_cxx_api.h, of 1.21 or newer) are not found. Pass -DORT_ROOT=FOLDER" in told
+    assert "libonnxruntime-dev" in told and "docs/embed/c-library.md" in told
+    python = tool("false")
+    told = configured(tmp_path / "no-library", f"-DORT_ROOT={tmp_path}", f"-DPython3_EXECUTABLE={python}")
+    assert "library is not found. Pass -DORT_ROOT=FOLDER" in told and "pip install onnxruntime" in told
+    told = configured(tmp_path / "python", f"-DORT_ROOT={tmp_path}", f"-DPython3_EXECUTABLE={sys.executable}")
+    assert "capi/libonnxruntime.so.1." in told and "Generating done" in told
+    (tmp_path / "lib").mkdir()
+    (tmp_path / "lib" / "libonnxruntime.so.1.99.9").write_text("")
+    told = configured(tmp_path / "folder", f"-DORT_ROOT={tmp_path}", f"-DPython3_EXECUTABLE={python}")
+    assert f"{tmp_path}/lib/libonnxruntime.so.1.99.9" in told and "Generating done" in told
 
 
 def test_python_as_the_docs_show(prefix):

@@ -111,9 +111,20 @@ def test_arguments_that_cover_more(runtime, networks, tmp_path):
         pytest.skip("clang has no libFuzzer")
     made = Sanitized(flags, tmp_path, runtime, f"-DCMAKE_CXX_COMPILER={tool('clang++')}")
     program, prefix = tmp_path / "fuzzer", made.prefix
-    options = ["-DLIBFUZZER", HERE / "front.c", "-o", program, f"-I{prefix}/include", f"-L{prefix}/lib"]
+    options = [
+        "-DLIBFUZZER",
+        "-x",
+        "c",
+        HERE / "front.c",
+        "-x",
+        "none",
+        "-o",
+        program,
+        f"-I{prefix}/include",
+        f"-L{prefix}/lib",
+    ]
     flags = ADDRESS.replace("address", "fuzzer,address").split()
-    command(tool("clang"), *flags, *options, f"-Wl,-rpath,{prefix}/lib", "-lngpt")
+    command(tool("clang++"), *flags, *options, f"-Wl,-rpath,{prefix}/lib", "-lngpt")
     environment = os.environ | {"FRONT_NETWORKS": "\n".join(map(str, networks))}
     run = [str(program), "-max_total_time=60", "-max_len=4000", f"-artifact_prefix={tmp_path}/", "-print_final_stats=1"]
     outcome = subprocess.run(run, capture_output=True, text=True, timeout=300, env=environment)
