@@ -71,7 +71,8 @@ void use(const std::string &name, Ort::SessionOptions &options) {
         try {
             return device.add(options);
         } catch (const Ort::Exception &error) {
-            throw Failure(NGPT_FAILED, "device '" + name + "': ONNX Runtime cannot use it here (drivers?): " + error.what());
+            throw Failure(NGPT_FAILED,
+                          "device '" + name + "': ONNX Runtime cannot use it here (drivers?): " + error.what());
         }
     }
     throw Failure(NGPT_BAD_ARGUMENT, "device '" + name + "': no, this ONNX Runtime has: " + have);

@@ -37,7 +37,8 @@ template <typename Number> std::array<Number, 3> strides(const View &view, int64
     return {channel, pixel, view.row_stride ? Number(view.row_stride) : pixel * Number(width)};
 }
 
-template <typename Access> void each(const View &view, int64_t width, const Window &window, int channels, Access access) {
+template <typename Access>
+void each(const View &view, int64_t width, const Window &window, int channels, Access access) {
     const auto [channel, pixel, row] = strides<ptrdiff_t>(view, width);
     for (int c = 0; c < channels; c++)
         for (int64_t y = 0; y < window.height; y++) {

@@ -48,7 +48,8 @@ void Network::load_statistics(int threads) {
         statistics_ = load(environment_, stem + ".statistics.onnx", "cpu", threads);
         for (const std::string &name : statistics_.names)
             if (!input(name))
-                throw Failure(NGPT_BAD_NETWORK, stem + ".statistics.onnx: belongs to another network, it reads " + name);
+                throw Failure(NGPT_BAD_NETWORK,
+                              stem + ".statistics.onnx: belongs to another network, it reads " + name);
         if (!holds(statistics_.outputs, "statistics"))
             throw Failure(NGPT_BAD_NETWORK, stem + ".statistics.onnx: makes no statistics; export it anew");
         for (const std::string &name : statistics_.outputs)
@@ -82,14 +83,16 @@ void Network::list_inputs() {
         if (image_.names[i] != "statistics" && !holds(names, image_.names[i])) names.push_back(image_.names[i]);
     for (const std::string &name : names) {
         const size_t i = std::find(image_.names.begin(), image_.names.end(), name) - image_.names.begin();
-        if (i == image_.names.size() || image_.shapes[i].size() != 4 || image_.shapes[i][1] < 1 || image_.shapes[i][1] > 16)
+        if (i == image_.names.size() || image_.shapes[i].size() != 4 || image_.shapes[i][1] < 1 ||
+            image_.shapes[i][1] > 16)
             throw Failure(NGPT_BAD_NETWORK, path + ": its metadata list a layer " + name + ", its graph reads none");
         const bool variance = ends_with(name, "_var"), has_value = i >= image_.must;
         inputs.push_back({name, int(image_.shapes[i][1]), !has_value && !variance && !holds(optional, name), has_value,
                           variance ? -1.0f : 0.0f});
     }
     if (!holds(names, "primal") || !holds(image_.names, "statistics") || inputs.size() + 1 != image_.names.size())
-        throw Failure(NGPT_BAD_NETWORK, path + ": its graph reads layers that its metadata do not list; export it anew");
+        throw Failure(NGPT_BAD_NETWORK,
+                      path + ": its graph reads layers that its metadata do not list; export it anew");
     if (!holds(image_.outputs, "image")) throw Failure(NGPT_BAD_NETWORK, path + ": makes no image; export it anew");
 }
 
@@ -105,9 +108,10 @@ Tiles Network::plan(int64_t width, int64_t height, int64_t memory, bool with_bas
     const int64_t most = (memory << 20) / bytes_per_pixel_;
     const Tiles tiles = cut(width, height, alignment_, with_base ? overlap_with_base_ : overlap_, most);
     if (tiles.area() > most)
-        throw Failure(NGPT_OUT_OF_MEMORY, path + ": its smallest tile takes " +
-                                              std::to_string((tiles.area() * bytes_per_pixel_ >> 20) + 1) + " MiB, and " +
-                                              std::to_string(memory) + " MiB are allowed or left; allow more, or free some");
+        throw Failure(NGPT_OUT_OF_MEMORY,
+                      path + ": its smallest tile takes " +
+                          std::to_string((tiles.area() * bytes_per_pixel_ >> 20) + 1) + " MiB, and " +
+                          std::to_string(memory) + " MiB are allowed or left; allow more, or free some");
     return tiles;
 }
 

@@ -89,7 +89,8 @@ void set(Layers &views, const char *name, const char *verb, const std::vector<st
     if (!name) refuse("the name is NULL; the network " + std::string(verb) + " " + joined(known));
     const std::string key = name;
     if (std::find(known.begin(), known.end(), key) == known.end())
-        refuse("the network " + std::string(verb) + " no '" + one_line(key, 40) + "'; it " + verb + " " + joined(known));
+        refuse("the network " + std::string(verb) + " no '" + one_line(key, 40) + "'; it " + verb + " " +
+               joined(known));
     if (!view.pixels) {
         views.erase(key);
         return;
@@ -97,22 +98,24 @@ void set(Layers &views, const char *name, const char *verb, const std::vector<st
     if (view.format != NGPT_FLOAT && view.format != NGPT_HALF)
         refuse(key + ": the format is " + std::to_string(view.format) + "; it must be NGPT_FLOAT or NGPT_HALF");
     if (view.channels < channels())
-        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " + std::to_string(channels()));
+        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " +
+               std::to_string(channels()));
     if (view.channels > MOST_CHANNELS)
         refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " +
                std::to_string(MOST_CHANNELS) + " at most");
     views[key] = view;
 }
 
+std::string size_of(int width, int height) { return std::to_string(width) + "x" + std::to_string(height); }
+
 void check_size(int width, int height) {
     if (width < 1 || height < 1 || width > LARGEST || height > LARGEST)
-        refuse("the image has " + std::to_string(width) + "x" + std::to_string(height) + " pixels; sides must be 1 to " +
-               std::to_string(LARGEST));
+        refuse("the image has " + size_of(width, height) + " pixels; sides must be 1 to " + std::to_string(LARGEST));
 }
 
 void check_addresses(const std::string &name, const View &view, int width, int height, int channels) {
     if (!addressable(view, width, height, channels))
-        refuse(name + ": its strides lead out of memory for " + std::to_string(width) + "x" + std::to_string(height) + " pixels");
+        refuse(name + ": its strides lead out of memory for " + size_of(width, height) + " pixels");
 }
 
 void check_addresses(const Network &network, const Layers &layers, const Layers &outputs, int width, int height) {
@@ -128,9 +131,9 @@ uint64_t bytes_of_statistics(const Network &network) { return network.prepared.e
 int64_t left_beside(int width, int height, uint64_t bytes) {
     const uint64_t needed = uint64_t(width) * uint64_t(height) * bytes, left = memory_left();
     if (needed > left)
-        throw Failure(NGPT_OUT_OF_MEMORY, std::to_string(width) + "x" + std::to_string(height) + " pixels take " +
-                                              std::to_string(needed >> 20) + " MiB beside their layers, and " +
-                                              std::to_string(left >> 20) + " MiB are left; cut the image, or free some");
+        throw Failure(NGPT_OUT_OF_MEMORY, size_of(width, height) + " pixels take " + std::to_string(needed >> 20) +
+                                              " MiB beside their layers, and " + std::to_string(left >> 20) +
+                                              " MiB are left; cut the image, or free some");
     return int64_t((left - needed) >> 20);
 }
 
@@ -234,7 +237,8 @@ ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void *pixels, 
         std::vector<std::string> known;
         for (const Input &one : job->network->inputs) known.push_back(one.name);
         // `read` and `write` have one structure; this one is for `read`.
-        const View view{const_cast<void *>(pixels), number_of(format), channels, channel_stride, pixel_stride, row_stride};
+        void *at = const_cast<void *>(pixels);
+        const View view{at, number_of(format), channels, channel_stride, pixel_stride, row_stride};
         set(job->layers, name, "reads", known, view, [&] { return job->network->input(name)->channels; });
     });
 }
@@ -282,23 +286,24 @@ ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_prog
 
         check_addresses(network, layers, outputs, width, height);
 
-        std::vector<float> shared = std::exchange(job->statistics, {});
-        if (job->width != width || job->height != height) shared.clear();
-        const int64_t most = std::min<int64_t>(memory ? memory : DEFAULT_MEMORY, left_beside(width, height, BYTES_OF_PIXEL));
+        if (job->width != width || job->height != height) job->statistics.clear();
+        const int64_t left = left_beside(width, height, BYTES_OF_PIXEL);
+        const int64_t most = std::min<int64_t>(memory ? memory : DEFAULT_MEMORY, left);
         const Tiles tiles = network.plan(width, height, most, layers.count("base"));
-        if (tiles.count() > 1 && shared.empty())
-            left_beside(width, height, BYTES_OF_PIXEL + bytes_of_statistics(network));
+        const bool asks = tiles.count() > 1 && job->statistics.empty();
+        if (asks) left_beside(width, height, BYTES_OF_PIXEL + bytes_of_statistics(network));
         Progress asked(progress, user);
         asked.advance(0);
         std::vector<float> image(size_t(3) * size_t(width) * size_t(height));
-        if (tiles.count() > 1 && shared.empty())
-            shared = network.prepare({}, layers, width, height, asked.cancelled()).at("statistics");
+        std::vector<float> shared = std::exchange(job->statistics, {});
+        if (asks) shared = network.prepare({}, layers, width, height, asked.cancelled()).at("statistics");
         for (int64_t i = 0; i < tiles.count(); i++) {
             const auto [inner, outer] = tiles.tile(i);
             const std::vector<float> part = network.run(layers, width, outer, shared, asked.cancelled());
             for (int64_t c = 0; c < 3; c++)
                 for (int64_t y = inner.top; y < inner.top + inner.height; y++) {
-                    const float *from = &part[(c * outer.height + y - outer.top) * outer.width + inner.left - outer.left];
+                    const int64_t row = (c * outer.height + y - outer.top) * outer.width;
+                    const float *from = &part[size_t(row + inner.left - outer.left)];
                     std::copy(from, from + inner.width, &image[(c * height + y) * width + inner.left]);
                 }
             asked.advance(double(i + 1) / double(tiles.count()));

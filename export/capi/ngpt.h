@@ -113,8 +113,8 @@ NGPT_API ngpt_status ngpt_set_output(ngpt_job *job, const char *name, void *pixe
                                      ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride);
 
 /* Called by the thread in `ngpt_run` when the run begins, and with each tile, with the part that is done, 0 to 1; and,
- * so that it may cancel, about twenty times a second with the same part again. A small image is one tile. Anything but 0
- * cancels the run. It must not throw, and not free the job. */
+ * so that it may cancel, about twenty times a second with the same part again. A small image is one tile. Anything but
+ * 0 cancels the run. It must not throw, and not free the job. */
 typedef int (*ngpt_progress)(void *user, double fraction);
 
 /* Makes "image", in tiles if need be, which share the statistics of the whole image.

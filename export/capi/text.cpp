@@ -10,7 +10,8 @@ size_t letter(const std::string &text, size_t at) {
     const auto byte = [&](size_t i) { return at + i < text.size() ? static_cast<unsigned char>(text[at + i]) : 0u; };
     const unsigned first = byte(0);
     if (first < 0x80) return first >= 0x20 && first != 0x7f;
-    const size_t length = first >= 0xc2 && first < 0xe0 ? 2 : (first & 0xf0) == 0xe0 ? 3 : first >= 0xf0 && first < 0xf5 ? 4 : 0;
+    if (first < 0xc2 || first > 0xf4) return 0;
+    const size_t length = first < 0xe0 ? 2 : first < 0xf0 ? 3 : 4;
     unsigned code = first & (0xff >> (length + 1));
     for (size_t i = 1; i < length; i++) {
         if ((byte(i) & 0xc0) != 0x80) return 0;

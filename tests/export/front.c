@@ -55,7 +55,8 @@ static ptrdiff_t number(void) {
 static int size(void) { return chance(12) ? (int)number() : 1 + (int)(byte() % 24); }
 
 static const char *name(void) {
-    static const char *const names[] = {"primal", "image", "statistics", "direct", "base", "", "p", "\xc3\xa9\xff\x1b[2"};
+    static const char *const names[] = {"primal", "image", "statistics", "direct",
+                                        "base",   "",      "p",          "\xc3\xa9\xff\x1b[2"};
     return chance(20) ? NULL : names[chance(2) ? byte() % 2 : byte() % 8];
 }
 
@@ -102,10 +103,10 @@ static void set(place *at) {
     one.format = chance(12) ? (int)number() : (int)(byte() % 2);
     one.channels = chance(6) ? (int)number() : 3;
     for (i = 0; i < 3; i++) one.strides[i] = chance(3) ? number() : 0;
-    status = output ? ngpt_set_output(at->job, chosen, one.pixels, (ngpt_format)one.format, one.channels, one.strides[0],
-                                      one.strides[1], one.strides[2])
-                    : ngpt_set_layer(at->job, chosen, one.pixels, (ngpt_format)one.format, one.channels, one.strides[0],
-                                     one.strides[1], one.strides[2]);
+    status = output ? ngpt_set_output(at->job, chosen, one.pixels, (ngpt_format)one.format, one.channels,
+                                      one.strides[0], one.strides[1], one.strides[2])
+                    : ngpt_set_layer(at->job, chosen, one.pixels, (ngpt_format)one.format, one.channels,
+                                     one.strides[0], one.strides[1], one.strides[2]);
     counted(status);
     message_fits(ngpt_message(at->job), 511);
     assert(status == NGPT_BAD_ARGUMENT || status == NGPT_OK);
@@ -121,7 +122,8 @@ static void set(place *at) {
 }
 
 static void run(place *at) {
-    const int width = size(), height = size(), memory = chance(6) ? (int)number() : chance(2) ? 0 : 1 + (int)(byte() % 4);
+    const int width = size(), height = size();
+    const int memory = chance(6) ? (int)number() : chance(2) ? 0 : 1 + (int)(byte() % 4);
     const ngpt_progress progress = chance(2) ? ask : NULL;
     int i, worst = 1, status;
     for (i = 0; i < at->count && width > 0 && height > 0 && width <= 65536 && height <= 65536; i++) {
@@ -144,7 +146,8 @@ static void session(void) {
     memset(&at, 0, sizeof at);
     if (chance(16)) {
         const size_t room = byte() % (sizeof message + 1);
-        at.network = ngpt_open_on(chance(4) ? name() : "cpu", chance(8) ? name() : paths[index], size() % 3, message, room);
+        const char *device = chance(4) ? name() : "cpu", *path = chance(8) ? name() : paths[index];
+        at.network = ngpt_open_on(device, path, size() % 3, message, room);
         counted(at.network ? NGPT_OK : NGPT_BAD_NETWORK);
         if (room) message_fits(message, room - 1);
     }
