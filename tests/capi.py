@@ -1,8 +1,10 @@
 """The C library for tests: built by CMake, and called by ctypes with arrays (H, W, C) of any strides and of halves."""
 
 import ctypes
+import os
 import shutil
 import subprocess
+import sys
 from ctypes import CFUNCTYPE, c_char_p, c_double, c_int, c_size_t, c_ssize_t, c_void_p
 from pathlib import Path
 
@@ -15,7 +17,7 @@ SOURCE = Path(__file__).parents[1] / "export" / "capi"
 HEADER = SOURCE / "ngpt.h"
 WEIGHTS = Path(ngpt.__file__).parent / "weights"
 FAST, PRIMAL = WEIGHTS / "ngpt-fast.onnx", WEIGHTS / "ngpt-primal.onnx"
-OK, BAD_ARGUMENT, MISSING_LAYER, BAD_NETWORK, OUT_OF_MEMORY, CANCELLED = range(6)
+OK, BAD_ARGUMENT, MISSING_LAYER, BAD_NETWORK, OUT_OF_MEMORY, CANCELLED, FAILED = range(7)
 FORMATS = {np.dtype(np.float32): 0, np.dtype(np.float16): 1}
 PROGRESS = CFUNCTYPE(c_int, c_void_p, c_double)
 
@@ -33,12 +35,22 @@ def tool(*names) -> str:
     return found or pytest.skip(f"{' and '.join(names)} is not installed")
 
 
+def headers() -> Path:
+    """Where ONNX Runtime is: include/, and lib/ if it is not that of the Python package."""
+    root = Path(os.environ.get("ORT_ROOT", "/usr"))
+    fetched = SOURCE.parents[1] / "build" / "onnxruntime"
+    for folder in (root, fetched):
+        if any((folder / name / "onnxruntime_cxx_api.h").exists() for name in ("include", "include/onnxruntime")):
+            return folder
+    return pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include: python scripts/headers.py fetches some")
+
+
 def install(runtime, folder, *options) -> Path:
     """The prefix where the library lies."""
     cmake = tool("cmake")
     tool("g++", "clang++")
     settings = [f"-DORT_ROOT={runtime}", f"-DCMAKE_INSTALL_PREFIX={folder / 'prefix'}", "-DCMAKE_INSTALL_LIBDIR=lib"]
-    settings += ["-DCMAKE_CXX_FLAGS=-Werror", *options]
+    settings += [f"-DPython3_EXECUTABLE={sys.executable}", "-DCMAKE_CXX_FLAGS=-Werror", *options]
     command(cmake, "-S", SOURCE, "-B", folder / "build", *settings)
     command(cmake, "--build", folder / "build", "--parallel", 2)
     command(cmake, "--install", folder / "build")
@@ -53,6 +65,7 @@ def load(path) -> ctypes.CDLL:
         "version": (c_char_p,),
         "abi": (c_int,),
         "open": (c_void_p, c_char_p, c_int, c_char_p, c_size_t),
+        "open_on": (c_void_p, c_char_p, c_char_p, c_int, c_char_p, c_size_t),
         "close": (None, c_void_p),
         "layer_count": (c_int, c_void_p),
         "layer_name": (c_char_p, c_void_p, c_int),
@@ -76,9 +89,10 @@ def load(path) -> ctypes.CDLL:
 class Network:
     """An open network; the handle is None, and ``message`` says why, where it cannot be opened."""
 
-    def __init__(self, library, path=FAST, threads=1):
+    def __init__(self, library, path=FAST, threads=1, device=None):
         self.library, message = library, ctypes.create_string_buffer(512)
-        self.handle = library.ngpt_open(str(path).encode(), threads, message, len(message))
+        device = None if device is None else device.encode()
+        self.handle = library.ngpt_open_on(device, str(path).encode(), threads, message, len(message))
         self.message = message.value.decode(errors="replace")
         self.names = [library.ngpt_layer_name(self.handle, i).decode(errors="replace") for i in range(self.count())]
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from capi import headers, install
 
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
 LIBRARY = HOSTS.parent / "capi"
@@ -81,27 +82,22 @@ def agree_but_for_rounding_in_oidn(image, expected):
     assert error.mean() <= 1e-4 and error.max() <= 2e-2, (error.mean(), error.max())
 
 
-def compiled(source: str, program: Path, *flags: str) -> list[str]:
-    """The command of a C++ host, compiled with libngpt against ONNX Runtime of the system or of ORT_ROOT."""
+def compiled(source: str, folder: Path, *flags: str) -> list[str]:
+    """The command of a C++ host, compiled with libngpt in a folder."""
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("neither g++ nor clang++ is installed")
-    root = Path(os.environ.get("ORT_ROOT", "/usr"))
-    headers = [path for path in (root / "include", root / "include" / "onnxruntime") if path.is_dir()]
-    if not any((path / "onnxruntime_cxx_api.h").exists() for path in headers):
-        pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include; name a release's folder in ORT_ROOT")
-    library = root / "lib"
+    prefix = install(headers(), folder)
+    program = folder / Path(source).stem
     command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / source, "-o", program]
-    command += [*LIBRARY.glob("*.cpp"), f"-I{LIBRARY}", '-DNGPT_VERSION="0"', "-pthread"]
-    command += [flag for path in headers for flag in ("-isystem", path) if path != Path("/usr/include")]
-    command += [f"-L{library}", f"-Wl,-rpath,{library}", "-lonnxruntime", *flags]
+    command += [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lngpt", *flags]
     result = subprocess.run(command, capture_output=True, text=True, timeout=500)
     assert result.returncode == 0, result.stderr
     return [str(program)]
 
 
 def cpp_host(folder) -> list[str]:
-    return compiled("host.cpp", folder / "ngpt-host")
+    return compiled("host.cpp", folder)
 
 
 def node_modules(package, host) -> Path:
@@ -138,4 +134,4 @@ def oidn_host(folder) -> list[str]:
     (folder / "OpenImageDenoise").mkdir()
     (folder / "OpenImageDenoise" / "oidn.h").write_text(_OIDN)
     flags = ["-shared", "-fPIC", f"-I{folder}", str(library), f"-Wl,-rpath,{library.parent}"]
-    return [sys.executable, "-c", _IN_PYTHON, *compiled("oidn_host.cpp", folder / "ngpt-oidn-host.so", *flags)]
+    return [sys.executable, "-c", _IN_PYTHON, *compiled("oidn_host.cpp", folder, *flags)]

@@ -330,3 +330,13 @@ def one_error(stderr: str) -> bool:
     failed = re.search(r"error: (\d+) of \d+ stacks were not reconstructed", stderr)
     expected = int(failed[1]) + 1 if failed else 1
     return len(errors) == expected and "Traceback" not in stderr and "Exception ignored" not in stderr
+
+
+def left_in_home(home: Path, *command, **environment: str) -> list[str]:
+    """The files in a fresh home after a program has ended."""
+    known = {name: value for name, value in os.environ.items() if name != "ORT_DISABLE_TELEMETRY"}
+    known |= {"HOME": str(home), "USERPROFILE": str(home), "XDG_CACHE_HOME": str(home / ".cache")}
+    subprocess.run(
+        [str(word) for word in command], env=known | environment, check=True, timeout=300, stdout=subprocess.DEVNULL
+    )
+    return sorted(str(file.relative_to(home)) for file in home.rglob("*") if file.is_file())

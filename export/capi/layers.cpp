@@ -1,5 +1,6 @@
 #include "layers.hpp"
 
+#include <array>
 #include <cmath>
 #include <cstring>
 
@@ -27,19 +28,37 @@ uint16_t to_half(float value) {
     return uint16_t(sign + ((shift + 24) << 10) + steps);
 }
 
-template <typename Access> void each(const View &view, int64_t width, const Window &window, int channels, Access access) {
-    const ptrdiff_t size = view.format == NGPT_HALF ? 2 : 4;
-    const ptrdiff_t channel = view.channel_stride ? view.channel_stride : size;
-    const ptrdiff_t pixel = view.pixel_stride ? view.pixel_stride : size * view.channels;
-    const ptrdiff_t row = view.row_stride ? view.row_stride : pixel * width;
+int size_of(const View &view) { return view.format == NGPT_HALF ? 2 : 4; }
+
+// From a channel, pixel and row to the next, in a type that holds them.
+template <typename Number> std::array<Number, 3> strides(const View &view, int64_t width) {
+    const Number channel = view.channel_stride ? Number(view.channel_stride) : Number(size_of(view));
+    const Number pixel = view.pixel_stride ? Number(view.pixel_stride) : Number(size_of(view)) * Number(view.channels);
+    return {channel, pixel, view.row_stride ? Number(view.row_stride) : pixel * Number(width)};
+}
+
+template <typename Access>
+void each(const View &view, int64_t width, const Window &window, int channels, Access access) {
+    const auto [channel, pixel, row] = strides<ptrdiff_t>(view, width);
     for (int c = 0; c < channels; c++)
         for (int64_t y = 0; y < window.height; y++) {
             char *at = static_cast<char *>(view.pixels) + c * channel + (window.top + y) * row + window.left * pixel;
-            for (int64_t x = 0; x < window.width; x++, at += pixel) access(at);
+            // Not by steps: the one beyond the last pixel may be no address.
+            for (int64_t x = 0; x < window.width; x++) access(at + x * pixel);
         }
 }
 
 }  // namespace
+
+// In double, which has room for any product of strides and sizes.
+bool addressable(const View &view, int64_t width, int64_t height, int channels) {
+    const auto [channel, pixel, row] = strides<double>(view, width);
+    double before = 0, behind = size_of(view);
+    for (const double reach : {channel * double(channels - 1), pixel * double(width - 1), row * double(height - 1)})
+        (reach < 0 ? before : behind) += std::abs(reach);
+    const double first = double(reinterpret_cast<uintptr_t>(view.pixels)), last = double(PTRDIFF_MAX) / 2;
+    return before + behind <= last && before <= first && first + behind <= double(UINTPTR_MAX);
+}
 
 // Values may lie at odd addresses, which is why they are copied as bytes.
 void read(const View &view, int64_t width, const Window &window, int channels, float *planes) {

@@ -11,7 +11,7 @@ namespace ngpt {
 // Pixels that are not ours; strides in bytes, 0 for those without gaps.
 struct View {
     void *pixels;
-    ngpt_format format;
+    int format;  // of ngpt_format
     int channels;
     ptrdiff_t channel_stride, pixel_stride, row_stride;
 };
@@ -21,6 +21,9 @@ struct Window {
     int64_t top, left, height, width;
     int64_t area() const { return height * width; }
 };
+
+// Whether all its pixels have an address. Strides that lead beyond are the caller's error, and would overflow.
+bool addressable(const View &view, int64_t width, int64_t height, int channels);
 
 // The first `channels` of a window, out of an image `width` wide, channel by channel, row by row.
 void read(const View &view, int64_t width, const Window &window, int channels, float *planes);

@@ -1,13 +1,9 @@
 #include "network.hpp"
+#include "text.hpp"
 
 #include <algorithm>
 #include <chrono>
-#include <cstdlib>
-#include <filesystem>
-#include <fstream>
 #include <future>
-#include <iterator>
-#include <mutex>
 #include <sstream>
 
 namespace ngpt {
@@ -28,55 +24,10 @@ bool ends_with(const std::string &text, const std::string &end) {
     return text.size() >= end.size() && !text.compare(text.size() - end.size(), end.size(), end);
 }
 
-// The functions of the library that is loaded: constants, and the same for all handles.
-void find_runtime() {
-    static std::once_flag once;
-    std::call_once(once, [] {
-        // Official builds send telemetry by themselves, unless this is set before the first environment is made.
-#ifdef _WIN32
-        _putenv_s("ORT_DISABLE_TELEMETRY", "1");
-#else
-        setenv("ORT_DISABLE_TELEMETRY", "1", 0);
-#endif
-        const OrtApi *api = OrtGetApiBase()->GetApi(ORT_API_VERSION);
-        if (!api)
-            throw Failure(NGPT_FAILED, std::string("ONNX Runtime ") + OrtGetApiBase()->GetVersionString() +
-                                           " is older than the headers that ngpt was built with; use a newer one");
-        Ort::InitApi(api);
-    });
-}
-
-// A way to cut a side: pieces of one size, which is why the last ones begin earlier, at multiples of the alignment.
-struct Cut {
-    int64_t step, size, count;
-};
-
-// All ways, coarsest first.
-std::vector<Cut> cuts(int64_t length, int64_t alignment, int64_t overlap) {
-    std::vector<Cut> ways;
-    for (int64_t pieces = 1; pieces <= std::max<int64_t>(1, length / alignment); pieces++) {
-        const int64_t step = (length + pieces * alignment - 1) / (pieces * alignment) * alignment;
-        const int64_t size = std::min(step + 2 * overlap + length % alignment, length);
-        if (ways.empty() || size < ways.back().size) ways.push_back({step, size, (length + step - 1) / step});
-    }
-    return ways;
-}
-
 }  // namespace
 
-std::string one_line(const std::string &text) {
-    std::istringstream words(text);
-    std::string line;
-    for (std::string word; words >> word && line.size() + word.size() < 400;) line += (line.empty() ? "" : " ") + word;
-    return line;
-}
-
-Network::Network(const std::string &path, int threads) : path(path) {
-    find_runtime();
-    // What goes wrong comes as an exception; in the log it would stand a second time.
-    environment_ = Ort::Env(ORT_LOGGING_LEVEL_FATAL, "ngpt");
-    environment_.DisableTelemetryEvents();
-    image_ = load(path, threads);
+Network::Network(const std::string &path, const std::string &device, int threads)
+    : path(path), environment_(environment()), image_(load(environment_, path, device, threads)) {
     Ort::AllocatorWithDefaultOptions allocator;
     const Ort::ModelMetadata about = image_.session.GetModelMetadata();
     for (const auto &key : about.GetCustomMetadataMapKeysAllocated(allocator))
@@ -89,49 +40,22 @@ Network::Network(const std::string &path, int threads) : path(path) {
     load_statistics(threads);
 }
 
-Network::Graph Network::load(const std::string &path, int threads) {
-    // Read here, since ONNX Runtime has another kind of paths on Windows.
-    std::ifstream file(std::filesystem::u8path(path), std::ios::binary);
-    const std::string data{std::istreambuf_iterator<char>(file), {}};
-    if (data.empty()) throw Failure(NGPT_BAD_NETWORK, path + ": cannot be read, or is empty");
-    Ort::SessionOptions options;
-    options.SetLogSeverityLevel(ORT_LOGGING_LEVEL_FATAL);
-    options.SetIntraOpNumThreads(threads);
-    // ONNX Runtime 1.21 gives the nodes it makes here one name, since ours have none, and then refuses the model.
-    options.AddConfigEntry("optimization.disable_specified_optimizers", "GatherSliceToSplitFusion");
-    Graph graph;
-    try {
-        graph.session = Ort::Session(environment_, data.data(), data.size(), options);
-    } catch (const Ort::Exception &error) {
-        throw Failure(NGPT_BAD_NETWORK, path + ": ONNX Runtime cannot load it: " + error.what());
-    }
-    Ort::AllocatorWithDefaultOptions allocator;
-    const auto add = [&](Ort::AllocatedStringPtr name, const Ort::TypeInfo &type) {
-        graph.names.push_back(name.get());
-        graph.shapes.push_back(type.GetTensorTypeAndShapeInfo().GetShape());
-    };
-    graph.must = graph.session.GetInputCount();
-    for (size_t i = 0; i < graph.must; i++)
-        add(graph.session.GetInputNameAllocated(i, allocator), graph.session.GetInputTypeInfo(i));
-    for (size_t i = 0; i < graph.session.GetOverridableInitializerCount(); i++)
-        add(graph.session.GetOverridableInitializerNameAllocated(i, allocator),
-            graph.session.GetOverridableInitializerTypeInfo(i));
-    for (size_t i = 0; i < graph.session.GetOutputCount(); i++)
-        graph.outputs.push_back(graph.session.GetOutputNameAllocated(i, allocator).get());
-    return graph;
-}
-
 // Its lack is an error only where it is needed.
 void Network::load_statistics(int threads) {
     const std::string stem = ends_with(path, ".onnx") ? path.substr(0, path.size() - 5) : path;
     try {
-        statistics_ = load(stem + ".statistics.onnx", threads);
+        // Of a whole image, for which devices have no room.
+        statistics_ = load(environment_, stem + ".statistics.onnx", "cpu", threads);
         for (const std::string &name : statistics_.names)
             if (!input(name))
-                throw Failure(NGPT_BAD_NETWORK, stem + ".statistics.onnx: belongs to another network, it reads " + name);
+                throw Failure(NGPT_BAD_NETWORK,
+                              stem + ".statistics.onnx: belongs to another network, it reads " + name);
+        if (!holds(statistics_.outputs, "statistics"))
+            throw Failure(NGPT_BAD_NETWORK, stem + ".statistics.onnx: makes no statistics; export it anew");
         for (const std::string &name : statistics_.outputs)
             if (name != "statistics") prepared.push_back(name);
-    } catch (const std::exception &error) {
+    } catch (const Failure &error) {
+        if (error.status == NGPT_OUT_OF_MEMORY) throw;
         no_statistics_ = error.what();
     }
 }
@@ -147,7 +71,7 @@ int64_t Network::number(const std::string &key, int64_t least, int64_t most) con
     std::istringstream text(value(key));
     int64_t number = 0;
     if (text >> number && text.eof() && number >= least && number <= most) return number;
-    throw Failure(NGPT_BAD_NETWORK, path + ": its " + key + " is '" + value(key) + "'; it must be " +
+    throw Failure(NGPT_BAD_NETWORK, path + ": its " + key + " is '" + one_line(value(key), 40) + "'; it must be " +
                                         std::to_string(least) + " to " + std::to_string(most) + ": export it anew");
 }
 
@@ -159,14 +83,17 @@ void Network::list_inputs() {
         if (image_.names[i] != "statistics" && !holds(names, image_.names[i])) names.push_back(image_.names[i]);
     for (const std::string &name : names) {
         const size_t i = std::find(image_.names.begin(), image_.names.end(), name) - image_.names.begin();
-        if (i == image_.names.size() || image_.shapes[i].size() != 4 || image_.shapes[i][1] < 1 || image_.shapes[i][1] > 16)
+        if (i == image_.names.size() || image_.shapes[i].size() != 4 || image_.shapes[i][1] < 1 ||
+            image_.shapes[i][1] > 16)
             throw Failure(NGPT_BAD_NETWORK, path + ": its metadata list a layer " + name + ", its graph reads none");
         const bool variance = ends_with(name, "_var"), has_value = i >= image_.must;
         inputs.push_back({name, int(image_.shapes[i][1]), !has_value && !variance && !holds(optional, name), has_value,
                           variance ? -1.0f : 0.0f});
     }
     if (!holds(names, "primal") || !holds(image_.names, "statistics") || inputs.size() + 1 != image_.names.size())
-        throw Failure(NGPT_BAD_NETWORK, path + ": its graph reads layers that its metadata do not list; export it anew");
+        throw Failure(NGPT_BAD_NETWORK,
+                      path + ": its graph reads layers that its metadata do not list; export it anew");
+    if (!holds(image_.outputs, "image")) throw Failure(NGPT_BAD_NETWORK, path + ": makes no image; export it anew");
 }
 
 const Input *Network::input(const std::string &name) const {
@@ -177,31 +104,14 @@ const Input *Network::input(const std::string &name) const {
 
 bool Network::prepares_with(const std::string &name) const { return holds(statistics_.names, name); }
 
-std::vector<Tile> Network::plan(int64_t width, int64_t height, int64_t memory, bool with_base) const {
-    const int64_t overlap = with_base ? overlap_with_base_ : overlap_, most = (memory << 20) / bytes_per_pixel_;
-    const std::vector<Cut> down = cuts(height, alignment_, overlap), across = cuts(width, alignment_, overlap);
-    const Cut *rows = nullptr, *columns = nullptr;
-    int64_t least = 0;
-    for (const Cut &tall : down)
-        for (const Cut &wide : across)
-            if (tall.size * wide.size <= most) {
-                const int64_t work = tall.count * wide.count * tall.size * wide.size;
-                if (!rows || work < least) rows = &tall, columns = &wide, least = work;
-                break;
-            }
-    if (!rows) {
-        const int64_t needed = (down.back().size * across.back().size * bytes_per_pixel_ >> 20) + 1;
-        throw Failure(NGPT_OUT_OF_MEMORY, path + ": its smallest tile takes " + std::to_string(needed) + " MiB, and " +
-                                              std::to_string(memory) + " MiB are allowed; allow more");
-    }
-    std::vector<Tile> tiles;
-    for (int64_t y = 0; y < height; y += rows->step)
-        for (int64_t x = 0; x < width; x += columns->step) {
-            const int64_t top = std::min(std::max<int64_t>(y - overlap, 0), height - rows->size);
-            const int64_t left = std::min(std::max<int64_t>(x - overlap, 0), width - columns->size);
-            tiles.push_back({{y, x, std::min(rows->step, height - y), std::min(columns->step, width - x)},
-                             {top, left, rows->size, columns->size}});
-        }
+Tiles Network::plan(int64_t width, int64_t height, int64_t memory, bool with_base) const {
+    const int64_t most = (memory << 20) / bytes_per_pixel_;
+    const Tiles tiles = cut(width, height, alignment_, with_base ? overlap_with_base_ : overlap_, most);
+    if (tiles.area() > most)
+        throw Failure(NGPT_OUT_OF_MEMORY,
+                      path + ": its smallest tile takes " +
+                          std::to_string((tiles.area() * bytes_per_pixel_ >> 20) + 1) + " MiB, and " +
+                          std::to_string(memory) + " MiB are allowed or left; allow more, or free some");
     return tiles;
 }
 
@@ -216,6 +126,20 @@ Images Network::prepare(std::vector<std::string> names, const Layers &layers, in
 std::vector<float> Network::run(const Layers &layers, int64_t width, const Window &window,
                                 const std::vector<float> &statistics, const Cancelled &cancelled) {
     return std::move(run(image_, {"image"}, layers, width, window, statistics, cancelled).at("image"));
+}
+
+// What a graph makes is what it says only after a look.
+std::vector<float> Network::taken(const Ort::Value &value, const std::string &name, const Window &window) const {
+    const std::vector<int64_t> image{1, 3, window.height, window.width}, statistics{5};
+    if (value.IsTensor()) {
+        const auto tensor = value.GetTensorTypeAndShapeInfo();
+        if (tensor.GetElementType() == ONNX_TENSOR_ELEMENT_DATA_TYPE_FLOAT &&
+            tensor.GetShape() == (name == "statistics" ? statistics : image)) {
+            const float *data = value.GetTensorData<float>();
+            return {data, data + tensor.GetElementCount()};
+        }
+    }
+    throw Failure(NGPT_BAD_NETWORK, path + ": its " + name + " has another size than is due; export it anew");
 }
 
 Images Network::run(Graph &graph, const std::vector<std::string> &outputs, const Layers &layers, int64_t width,
@@ -254,14 +178,13 @@ Images Network::run(Graph &graph, const std::vector<std::string> &outputs, const
         future.wait();
         throw Failure(NGPT_CANCELLED, "cancelled");
     }
-    const std::vector<Ort::Value> result = future.get();
     Images images;
-    for (size_t i = 0; i < outputs.size(); i++) {
-        const size_t length = result[i].GetTensorTypeAndShapeInfo().GetElementCount();
-        if (length != (outputs[i] == "statistics" ? 5 : size_t(3 * window.area())))
-            throw Failure(NGPT_BAD_NETWORK, path + ": its " + outputs[i] + " has another size than is due; export it anew");
-        const float *data = result[i].GetTensorData<float>();
-        images[outputs[i]].assign(data, data + length);
+    try {
+        const std::vector<Ort::Value> result = future.get();
+        for (size_t i = 0; i < outputs.size(); i++) images[outputs[i]] = taken(result[i], outputs[i], window);
+    } catch (const Ort::Exception &error) {
+        throw Failure(tells_of_memory(error.what()) ? NGPT_OUT_OF_MEMORY : NGPT_FAILED,
+                      path + ": ONNX Runtime cannot run it: " + error.what());
     }
     return images;
 }

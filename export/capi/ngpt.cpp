@@ -1,8 +1,10 @@
 // The C functions: checks of what they are given, and exceptions as messages.
+#include "memory.hpp"
 #include "network.hpp"
+#include "text.hpp"
 
 #include <algorithm>
-#include <cstdio>
+#include <cstring>
 #include <exception>
 #include <memory>
 #include <new>
@@ -26,31 +28,37 @@ namespace {
 
 constexpr int DEFAULT_MEMORY = 2048, LARGEST = 65536;
 
-ngpt_status tell(char *message, size_t size, ngpt_status status, const std::exception &error) try {
-    if (message && size) std::snprintf(message, size, "%s", one_line(error.what()).c_str());
-    return status;
-} catch (const std::bad_alloc &) {
-    std::snprintf(message, size, "out of memory");
-    return NGPT_OUT_OF_MEMORY;
+constexpr int MOST_THREADS = 1024, MOST_CHANNELS = 65536;
+// Of the image that is kept until all of it is made.
+constexpr uint64_t BYTES_OF_PIXEL = 12;
+
+// Copies what is wrong to the caller. A handler that threw would end the process, even for lack of memory.
+ngpt_status tell(char *message, size_t size, ngpt_status status, const char *text) noexcept {
+    try {
+        copy_line(one_line(text).c_str(), message, size);
+        return status;
+    } catch (...) {
+        copy_line("out of memory", message, size);
+        return NGPT_OUT_OF_MEMORY;
+    }
 }
 
 // What `action` throws, as a status and a message.
-template <typename Action> ngpt_status guarded(char *message, size_t size, Action action) {
+template <typename Action> ngpt_status guarded(char *message, size_t size, Action action) noexcept {
     if (message && size) *message = 0;
     try {
         action();
         return NGPT_OK;
     } catch (const Failure &error) {
-        return tell(message, size, error.status, error);
+        return tell(message, size, error.status, error.what());
     } catch (const std::bad_alloc &) {
-        return tell(message, size, NGPT_OUT_OF_MEMORY, std::runtime_error("out of memory; free some, or allow less"));
+        copy_line("out of memory; free some, or allow less", message, size);
+        return NGPT_OUT_OF_MEMORY;
     } catch (const std::exception &error) {
-        // ONNX Runtime has no code of its own for this.
-        const std::string text = error.what();
-        const bool memory = text.find("allocate memory") != text.npos || text.find("bad_alloc") != text.npos;
-        return tell(message, size, memory ? NGPT_OUT_OF_MEMORY : NGPT_FAILED, error);
+        return tell(message, size, tells_of_memory(error.what()) ? NGPT_OUT_OF_MEMORY : NGPT_FAILED, error.what());
     } catch (...) {
-        return tell(message, size, NGPT_FAILED, std::runtime_error("an unknown exception"));
+        copy_line("an unknown exception", message, size);
+        return NGPT_FAILED;
     }
 }
 
@@ -66,6 +74,14 @@ std::string joined(const std::vector<std::string> &names) {
     return text;
 }
 
+// A format of any number, which C allows and C++ does not.
+int number_of(const ngpt_format &format) {
+    int number;
+    static_assert(sizeof number == sizeof format, "");
+    std::memcpy(&number, &format, sizeof number);
+    return number;
+}
+
 // Notes a view under one of the names that are known, or forgets it where there are no pixels.
 template <typename Channels>
 void set(Layers &views, const char *name, const char *verb, const std::vector<std::string> &known, const View &view,
@@ -73,22 +89,52 @@ void set(Layers &views, const char *name, const char *verb, const std::vector<st
     if (!name) refuse("the name is NULL; the network " + std::string(verb) + " " + joined(known));
     const std::string key = name;
     if (std::find(known.begin(), known.end(), key) == known.end())
-        refuse("the network " + std::string(verb) + " no '" + key.substr(0, 40) + "'; it " + verb + " " + joined(known));
+        refuse("the network " + std::string(verb) + " no '" + one_line(key, 40) + "'; it " + verb + " " +
+               joined(known));
     if (!view.pixels) {
         views.erase(key);
         return;
     }
     if (view.format != NGPT_FLOAT && view.format != NGPT_HALF)
-        refuse(key + ": the format is " + std::to_string(int(view.format)) + "; it must be NGPT_FLOAT or NGPT_HALF");
+        refuse(key + ": the format is " + std::to_string(view.format) + "; it must be NGPT_FLOAT or NGPT_HALF");
     if (view.channels < channels())
-        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " + std::to_string(channels()));
+        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " +
+               std::to_string(channels()));
+    if (view.channels > MOST_CHANNELS)
+        refuse(key + ": has " + std::to_string(view.channels) + " channels; it must have " +
+               std::to_string(MOST_CHANNELS) + " at most");
     views[key] = view;
 }
 
+std::string size_of(int width, int height) { return std::to_string(width) + "x" + std::to_string(height); }
+
 void check_size(int width, int height) {
     if (width < 1 || height < 1 || width > LARGEST || height > LARGEST)
-        refuse("the image has " + std::to_string(width) + "x" + std::to_string(height) + " pixels; sides must be 1 to " +
-               std::to_string(LARGEST));
+        refuse("the image has " + size_of(width, height) + " pixels; sides must be 1 to " + std::to_string(LARGEST));
+}
+
+void check_addresses(const std::string &name, const View &view, int width, int height, int channels) {
+    if (!addressable(view, width, height, channels))
+        refuse(name + ": its strides lead out of memory for " + size_of(width, height) + " pixels");
+}
+
+void check_addresses(const Network &network, const Layers &layers, const Layers &outputs, int width, int height) {
+    for (const auto &[name, view] : layers) check_addresses(name, view, width, height, network.input(name)->channels);
+    for (const auto &[name, view] : outputs) check_addresses(name, view, width, height, 3);
+}
+
+// Of the statistics of a whole image: ONNX Runtime's and our copies of the layers, measured and rounded up.
+uint64_t bytes_of_statistics(const Network &network) { return network.prepared.empty() ? 300 : 700; }
+
+// What is left of memory beside so many bytes for each pixel, in MiB. Asked before: where memory is promised that is
+// not there, the system ends the process when it is written to.
+int64_t left_beside(int width, int height, uint64_t bytes) {
+    const uint64_t needed = uint64_t(width) * uint64_t(height) * bytes, left = memory_left();
+    if (needed > left)
+        throw Failure(NGPT_OUT_OF_MEMORY, size_of(width, height) + " pixels take " + std::to_string(needed >> 20) +
+                                              " MiB beside their layers, and " + std::to_string(left >> 20) +
+                                              " MiB are left; cut the image, or free some");
+    return int64_t((left - needed) >> 20);
 }
 
 void check_layers(const Network &network, const Layers &layers, bool preparing) {
@@ -129,11 +175,17 @@ const char *ngpt_version(void) { return NGPT_VERSION; }
 int ngpt_abi(void) { return NGPT_ABI; }
 
 ngpt_network *ngpt_open(const char *path, int threads, char *message, size_t size) {
+    return ngpt_open_on("cpu", path, threads, message, size);
+}
+
+ngpt_network *ngpt_open_on(const char *device, const char *path, int threads, char *message, size_t size) {
     ngpt_network *network = nullptr;
     guarded(message, size, [&] {
         if (!path) refuse("the path of the network is NULL");
-        if (threads < 0) refuse("the number of threads is " + std::to_string(threads) + "; it must be 0 or more");
-        auto shared = std::make_shared<Network>(path, threads);
+        if (threads < 0 || threads > MOST_THREADS)
+            refuse("the number of threads is " + std::to_string(threads) + "; it must be 0 to " +
+                   std::to_string(MOST_THREADS));
+        auto shared = std::make_shared<Network>(path, device ? device : "cpu", threads);
         network = new ngpt_network{std::move(shared)};
     });
     return network;
@@ -166,10 +218,13 @@ const char *ngpt_metadata(const ngpt_network *network, const char *key) try {
     return nullptr;
 }
 
-ngpt_job *ngpt_job_new(const ngpt_network *network) {
-    ngpt_job *job = network ? new (std::nothrow) ngpt_job : nullptr;
-    if (job) job->network = network->shared;
+ngpt_job *ngpt_job_new(const ngpt_network *network) try {
+    if (!network) return nullptr;
+    ngpt_job *job = new ngpt_job;
+    job->network = network->shared;
     return job;
+} catch (const std::bad_alloc &) {
+    return nullptr;
 }
 
 void ngpt_job_free(ngpt_job *job) { delete job; }
@@ -182,7 +237,8 @@ ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void *pixels, 
         std::vector<std::string> known;
         for (const Input &one : job->network->inputs) known.push_back(one.name);
         // `read` and `write` have one structure; this one is for `read`.
-        const View view{const_cast<void *>(pixels), format, channels, channel_stride, pixel_stride, row_stride};
+        void *at = const_cast<void *>(pixels);
+        const View view{at, number_of(format), channels, channel_stride, pixel_stride, row_stride};
         set(job->layers, name, "reads", known, view, [&] { return job->network->input(name)->channels; });
     });
 }
@@ -192,7 +248,7 @@ ngpt_status ngpt_set_output(ngpt_job *job, const char *name, void *pixels, ngpt_
     return guarded(job, [&] {
         std::vector<std::string> known = job->network->prepared;
         known.insert(known.begin(), "image");
-        const View view{pixels, format, channels, channel_stride, pixel_stride, row_stride};
+        const View view{pixels, number_of(format), channels, channel_stride, pixel_stride, row_stride};
         set(job->outputs, name, "makes", known, view, [] { return 3; });
     });
 }
@@ -206,6 +262,8 @@ ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress pro
         std::vector<std::string> names;
         for (const std::string &name : network.prepared)
             if (outputs.count(name)) names.push_back(name);
+        check_addresses(network, layers, outputs, width, height);
+        left_beside(width, height, bytes_of_statistics(network));
         Progress asked(progress, user);
         asked.advance(0);
         Images images = network.prepare(names, layers, width, height, asked.cancelled());
@@ -226,22 +284,29 @@ ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_prog
         check_layers(network, layers, false);
         if (!outputs.count("image")) throw Failure(NGPT_MISSING_LAYER, "the output 'image' is not set");
 
-        const auto tiles = network.plan(width, height, memory ? memory : DEFAULT_MEMORY, layers.count("base"));
+        check_addresses(network, layers, outputs, width, height);
+
+        if (job->width != width || job->height != height) job->statistics.clear();
+        const int64_t left = left_beside(width, height, BYTES_OF_PIXEL);
+        const int64_t most = std::min<int64_t>(memory ? memory : DEFAULT_MEMORY, left);
+        const Tiles tiles = network.plan(width, height, most, layers.count("base"));
+        const bool asks = tiles.count() > 1 && job->statistics.empty();
+        if (asks) left_beside(width, height, BYTES_OF_PIXEL + bytes_of_statistics(network));
         Progress asked(progress, user);
         asked.advance(0);
-        std::vector<float> image(size_t(3) * width * height), shared = std::exchange(job->statistics, {});
-        if (job->width != width || job->height != height) shared.clear();
-        if (tiles.size() > 1 && shared.empty())
-            shared = network.prepare({}, layers, width, height, asked.cancelled()).at("statistics");
-        for (size_t i = 0; i < tiles.size(); i++) {
-            const auto &[inner, outer] = tiles[i];
+        std::vector<float> image(size_t(3) * size_t(width) * size_t(height));
+        std::vector<float> shared = std::exchange(job->statistics, {});
+        if (asks) shared = network.prepare({}, layers, width, height, asked.cancelled()).at("statistics");
+        for (int64_t i = 0; i < tiles.count(); i++) {
+            const auto [inner, outer] = tiles.tile(i);
             const std::vector<float> part = network.run(layers, width, outer, shared, asked.cancelled());
             for (int64_t c = 0; c < 3; c++)
                 for (int64_t y = inner.top; y < inner.top + inner.height; y++) {
-                    const float *from = &part[(c * outer.height + y - outer.top) * outer.width + inner.left - outer.left];
+                    const int64_t row = (c * outer.height + y - outer.top) * outer.width;
+                    const float *from = &part[size_t(row + inner.left - outer.left)];
                     std::copy(from, from + inner.width, &image[(c * height + y) * width + inner.left]);
                 }
-            asked.advance(double(i + 1) / double(tiles.size()));
+            asked.advance(double(i + 1) / double(tiles.count()));
         }
         write(outputs.at("image"), width, height, image.data());
     });

@@ -43,7 +43,7 @@ typedef enum ngpt_status {
     NGPT_BAD_ARGUMENT = 1,  /* NULL, a name that the network does not know, a size or number out of range */
     NGPT_MISSING_LAYER = 2, /* a layer that the network needs, or the output, is not set */
     NGPT_BAD_NETWORK = 3,   /* a file that is damaged, lacks, or belongs to another network */
-    NGPT_OUT_OF_MEMORY = 4,
+    NGPT_OUT_OF_MEMORY = 4, /* what is allowed, or what the machine has left, is too little */
     NGPT_CANCELLED = 5,     /* by the progress function */
     NGPT_FAILED = 6         /* ONNX Runtime, or the system */
 } ngpt_status;
@@ -58,11 +58,16 @@ NGPT_API int ngpt_abi(void);
 
 /* Loads a network, and NETWORK.statistics.onnx beside it, which is needed for tiles only.
  *
- * threads  of the processor for each run, 0 for as many as it has cores
- * message  says in one line what is wrong; `size` bytes, or NULL
+ * threads  of the processor for each run, 0 for as many as it has cores; at most 1024
+ * message  says in one line of UTF-8 what is wrong; `size` bytes, or NULL
  *
  * Returns NULL if it cannot. */
 NGPT_API ngpt_network *ngpt_open(const char *path, int threads, char *message, size_t size);
+
+/* The same on a device: NULL or "cpu" (as `ngpt_open`), "cuda", "tensorrt", "openvino", "directml" or "coreml". Returns
+ * NULL where this build of ONNX Runtime has no such device, and the message says which it has. What a device cannot do
+ * runs on the processor. Layers and images stay in the memory of the processor. */
+NGPT_API ngpt_network *ngpt_open_on(const char *device, const char *path, int threads, char *message, size_t size);
 
 /* Jobs of the network stay usable. */
 NGPT_API void ngpt_close(ngpt_network *network);
@@ -92,7 +97,8 @@ NGPT_API const char *ngpt_message(const ngpt_job *job);
  *
  * name      of a layer of the network
  * pixels    the first channel of the pixel at the top left; NULL: the layer is not there after all
- * channels  that the image has, as many as the network reads or more; those beyond are ignored, such as alpha
+ * channels  that the image has, as many as the network reads or more, 65536 at most; those beyond are ignored, such as
+ *           alpha
  * ..stride  bytes from a channel, pixel or row to the next; 0 for interleaved pixels without gaps, that is for
  *           sizeof(format), channels * sizeof(format), and width times the bytes of a pixel. Rows that begin at the
  *           bottom have a negative stride. */
@@ -106,22 +112,25 @@ NGPT_API ngpt_status ngpt_set_layer(ngpt_job *job, const char *name, const void 
 NGPT_API ngpt_status ngpt_set_output(ngpt_job *job, const char *name, void *pixels, ngpt_format format, int channels,
                                      ptrdiff_t channel_stride, ptrdiff_t pixel_stride, ptrdiff_t row_stride);
 
-/* Called about twenty times a second by the thread in `ngpt_run` with the part that is done, 0 to 1. Anything but 0
- * cancels the run. It must not throw, and not free the job. */
+/* Called by the thread in `ngpt_run` when the run begins, and with each tile, with the part that is done, 0 to 1; and,
+ * so that it may cancel, about twenty times a second with the same part again. A small image is one tile. Anything but
+ * 0 cancels the run. It must not throw, and not free the job. */
 typedef int (*ngpt_progress)(void *user, double fraction);
 
 /* Makes "image", in tiles if need be, which share the statistics of the whole image.
  *
  * width, height  1 to 65536
- * memory         MiB that the network may use beside the layers, 0 for 2048. Smaller tiles take longer, and give the
- *                same image to 1e-5.
+ * memory         MiB that a tile may take, 0 for 2048; less where the machine has less left. Smaller tiles take
+ *                longer, and give the same image to 1e-5. The whole image takes 12 bytes a pixel beside, and, if it is
+ *                cut into tiles, 300 for their statistics (700 where the network corrects another denoiser). What the
+ *                machine has no room for is refused before anything is made.
  * progress       may be NULL; `user` is passed to it */
 NGPT_API ngpt_status ngpt_run(ngpt_job *job, int width, int height, int memory, ngpt_progress progress, void *user);
 
 /* Only for networks that correct another denoiser, which read "denoised": makes what that is to be given, those of
  * "oidn_primal", "oidn_albedo", "oidn_normal" and "oidn_base" that are set as outputs. Call it, then the denoiser, then
  * set "denoised" (and "denoised_base", and oidn_base as "base"), and call `ngpt_run`, which takes over the statistics.
- * It works on the whole image at once. */
+ * It works on the whole image at once, and takes up to 700 bytes a pixel. */
 NGPT_API ngpt_status ngpt_prepare(ngpt_job *job, int width, int height, ngpt_progress progress, void *user);
 
 #ifdef __cplusplus

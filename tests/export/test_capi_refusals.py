@@ -156,7 +156,7 @@ def test_damaged_networks(library, tmp_path):
         network = Network(library, tmp_path / "mutant.onnx")
         assert (network.handle is None) == bool(network.message)
         network.close()
-    assert Network(library, FAST, threads=-1).message == "the number of threads is -1; it must be 0 or more"
+    assert Network(library, FAST, threads=-1).message == "the number of threads is -1; it must be 0 to 1024"
 
 
 def test_messages_fit_where_they_go(library, tmp_path):

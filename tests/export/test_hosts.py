@@ -18,6 +18,7 @@ import pytest
 from browser import Session
 from exr_files import noise, same_bits, window, write_raw
 from hosts import HOSTS, VECTOR, agree, caller, cpp_host, node, node_host, node_modules, read_layers, read_pfm
+from processes import left_in_home
 
 import ngpt
 from ngpt.cli import main
@@ -72,6 +73,14 @@ def wide(tmp_path_factory, python):
 @pytest.fixture(scope="module", params=[cpp_host, node_host], ids=["cpp", "node"])
 def host(request, tmp_path_factory):
     return caller(request.param(tmp_path_factory.mktemp("host")))
+
+
+def test_node_leaves_nothing_in_a_home(tmp_path):
+    """ONNX Runtime's telemetry is off before it is loaded; that of C and C++ is tested with the C library."""
+    call = [*node_host(tmp_path), MODEL, VECTOR, tmp_path / "image.pfm"]
+    assert left_in_home(tmp_path / "home", *call) == []
+    if not left_in_home(tmp_path / "on", *call, ORT_DISABLE_TELEMETRY="0"):
+        pytest.skip("this build of ONNX Runtime sends no telemetry")
 
 
 def test_the_vector_is_what_denoise_makes_of_all_that_goes_wrong():
