@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.session import render_frames
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 from ngpt.io.exr import write
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output
@@ -96,7 +96,7 @@ def write_frames_on_cluster(
 ) -> Written:
     """``write_frames`` in parts, each on a worker of the Dask cluster whose scheduler is at ``address``."""
     if options.pop("shard", None):
-        raise NgptError("--cluster shares the frames out by itself; leave --shard out")
+        raise WrongUse("--cluster shares the frames out by itself; leave --shard out")
     for file in files.values():
         check_output(file, overwrite or skip_existing)
     from data_gen.dataset.jobs import cluster

@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet, and the interrupt that others hide."""
+"""The one exception that users of ngpt meet, its kind for wrong calls, and the interrupt that others hide."""
 
 LONGEST = 1000
 
@@ -15,6 +15,13 @@ class NgptError(ValueError):
         line = " ".join(message.splitlines())
         half = LONGEST // 2 - 3
         super().__init__(line if len(line) <= LONGEST else f"{line[:half]} ... {line[-half:]}")
+
+
+class WrongUse(NgptError):
+    """What is asked for makes no sense whatever the files hold: an option, a value, or two that exclude each other.
+
+    The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
+    """
 
 
 def stop_if_interrupted(error: BaseException) -> None:

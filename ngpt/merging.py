@@ -204,7 +204,7 @@ def _number(stack: GradientStack, name: str) -> float:
     # Files of elsewhere may hold anything under our names.
     if not isinstance(value, int | float | np.number) or not np.isfinite(value) or value < 0:
         raise NgptError(f"{stack.path}: attribute '{name}' is {value!r}, and no number that could be summed; remove it")
-    return value
+    return float(value)
 
 
 def _seeds(stack: GradientStack) -> list[str]:

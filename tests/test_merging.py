@@ -175,9 +175,9 @@ def test_command(rng, tmp_path, capsys):
     assert np.allclose(pass_through(merged)["diagnostics.discarded"], 0.25)
     assert main(["info", out]) == 0
     assert "discarded" in capsys.readouterr().out
-    assert main(["merge", *paths, "-o", out]) == 2
+    assert main(["merge", *paths, "-o", out]) == 1
     assert "--force" in capsys.readouterr().err
-    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 2
+    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 1
     assert "seed 0" in capsys.readouterr().err
 
 

@@ -27,7 +27,7 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
@@ -115,17 +115,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
-        raise NgptError(
+        raise WrongUse(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
     for _, target in pairs:
         check_output(target, args.force or args.skip_existing)
         if target.suffix.lower() != ".exr":
-            raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+            raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
-                raise NgptError(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+                raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
     # Their results are there, but later frames are made of them.
     missing = [i for i, (_, target) in enumerate(pairs) if not target.exists()] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
@@ -297,11 +297,11 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
         if not folder.is_dir() and (folder.exists() or named_file):
             kind = "is a file" if folder.exists() else "is the name of a file"
-            raise NgptError(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
+            raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
         targets = [folder / path.name for path in sources]
         repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
         if repeated:
-            raise NgptError(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
+            raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
@@ -185,7 +185,7 @@ def labels(paths: list[str]) -> list[str]:
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:
-            raise NgptError(f"{path}: is given twice; leave one out")
+            raise WrongUse(f"{path}: is given twice; leave one out")
     bare = [place.with_suffix("").parts for place in places]
     for depth in range(1, max(map(len, bare)) + 1):
         names = ["/".join(parts[-depth:]) for parts in bare]

@@ -93,11 +93,12 @@ def test_help_and_lists_have_methods_by_standing(source, capsys):
         (["-m", "ngpt-fast", "-O", "memory=much"], "option 'memory': 'much' is not allowed; it takes a whole number"),
     ],
 )
-def test_errors_are_those_of_the_method(source, arguments, message, capfd):
+def test_errors_are_those_of_the_method(source, tmp_path, arguments, message, capfd):
     if "oidn" in arguments and "alpha=1" not in arguments and oidn.missing():
         pytest.skip(oidn.missing())
-    assert main(["denoise", source, *arguments]) == 1
-    assert message in capfd.readouterr().err
+    assert main(["denoise", source, source, *arguments, "-o", f"{tmp_path}/"]) == 2
+    errors = capfd.readouterr().err
+    assert message in errors and errors.count("\n") == 1
 
 
 def test_an_option_without_a_value_is_wrong_usage(source, capfd):

@@ -13,6 +13,7 @@ from data_gen.frames.pattern import filled
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.system.console import Console
+from ngpt.system.interrupts import Interrupt
 
 
 def test_frames_are_ranges_lists_and_steps():
@@ -81,7 +82,7 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
     ]
     assert main(["render", "diffuse", "--frames", "0:2", *words]) == 0
     first = (tmp_path / "shot/diffuse.0001.exr").read_bytes()
-    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 2
+    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 1
     assert "exists already" in capsys.readouterr().err
     assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
     assert "2 of 3 frames were skipped" in capsys.readouterr().err
@@ -161,7 +162,9 @@ def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer
     words = ["render", "diffuse", "--frames", "0:2", "--cluster", "tcp://nowhere:1", "-o", str(tmp_path / "shot")]
     args = parser_of(words)
     assert render.run(args, Console(quiet=True)) == 0 and seen == [before]
-    pressed = contextmanager(lambda noted: iter([lambda: True]))
+    interrupt = Interrupt()
+    interrupt.signal = signal.SIGINT
+    pressed = contextmanager(lambda noted: iter([interrupt]))
     monkeypatch.setattr(render, "stop_on_ctrl_c", pressed)
     one = ["render", "diffuse", "--size", "8x8", "-q", "--sampler", "primal", "-o", str(tmp_path / "a.exr")]
     assert main(one) == 0 and ngpt.read(tmp_path / "a.exr").attributes["ngpt:spp"] == 32
