@@ -196,6 +196,7 @@ def shot(args: argparse.Namespace, console: Console) -> int:
                 frame, what = report["frame"], "{width}x{height}, {spp} spp, {seconds:.2f} s".format(**report)
                 if report["discarded"]:
                     console.say(f"frame {frame}: {report['discarded']} non-finite values were left out")
+                what += f", in place of {report['in place of']}" if "in place of" in report else ""
                 console.say(f"{filled(args.scene, frame)} frame {frame} -> {report['output']}: {what}")
             said = len(written.frames)
             progress(written.done, total)

@@ -29,6 +29,7 @@ from ngpt.cli.arguments import (
 from ngpt.cli.denoise_shot import way, windowed
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
@@ -127,7 +128,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             if given:
                 raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
     # Their results are there, but later frames are made of them.
-    missing = [i for i, (_, target) in enumerate(pairs) if not target.exists()] if args.temporal else []
+    missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
     reference = read_image(args.ref, args.untrusted) if args.ref else None
     options = {
@@ -139,7 +140,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     overwrite = partial(write_frame, overwrite=args.force)
     frames: Any
     windows = False
-    if args.temporal and not all(args.skip_existing and target.exists() for _, target in pairs):
+    if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
         by_wcv = args.method == "wcv" and not options
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
@@ -188,7 +189,7 @@ def _unseen(done: int, total: int) -> None:
 class Frame(NamedTuple):
     """A stack on its way from its file to that of its result; with ``there`` its result was there already.
 
-    ``over_time`` is what other frames were to the result, as header attributes.
+    ``cut`` says that a file is in its place which is not whole. ``over_time`` is what other frames were to the result, as header attributes.
     """
 
     source: Path
@@ -198,6 +199,7 @@ class Frame(NamedTuple):
     metrics: dict[str, float] | None = None
     groups: tuple[str, ...] = ()
     there: bool = False
+    cut: bool = False
     over_time: Mapping[str, Any] = {}
 
 
@@ -207,10 +209,11 @@ def read_frame(
     """``again``: results that are made again where they are there, since others build on them."""
     source, target = pair
     # Only now, for several machines may be at work on one folder.
-    there = args.skip_existing and target.exists()
+    there = args.skip_existing and finished(target)
     if there and target not in again:
         return Frame(source, target, None, there=True)
-    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there)
+    cut = args.skip_existing and not there and target.exists()
+    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there, cut=cut)
 
 
 def compute_frame(
@@ -244,11 +247,11 @@ def compute_frame(
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, over_time = frame
+    source, target, stack, result, metrics, groups, there, cut, over_time = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
-    write(target, result.image, like=stack, overwrite=overwrite, attributes={**result.attributes, **over_time})
+    write(target, result.image, like=stack, overwrite=overwrite or cut, attributes={**result.attributes, **over_time})
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -263,6 +266,7 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "standard error": result.error is not None,
         "groups": list(groups),
     }
+    report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     return report | ({"metrics": metrics} if metrics else {})
 
@@ -277,6 +281,8 @@ def describe(report: dict) -> str:
     text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
         text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if "in place of" in report:
+        text += f", in place of {report['in place of']}"
     if "history" in report:
         text += f", {report['history']:.0%} history"
     if report["groups"]:

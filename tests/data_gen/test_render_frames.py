@@ -87,6 +87,11 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
     assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
     assert "2 of 3 frames were skipped" in capsys.readouterr().err
     assert (tmp_path / "shot/diffuse.0001.exr").read_bytes() == first
+    (tmp_path / "shot/diffuse.0001.exr").write_bytes(first[:-5])
+    assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
+    told = capsys.readouterr().err
+    assert "2 of 3 frames were skipped" in told and "in place of a file that was not whole" in told
+    assert len((tmp_path / "shot/diffuse.0001.exr").read_bytes()) == len(first)
     stack = ngpt.read(tmp_path / "shot/diffuse.0002.exr")
     assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05
 
