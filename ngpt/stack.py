@@ -106,9 +106,10 @@ class GradientStack:
     def number(self, attribute: str) -> float | None:
         """An attribute that is a finite number; None where there is none, for files of elsewhere may hold anything."""
         value = self.attributes.get(attribute)
-        if isinstance(value, bool) or not isinstance(value, int | float | np.number) or not abs(value) < np.inf:
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
             return None
-        return float(value)
+        number = float(value)
+        return number if abs(number) < np.inf else None
 
     def __getitem__(self, name: str) -> np.ndarray:
         """Returns layer ``name``; raises NgptError if the stack does not hold it."""

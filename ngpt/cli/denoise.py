@@ -189,7 +189,8 @@ def _unseen(done: int, total: int) -> None:
 class Frame(NamedTuple):
     """A stack on its way from its file to that of its result; with ``there`` its result was there already.
 
-    ``cut`` says that a file is in its place which is not whole. ``over_time`` is what other frames were to the result, as header attributes.
+    ``cut`` says that a file is in its place that is not whole.
+    ``over_time`` is what other frames were to the result, as header attributes.
     """
 
     source: Path

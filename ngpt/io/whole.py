@@ -10,7 +10,7 @@ from typing import BinaryIO
 
 from ngpt.errors import NgptError
 from ngpt.io.header import PartHeader, read_headers
-from ngpt.io.openexr import regular_file
+from ngpt.system.reading import regular_file
 
 _MULTIPART = 0x1000
 
