@@ -14,7 +14,7 @@ from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
-from ngpt.system.console import Console
+from ngpt.system.console import Console, tell
 from ngpt.system.files import check_output
 from ngpt.version import __version__
 
@@ -125,7 +125,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
-            print(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
+            tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
     formulas |= {"change": CHANGE} if len(frames) > 1 else {}
     overview = Overview(tables=tables, formulas=formulas)
@@ -212,6 +212,6 @@ def add_errors(entry: Entry, metrics: list[str], reference: np.ndarray, path: st
 def print_table(entries: list[Entry]) -> None:
     """The numbers of the page, for those who do not open it."""
     width = max(len(entry.name) for entry in entries)
-    print(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
+    tell(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
     for entry in entries:
-        print(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))
+        tell(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))

@@ -77,10 +77,25 @@ def _check_address_space() -> None:
         )
 
 
+def printable(text: str) -> str:
+    """One line of text as it may go to a terminal: what files call their things may hold sequences that control one.
+
+    Control characters, line breaks and marks of direction become what Python writes for them, ``\\x1b``.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+def tell(line: str) -> None:
+    """A line of the result, on standard output."""
+    print(printable(line))
+
+
 def print_line(text: str, stream: TextIO) -> None:
     """A message, at once. That nobody takes it, as when the disk with the log is full, stops no work."""
     try:
-        print(text, file=stream, flush=True)
+        print(printable(text), file=stream, flush=True)
     except OSError:
         _close(stream)
 
@@ -144,7 +159,7 @@ class Console:
         if self.quiet:
             yield lambda done, total: None
         elif self.terminal:
-            with _bar(label, unit, rate) as update:
+            with _bar(printable(label), unit, rate) as update:
                 yield update
         else:
             yield _Lines(self, label, unit, rate)

@@ -88,3 +88,29 @@ def test_pipes_are_no_networks(tmp_path, capsys):
     with pytest.raises(NgptError, match="no such file"):
         session(tmp_path / "a.onnx", "cpu", 0)
     assert main(["info", str(tmp_path / "a.onnx")]) == 1
+
+
+EVIL = "x\x1b]0;title\x07\x1b[2J\rgood\u202eneddih"
+
+
+def test_control_sequences_of_files_are_printed_escaped(tmp_path, capsys):
+    path = network(tmp_path / "a.onnx", **{"ngpt.method": EVIL, "ngpt.precision": EVIL, "ngpt.version": EVIL})
+    assert main(["info", str(path)]) == 0
+    shown = [capsys.readouterr().out]
+    stack = full_stack(12, 16)
+    stack.attributes |= {"owner": EVIL, f"name{EVIL}": "a"}
+    ngpt.write(tmp_path / "s.exr", ngpt.io.exr.with_channels(stack, {f"{EVIL}.Y": stack["depth"][..., 0]}))
+    assert main(["info", str(tmp_path / "s.exr")]) == 0
+    shown.append(capsys.readouterr().out)
+    odd = tmp_path / f"{EVIL}.exr"
+    odd.write_bytes((tmp_path / "s.exr").read_bytes())
+    assert main(["denoise", str(odd), "-m", "l2"]) == 0
+    shown.append(capsys.readouterr().err)
+    assert main(["report", str(odd), "--ref", str(tmp_path / "s.exr"), "-o", str(tmp_path / "page.html")]) == 0
+    shown.append(capsys.readouterr().out)
+    odd.write_bytes(b"damaged")
+    assert main(["info", str(odd)]) == 1
+    shown.append(capsys.readouterr().err)
+    for text in shown:
+        assert "\\x1b]0;title\\x07" in text and "\\u202e" in text
+        assert all(letter == "\n" or letter.isprintable() for letter in text), ascii(text)
