@@ -169,6 +169,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
                 report = {"input": str(source), "error": str(report)}
             else:
                 console.say(f"[{i}/{len(pairs)}] {describe(report)}")
+                if unknown := report.get("pixels without standard error"):
+                    console.say(f"{source}: the error of {unknown} pixels is NaN, for their variances are not finite")
             reports.append(report)
             progress(i, len(pairs))
     failed = sum("error" in report for report in reports)
@@ -267,6 +269,8 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "standard error": result.error is not None,
         "groups": list(groups),
     }
+    if result.error is not None:
+        report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
     report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     return report | ({"metrics": metrics} if metrics else {})

@@ -30,6 +30,7 @@ def test_frames_that_make_no_sense_are_refused(text):
 def test_text_changes_from_frame_to_frame():
     assert filled("{frame}", 7) == "7" and filled("shot.{frame:04d}.exr", 7) == "shot.0007.exr"
     assert filled("{10 + frame * 1.5:.2f},0", 3) == "14.50,0" and filled("{sin(pi * frame / 2):.1f}", 1) == "1.0"
+    assert filled("{frame:*>8.3f}|{frame:+,d}|{frame:#x}|{frame:99}", 4000)[:22] == "4000.000|+4,000|0xfa0|"
     assert (
         filled("{-(frame // 2) % 5}", 4) == "3"
         and filled("plain", 1) == "plain"
@@ -38,7 +39,11 @@ def test_text_changes_from_frame_to_frame():
 
 
 @pytest.mark.parametrize(
-    "text", ["{frames}", "{frame.real}", "{__import__('os')}", "{frame / 0}", "{frame:q}", "{frame +}"]
+    "text",
+    [
+        *("{frames}", "{frame.real}", "{__import__('os')}", "{frame / 0}", "{frame:q}", "{frame +}"),
+        *("{min(frame, 1, key=print)}", "{max(*frame)}", "{frame:.999999999f}", "{frame:0999999999d}", "{frame:100}"),
+    ],
 )
 def test_text_that_cannot_be_computed_is_refused(text):
     with pytest.raises(NgptError, match="frame"):
