@@ -95,6 +95,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     if called and called not in verbs and verbs.keys() == VERBS.keys():
         raise WrongUse(f"there is no verb '{called}' here; {NO_RENDERER}")
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
+    parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
     for name, verb in verbs.items():
