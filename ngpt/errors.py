@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet, its kind for wrong calls, and the interrupt that others hide."""
+"""The one exception that users of ngpt meet, its kind for wrong calls, and interrupts, which others hide."""
 
 LONGEST = 1000
 
@@ -24,6 +24,14 @@ class WrongUse(NgptError):
     """
 
 
+class Interrupted(KeyboardInterrupt):
+    """What Ctrl-C and SIGTERM raise in a command.
+
+    Python 3.11 ends itself by SIGINT, whatever status it is told, once a plain KeyboardInterrupt has passed code that
+    was compiled from a text, as that of dataclasses and named tuples is.
+    """
+
+
 def stop_if_interrupted(error: BaseException) -> None:
     """Raises KeyboardInterrupt if that is what ``error`` comes from: Ctrl-C within a library that wraps what it meets.
 
@@ -31,6 +39,7 @@ def stop_if_interrupted(error: BaseException) -> None:
     """
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, KeyboardInterrupt) or str(cause).rstrip().endswith("\nKeyboardInterrupt:"):
+        told = str(cause).rstrip().endswith(("\nKeyboardInterrupt:", "\nInterrupted:"))
+        if told or isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         cause = cause.__cause__ or cause.__context__

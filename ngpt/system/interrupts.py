@@ -5,6 +5,8 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 
+from ngpt.errors import Interrupted
+
 # Signals, and the handlers that are there where nobody has set another.
 _SIGNALS = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
 
@@ -26,7 +28,7 @@ class Interrupt:
 
 @contextmanager
 def raised() -> Iterator[Interrupt]:
-    """Both signals raise KeyboardInterrupt in the block, so that all of it is cleaned up after, and are noted.
+    """Both signals raise ``Interrupted`` in the block, so that all of it is cleaned up after, and are noted.
 
     One that somebody else handles or has switched off is left alone, and so are both outside of the main thread.
     """
@@ -34,7 +36,7 @@ def raised() -> Iterator[Interrupt]:
 
     def note(number, frame):
         found.signal = found.signal or number
-        raise KeyboardInterrupt
+        raise Interrupted
 
     # Python's own handlers tell that nobody has set another; those of the background of a script are others.
     ours = [number for number, usual in _SIGNALS.items() if signal.getsignal(number) is usual]
