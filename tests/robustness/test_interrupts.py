@@ -89,13 +89,13 @@ def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
 
 
 @pytest.mark.parametrize("name", SIGNALS)
-def test_the_status_is_told_wherever_it_comes(name):
+def test_the_status_is_told_wherever_it_comes(name, tmp_path):
     """Python 3.11 ends itself by SIGINT after a KeyboardInterrupt in code that was compiled from a text."""
-    code = (
+    (tmp_path / "texts.py").write_text(
         "import os, sys\nfrom ngpt.system.console import run_command\n"
         f"sys.exit(run_command(lambda: exec('os.kill(os.getpid(), {int(SIGNALS[name])}); [0 for i in range(9)]')))"
     )
-    run = complete([sys.executable, "-c", code])
+    run = complete([sys.executable, "-m", "texts"], cwd=tmp_path)
     assert (run.returncode, run.stderr) == (128 + SIGNALS[name], "ngpt: error: interrupted\n")
 
 
