@@ -29,7 +29,7 @@ from data_gen.passes import DEFAULT_MEMORY, Progress, SamplePass
 from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
@@ -73,9 +73,9 @@ class Adaptive:
 def check_adaptive(adaptive: Adaptive, sampler: Sampler, options: dict, spp: int | None) -> None:
     """Raises NgptError for what cannot be rendered with samples in different numbers."""
     if adaptive.error is not None and not 0 < adaptive.error < math.inf:
-        raise NgptError(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
+        raise WrongUse(f"an error of {adaptive.error:g} is never reached; give a positive number, such as 0.05")
     if spp is not None and spp < LEAST:
-        raise NgptError(f"{spp} samples per pixel are too few to be shared out; from {LEAST} on they can be")
+        raise WrongUse(f"{spp} samples per pixel are too few to be shared out; from {LEAST} on they can be")
     if sampler.even:
         able = ", ".join(name for name, other in SAMPLERS.items() if not other.even)
         raise NgptError(

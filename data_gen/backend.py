@@ -2,7 +2,7 @@
 
 from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
-from ngpt.errors import NgptError, stop_if_interrupted
+from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -28,7 +28,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         ) from error
     jit_variants = [v for v in mi.variants() if not v.startswith("scalar")]
     if name not in jit_variants:
-        raise NgptError(
+        raise WrongUse(
             f"variant '{name}' is not one this Mitsuba can vectorise; choose one of: {', '.join(jit_variants)}"
         )
     if name.startswith("llvm"):

@@ -15,7 +15,7 @@ from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import with_channels
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
@@ -112,16 +112,16 @@ def stack_of(
 def check_limits(
     spp: int | None, seed: int, sampler: str, seconds: float | None, memory: int, ends: bool = False
 ) -> None:
-    """Raises NgptError for what no scene could be rendered with; ``ends``: something else ends the render."""
+    """Raises WrongUse for what no scene could be rendered with; ``ends``: something else ends the render."""
     if spp is None and seconds is None and not ends:
-        raise NgptError("neither a number of samples per pixel nor a time to render for is given")
+        raise WrongUse("neither a number of samples per pixel nor a time to render for is given")
     if spp is not None and not 1 <= spp < 2**31:
-        raise NgptError(f"{spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
+        raise WrongUse(f"{spp} samples per pixel: from 1 to 2^31 - 1 can be rendered")
     if seconds is not None and not 0 < seconds < float("inf"):
-        raise NgptError(f"cannot render for {seconds:g} s; give a positive number of seconds")
+        raise WrongUse(f"cannot render for {seconds:g} s; give a positive number of seconds")
     if not 0 <= seed < 2**64:
-        raise NgptError(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
+        raise WrongUse(f"seed {seed} is out of range; use 0 .. 2^64 - 1")
     if memory < 1:
-        raise NgptError(f"{memory} MiB of memory: give a positive number")
+        raise WrongUse(f"{memory} MiB of memory: give a positive number")
     if sampler != "auto":
         find(sampler)

@@ -7,19 +7,18 @@ for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16, camer
 
 from __future__ import annotations
 
-import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 from data_gen.backend import DEFAULT_VARIANT, use_variant
 from data_gen.frames.pattern import filled
 from data_gen.samplers import FRAME_SAMPLERS, check_options
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.stack import GradientStack
+from ngpt.system.interrupts import noted
 
 if TYPE_CHECKING:
     import mitsuba as mi
@@ -158,7 +157,7 @@ def render_frames(
     cameras without a projection.
     """
     if dt == 1:
-        raise NgptError("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
+        raise WrongUse("--dt 1: how much differences vary takes 2 pairs or more to tell; use --dt 2")
     parameters = dict(parameters or {})
 
     def describe(frame: int) -> tuple[str, dict[str, str]]:
@@ -193,33 +192,8 @@ def render_frames(
     return whole()
 
 
-@contextmanager
-def stop_on_ctrl_c(noted: Callable[[], None] = lambda: None) -> Iterator[Callable[[], bool]]:
-    """Yields a function that says whether Ctrl-C was pressed, for ``stop``; pressed again, it interrupts as usual.
-
-    ``noted`` is called at once when it is pressed.
-    """
-    pressed = False
-
-    def note(number, frame):
-        nonlocal pressed
-        pressed = True
-        signal.signal(signal.SIGINT, before)
-        noted()
-
-    before = signal.getsignal(signal.SIGINT)
-    if before is signal.SIG_IGN:  # in the background of a script, whose Ctrl-C is not for us
-        yield lambda: False
-        return
-    try:
-        signal.signal(signal.SIGINT, note)
-    except ValueError:  # not in the main thread, where alone signals arrive
-        yield lambda: False
-        return
-    try:
-        yield lambda: pressed
-    finally:
-        signal.signal(signal.SIGINT, before)
+# Yields a function that says whether Ctrl-C was pressed, or SIGTERM has come, for ``stop``; the next one interrupts.
+stop_on_ctrl_c = noted
 
 
 def _start(variant: str | None) -> None:
@@ -243,7 +217,7 @@ def _sharing(adaptive: bool, error: float | None, method: str | None, by_itself:
     if adaptive or error is not None:
         return _adaptive(error, method or "auto")
     if method is not None and not by_itself:
-        raise NgptError(
+        raise WrongUse(
             "--for says what --adaptive and --error go by; give one of them too, or let a pilot choose for it: "
             "with --time, and without --sampler and --spp"
         )

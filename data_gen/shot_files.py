@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.session import render_frames
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 from ngpt.io.exr import write
+from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output
 
@@ -61,7 +62,7 @@ def write_frames(
         # Only when its turn has come, for several machines may be at work on one shot.
         if part_of[frame] != number:
             return True
-        there = skip_existing and files[frame].exists()
+        there = skip_existing and finished(files[frame])
         written.skipped += there
         return there
 
@@ -69,9 +70,12 @@ def write_frames(
     made(written, len(ours))
     for frame, stack in stacks:
         # Another machine may have been faster.
-        if not (skip_existing and files[frame].exists()):
-            write(files[frame], stack, overwrite=overwrite)
-        written.frames.append(report_of(stack, files[frame]))
+        there = skip_existing and finished(files[frame])
+        cut = skip_existing and not there and files[frame].exists()
+        if not there:
+            write(files[frame], stack, overwrite=overwrite or cut)
+        more = {"in place of": "a file that was not whole"} if cut else {}
+        written.frames.append(report_of(stack, files[frame]) | more)
         made(written, len(ours))
     if stop() and written.done < len(ours):
         written.interrupted = ours[written.done]
@@ -96,7 +100,7 @@ def write_frames_on_cluster(
 ) -> Written:
     """``write_frames`` in parts, each on a worker of the Dask cluster whose scheduler is at ``address``."""
     if options.pop("shard", None):
-        raise NgptError("--cluster shares the frames out by itself; leave --shard out")
+        raise WrongUse("--cluster shares the frames out by itself; leave --shard out")
     for file in files.values():
         check_output(file, overwrite or skip_existing)
     from data_gen.dataset.jobs import cluster

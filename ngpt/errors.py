@@ -1,4 +1,4 @@
-"""The one exception that users of ngpt meet, and the interrupt that others hide."""
+"""The one exception that users of ngpt meet, its kind for wrong calls, and interrupts, which others hide."""
 
 LONGEST = 1000
 
@@ -17,6 +17,21 @@ class NgptError(ValueError):
         super().__init__(line if len(line) <= LONGEST else f"{line[:half]} ... {line[-half:]}")
 
 
+class WrongUse(NgptError):
+    """What is asked for makes no sense whatever the files hold: an option, a value, or two that exclude each other.
+
+    The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
+    """
+
+
+class Interrupted(KeyboardInterrupt):
+    """What Ctrl-C and SIGTERM raise in a command.
+
+    Python 3.11 ends itself by SIGINT, whatever status it is told, once a plain KeyboardInterrupt has passed code that
+    was compiled from a text, as that of dataclasses and named tuples is.
+    """
+
+
 def stop_if_interrupted(error: BaseException) -> None:
     """Raises KeyboardInterrupt if that is what ``error`` comes from: Ctrl-C within a library that wraps what it meets.
 
@@ -24,6 +39,7 @@ def stop_if_interrupted(error: BaseException) -> None:
     """
     cause: BaseException | None = error
     while cause is not None:
-        if isinstance(cause, KeyboardInterrupt) or str(cause).rstrip().endswith("\nKeyboardInterrupt:"):
+        told = str(cause).rstrip().endswith(("\nKeyboardInterrupt:", "\nInterrupted:"))
+        if told or isinstance(cause, KeyboardInterrupt):
             raise KeyboardInterrupt from error
         cause = cause.__cause__ or cause.__context__

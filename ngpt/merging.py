@@ -12,6 +12,7 @@ differences too, whose two directions may have samples in different numbers.
 """
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -24,6 +25,8 @@ from ngpt.stack import GradientStack
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
 # Channels beside the layers that are means over samples too.
 DIAGNOSTICS = "diagnostics."
+# Samples of a pixel, of which headers count as many in 32 bits
+_MOST = 2.0**31
 
 
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
@@ -65,7 +68,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     if np.ptp(total):
         layers["samples"] = total
     attributes = dict(stacks[0].attributes) | {
-        "ngpt:spp": round(float(total.mean())),
+        "ngpt:spp": max(1, round(float(total.mean()))),
         "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
     }
     for name in ("ngpt:seconds", "ngpt:discarded"):
@@ -82,7 +85,7 @@ def _counts(stack: GradientStack, spp: int) -> np.ndarray:
     """Samples of each pixel, (H, W, 1) double precision."""
     if "samples" in stack:
         counts = stack["samples"].astype(np.float64)
-        wrong = ~(np.isfinite(counts) & (counts >= 0))
+        wrong = ~((counts >= 0) & (counts < _MOST))
         if wrong.any():
             y, x, _ = np.argwhere(wrong)[0]
             raise NgptError(
@@ -156,17 +159,18 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
         for name in _means(stack) ^ _means(first):
             has, lacks = (stack, first) if name in _means(stack) else (first, stack)
             raise NgptError(f"{has.path} has '{name}' and {lacks.path} has not; merge stacks with the same layers")
-        sampler = stack.attributes.get("ngpt:sampler")
-        if sampler != first.attributes.get("ngpt:sampler"):
+        # As texts, for files of elsewhere may hold anything under our names.
+        ours, theirs = (str(s.attributes.get("ngpt:sampler")) for s in (stack, first))
+        if ours != theirs:
             raise NgptError(
-                f"{stack.path} was made by sampler '{sampler}' and {first.path} by "
-                f"'{first.attributes.get('ngpt:sampler')}'; their variances cannot be merged"
+                f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'; their variances cannot be "
+                "merged"
             )
-        frame = stack.attributes.get("ngpt:frame")
-        if frame != first.attributes.get("ngpt:frame"):
+        ours, theirs = (str(s.attributes.get("ngpt:frame")) for s in (stack, first))
+        if ours != theirs:
             raise NgptError(
-                f"{stack.path} is frame {frame} and {first.path} is frame {first.attributes.get('ngpt:frame')}; only "
-                "stacks of one frame can be merged"
+                f"{stack.path} is frame {ours} and {first.path} is frame {theirs}; only stacks of one frame can be "
+                "merged"
             )
         for name in VARIANCES.values():
             if n > 1 and name not in stack and any(name in other for other in stacks):
@@ -195,16 +199,17 @@ def _means(stack: GradientStack) -> set[str]:
 def _samples(stack: GradientStack) -> int:
     spp = stack.attributes.get("ngpt:spp")
     if not isinstance(spp, int | np.integer) or spp < 1:
-        raise NgptError(f"{stack.path}: has no attribute 'ngpt:spp', so its weight is not known; render it with ngpt")
+        what = "has no attribute 'ngpt:spp'" if spp is None else f"attribute 'ngpt:spp' is {spp!r}"
+        raise NgptError(f"{stack.path}: {what}, so its weight is not known; render it with ngpt")
     return int(spp)
 
 
-def _number(stack: GradientStack, name: str) -> float:
-    value = stack.attributes[name]
-    # Files of elsewhere may hold anything under our names.
-    if not isinstance(value, int | float | np.number) or not np.isfinite(value) or value < 0:
-        raise NgptError(f"{stack.path}: attribute '{name}' is {value!r}, and no number that could be summed; remove it")
-    return value
+def _number(stack: GradientStack, name: str) -> Any:
+    """The attribute, whole where it is a whole number."""
+    given, value = stack.attributes[name], stack.number(name)
+    if value is None or value < 0:
+        raise NgptError(f"{stack.path}: attribute '{name}' is {given!r}, and no number that could be summed; remove it")
+    return given
 
 
 def _seeds(stack: GradientStack) -> list[str]:

@@ -12,7 +12,7 @@ import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import caustic, nfor, nlm, oidn
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.run import OPTIONS, Shipped
@@ -250,13 +250,17 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         # Weights say themselves what they need: any method that runs them will do.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
-        raise NgptError(f"unknown method '{name}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
+        raise WrongUse(f"unknown method '{name}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
     entry = METHODS[name]
     if method == "auto":
         # Where and in how much memory concerns only some of those it may stand for.
         idle = {"device", "memory"} - entry.options.keys()
         options = {option: value for option, value in options.items() if option not in idle}
-    values = settings(f"method '{name}'", entry.options, options)
+    try:
+        values = settings(f"method '{name}'", entry.options, options)
+    except WrongUse as error:
+        # Of another stack `auto` may take a method that has the option.
+        raise error if method == name else NgptError(str(error)) from None
     if entry.missing() and not own:
         raise NgptError(f"method '{name}': {entry.missing()}")
     # What the weights of a network need, they say themselves.

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Any
 
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 
 # Whom samplers and methods are for: users; users who know why; those who study them
 STANDINGS = ("use", "niche", "study")
@@ -47,7 +47,7 @@ class Option:
         return f"{kind}, or {words}" if words else kind
 
     def check(self, value: Any) -> Value:
-        """The ``value``, or what a text says, as the option's type. Raises NgptError for what is not allowed."""
+        """The ``value``, or what a text says, as the option's type. Raises WrongUse for what is not allowed."""
         if self.choices and (given := self._typed(value, type(self.choices[0]))) in self.choices:
             assert given is not None
             return given
@@ -57,7 +57,7 @@ class Option:
             text = value if isinstance(value, str) else written(value)
             near = get_close_matches(text, [written(choice) for choice in self.choices], 1)
             meant = f"; did you mean '{near[0]}'?" if near else ""
-            raise NgptError(f"'{text}' is not allowed; it takes {self.allowed}{meant}")
+            raise WrongUse(f"'{text}' is not allowed; it takes {self.allowed}{meant}")
         return typed
 
     @property
@@ -90,7 +90,7 @@ def written(value: Any) -> str:
 def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]) -> dict[str, Any]:
     """Values of all ``options``: those ``given``, which may be texts, and the others' defaults.
 
-    Raises NgptError, which names the ``owner`` ("method 'l2'"), for options that do not exist, and for values that are
+    Raises WrongUse, which names the ``owner`` ("method 'l2'"), for options that do not exist, and for values that are
     not allowed.
     """
     found: dict[str, Any] = {name: option.default for name, option in options.items()}
@@ -98,11 +98,11 @@ def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]
         if name not in options:
             near = get_close_matches(name, options, 1)
             help = f"did you mean '{near[0]}'?" if near else f"it has: {', '.join(options) or 'none'}"
-            raise NgptError(f"{owner} has no option '{name}'; {help}")
+            raise WrongUse(f"{owner} has no option '{name}'; {help}")
         try:
             found[name] = options[name].check(value)
-        except NgptError as error:
-            raise NgptError(f"{owner}, option '{name}': {error}") from None
+        except WrongUse as error:
+            raise WrongUse(f"{owner}, option '{name}': {error}") from None
     return found
 
 

@@ -103,6 +103,14 @@ class GradientStack:
         samples = f", {self.attributes['ngpt:spp']} spp" if "ngpt:spp" in self.attributes else ""
         return f"GradientStack {self.path}, {self.width}x{self.height}{samples}"
 
+    def number(self, attribute: str) -> float | None:
+        """An attribute that is a finite number; None where there is none, for files of elsewhere may hold anything."""
+        value = self.attributes.get(attribute)
+        if isinstance(value, bool) or not isinstance(value, int | float | np.integer | np.floating):
+            return None
+        number = float(value)
+        return number if abs(number) < np.inf else None
+
     def __getitem__(self, name: str) -> np.ndarray:
         """Returns layer ``name``; raises NgptError if the stack does not hold it."""
         if name not in self.layers:

@@ -175,9 +175,9 @@ def test_command(rng, tmp_path, capsys):
     assert np.allclose(pass_through(merged)["diagnostics.discarded"], 0.25)
     assert main(["info", out]) == 0
     assert "discarded" in capsys.readouterr().out
-    assert main(["merge", *paths, "-o", out]) == 2
+    assert main(["merge", *paths, "-o", out]) == 1
     assert "--force" in capsys.readouterr().err
-    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 2
+    assert main(["merge", paths[0], paths[0], "-o", out, "--force"]) == 1
     assert "seed 0" in capsys.readouterr().err
 
 
@@ -226,3 +226,47 @@ def test_merged_differences_of_uneven_counts_have_the_right_variance(rng):
         means.append(merged["dx"][:, 0, 0])
         variances.append(merged["dx_var"][:, 0, 0])
     assert np.mean(variances) == pytest.approx(np.var(means), rel=0.08)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -1, 1e30])
+def test_samples_that_are_no_counts_are_refused(rng, value):
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed) for seed in range(2))
+    counts = np.full((*SHAPE[:2], 1), 4, np.float32)
+    counts[2, 1] = value
+    with pytest.raises(NgptError, match=r"1.exr: layer 'samples' has .* at pixel \(1, 2\), and 1 of 20 pixels are no"):
+        merge([a, b.replace(samples=counts)])
+
+
+def test_few_samples_are_not_none(rng):
+    counts = np.zeros((*SHAPE[:2], 1), np.float32)
+    counts[0, 0] = 1
+    merged = merge([stack_of(rng.random((1, *SHAPE)), seed).replace(samples=counts) for seed in range(2)])
+    assert merged.attributes["ngpt:spp"] == 1
+    with pytest.raises(NgptError, match="layer 'samples' is 0 in all pixels"):
+        merge([stack_of(rng.random((4, *SHAPE)), seed).replace(samples=0 * counts) for seed in range(2)])
+
+
+@pytest.mark.parametrize("value", ["long", np.nan, -1.0, np.ones(2, np.float32), True])
+@pytest.mark.parametrize("name", ["ngpt:seconds", "ngpt:discarded"])
+def test_attributes_that_cannot_be_summed_are_refused(rng, name, value):
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed, **{name: 1}) for seed in range(2))
+    assert merge([a, b]).attributes[name] == 2
+    b.attributes[name] = value
+    with pytest.raises(NgptError, match=f"1.exr: attribute '{name}' is .* no number that could be summed"):
+        merge([a, b])
+
+
+@pytest.mark.parametrize("value", ["16", np.nan, 1e30, -4, 0, np.ones(2, np.float32)])
+def test_a_number_of_samples_that_is_none_is_refused(rng, value):
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed) for seed in range(2))
+    b.attributes["ngpt:spp"] = value
+    with pytest.raises(NgptError, match=r"1.exr: attribute 'ngpt:spp' is .*, so its weight is not known"):
+        merge([a, b])
+
+
+@pytest.mark.parametrize("name", ["ngpt:sampler", "ngpt:frame"])
+def test_names_that_are_vectors_differ_from_others(rng, name):
+    a, b = (stack_of(rng.random((4, *SHAPE)), seed) for seed in range(2))
+    b.attributes[name] = np.ones(2, np.float32)
+    with pytest.raises(NgptError, match="merged"):
+        merge([a, b])

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ngpt.cli.arguments import add_json, assignment, duration, print_json, size
 from ngpt.errors import NgptError
-from ngpt.system.console import Console
+from ngpt.system.console import Console, tell
 
 if TYPE_CHECKING:
     from data_gen.choosing.pipelines import Pipeline
@@ -70,11 +70,12 @@ def run(args: argparse.Namespace, console: Console) -> int:
         report = {"scene": args.scene, "size": [int(n) for n in film], "sampler": found[0].sampler}
         print_json(report | {"advice": rows})
         return 0
-    print(f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}")
+    tell(f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}")
     for row in found:
         shared = "adaptive" if row.adaptive else "even"
-        print(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}")
-    print("", *commands_of(found[0], args), sep="\n")
+        tell(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}")
+    for line in ("", *commands_of(found[0], args)):
+        tell(line)
     return 0
 
 

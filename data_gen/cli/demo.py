@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force, positive, size
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.measure.shown import available, judge
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     names = args.scene or list(SURFACES)
     for name in names:
         if name not in SCENES:
-            raise NgptError(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")
+            raise WrongUse(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")
     folder = Path(args.output)
     try:
         folder.mkdir(parents=True, exist_ok=True)

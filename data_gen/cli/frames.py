@@ -5,7 +5,7 @@ import re
 from pathlib import Path
 
 from data_gen.frames.pattern import filled, varies
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 
 # More than anyone renders; a typing error must not fill the memory.
 _MOST = 1_000_000
@@ -31,7 +31,7 @@ def frames(text: str) -> list[int]:
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:
     """Frame -> file. ``output`` is a pattern (``shot.{frame:04d}.exr``), or a folder, which is made if it is not there.
 
-    Raises NgptError for a name that is one file for several frames.
+    Raises WrongUse for a name that is one file for several frames.
     """
     stem = re.sub(r"[._-]*\{[^{}]*\}", "", Path(scene).stem) or "frame"
     pattern = output if output is not None else f"{stem}.{{frame:04d}}.exr"
@@ -40,7 +40,7 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
         if folder.suffix.lower() == ".exr" and not folder.is_dir():
             if len(numbers) > 1:
                 named = f"{folder.with_suffix('')}.{{frame:04d}}.exr"
-                raise NgptError(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
+                raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
             return {numbers[0]: folder}
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -51,7 +51,7 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
     seen: dict[Path, int] = {}
     for number, path in found.items():
         if path.suffix.lower() != ".exr":
-            raise NgptError(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
+            raise WrongUse(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
         if (other := seen.setdefault(path, number)) != number:
-            raise NgptError(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
+            raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
     return found

@@ -2,6 +2,7 @@
 
 import argparse
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 from ngpt.io.exr import write
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
+from ngpt.system.interrupts import Interrupt
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -134,13 +136,13 @@ def image(args: argparse.Namespace, console: Console) -> int:
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
-            raise NgptError(f"{option} belongs to a shot; name its frames: --frames 0:120")
+            raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
-            raise NgptError(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
+            raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
     target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force)
     if target.suffix.lower() != ".exr":
-        raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+        raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
 
     def chosen(plan) -> None:
         how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
@@ -159,9 +161,10 @@ def image(args: argparse.Namespace, console: Console) -> int:
             said=console.say,
             **asked(args),
         )
+        # Within it: the samples of an hour are not lost to a signal that comes while they are written.
+        write(target, stack, overwrite=args.force)
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
-    write(target, stack, overwrite=args.force)
     done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
     if args.error is not None and "ngpt:error" in stack.attributes:
         expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
@@ -175,13 +178,13 @@ def image(args: argparse.Namespace, console: Console) -> int:
         console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {plan.method}")
     if args.json:
         print_json(report_of(stack, target) | {"layers": stack.names})
-    return 130 if interrupted else 0
+    return stop.status if interrupted else 0
 
 
 def shot(args: argparse.Namespace, console: Console) -> int:
     """A stack for each frame."""
     if args.adaptive or args.error is not None or args.method is not None:
-        raise NgptError("--adaptive, --error and --for are for single images; leave them out with --frames")
+        raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
     files = targets(args.output, args.scene, args.frames)
     more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
     more |= {"overwrite": args.force, "skip_existing": args.skip_existing, **asked(args)}
@@ -194,19 +197,21 @@ def shot(args: argparse.Namespace, console: Console) -> int:
                 frame, what = report["frame"], "{width}x{height}, {spp} spp, {seconds:.2f} s".format(**report)
                 if report["discarded"]:
                     console.say(f"frame {frame}: {report['discarded']} non-finite values were left out")
+                what += f", in place of {report['in place of']}" if "in place of" in report else ""
                 console.say(f"{filled(args.scene, frame)} frame {frame} -> {report['output']}: {what}")
             said = len(written.frames)
             progress(written.done, total)
 
-        if args.cluster:
-            written = write_frames_on_cluster(args.cluster, args.scene, files, shard=args.shard, made=made, **more)
-        else:
-            with stop_on_ctrl_c(ending) as stop:
+        # What the workers of a cluster are at, no signal that comes here ends with this pass.
+        with nullcontext(Interrupt()) if args.cluster else stop_on_ctrl_c(ending) as stop:
+            if args.cluster:
+                written = write_frames_on_cluster(args.cluster, args.scene, files, shard=args.shard, made=made, **more)
+            else:
                 shard = args.shard or (0, 1)
                 written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
     if written.interrupted is not None:
         console.error(f"interrupted: frame {written.interrupted} is left out; --skip-existing goes on with it")
-        return 130
+        return stop.status
     if written.skipped:
         console.say(f"{written.skipped} of {written.done} frames were skipped: their stacks are there")
     if args.json:

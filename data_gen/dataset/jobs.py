@@ -41,7 +41,7 @@ class Pool(ProcessPoolExecutor):
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent)
 
     def __exit__(self, kind, *rest):
-        if kind is KeyboardInterrupt:
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
             # What they are at is made again; waiting for it takes minutes.
             for process in active_children():
                 process.terminate()

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import math
 from bisect import bisect_right
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from ngpt.errors import NgptError
+from ngpt.system.records import read_json
 
 _LOOK = ("origin", "target", "up")
 _KNOWN = {"frame", "to_world", *_LOOK, "fov", "fov_axis"}
@@ -23,7 +23,7 @@ _KNOWN = {"frame", "to_world", *_LOOK, "fov", "fov_axis"}
 class Key:
     """A camera at one frame.
 
-    ``to_world``  (4, 4), Mitsuba's camera to the world: columns left, up, forward, position
+    ``to_world``  (4, 4), Mitsuba's camera to the world: columns left, up, forward, position; in a path without scale
     ``look``      (3, 3), rows origin, target and up, where the key was given by them
     ``fov``       degrees, None: that of the scene
     ``fov_axis``  "x" (width) or "y" (height): what ``fov`` is of
@@ -37,16 +37,26 @@ class Key:
 
 
 class CameraPath:
-    """Key frames in rising order; before the first and after the last the camera rests."""
+    """Key frames in rising order; before the first and after the last the camera rests.
+
+    A camera's scale, which exporters write and Mitsuba refuses, is taken out of its matrix. Raises NgptError for a
+    matrix that flattens space or is not finite, and for cameras that are mirrored in some keys and not in others.
+    """
 
     def __init__(self, keys: list[Key]):
-        self.keys = keys
+        self.keys = [replace(key, to_world=_rigid(key)) for key in keys]
+        for one, other in pairwise(self.keys):
+            if _mirrored(one.to_world) != _mirrored(other.to_world):
+                raise NgptError(
+                    f"the camera is mirrored in one of the frames {one.frame:g} and {other.frame:g} and not in the "
+                    "other, and nothing is between them; give both the same sign of scale"
+                )
 
     def at(self, frame: float) -> Key:
         """The camera at a frame.
 
         Between two keys that both look at a point, origin, target, up and fov change evenly. Else the position does,
-        the orientation turns evenly about one axis, and scales change evenly.
+        and the orientation turns evenly about one axis.
         """
         after = bisect_right([key.frame for key in self.keys], frame)
         if after == 0 or after == len(self.keys):
@@ -77,11 +87,39 @@ def look_at(origin, target, up) -> np.ndarray:
     return matrix
 
 
+def _rigid(key: Key) -> np.ndarray:
+    """The matrix of a key without scale: it looks the same way, with the same side up, mirrored if it was."""
+    matrix = np.asarray(key.to_world, np.float64)
+    # Numbers of the renderer are single precision.
+    with np.errstate(over="ignore"):
+        if not np.isfinite(matrix.astype(np.float32)).all():
+            raise NgptError(f"frame {key.frame:g}: the camera's matrix has numbers that are not finite, or beyond 1e38")
+    axes = matrix[:3, :3]
+    if np.allclose(axes.T @ axes, np.eye(3), atol=1e-6):
+        return matrix
+    lengths = np.linalg.norm(axes, axis=0)
+    volume = np.linalg.det(axes / lengths) if lengths.min() > 0 else 0.0
+    if not abs(volume) > 1e-6:
+        raise NgptError(f"frame {key.frame:g}: the camera's matrix flattens space (a scale of 0?)")
+    forward = axes[:, 2] / lengths[2]
+    up = axes[:, 1] / lengths[1]
+    up = up - (up @ forward) * forward
+    up /= np.linalg.norm(up)
+    rigid = matrix.copy()
+    rigid[:3, :3] = np.stack([np.sign(volume) * np.cross(up, forward), up, forward], axis=1)
+    return rigid
+
+
+def _mirrored(matrix: np.ndarray) -> bool:
+    return bool(np.linalg.det(matrix[:3, :3]) < 0)
+
+
 def _between(one: np.ndarray, other: np.ndarray, t: float) -> np.ndarray:
-    scales = [np.linalg.norm(m[:3, :3], axis=0) for m in (one, other)]
-    turns = Rotation.from_matrix([m[:3, :3] / scale for m, scale in zip((one, other), scales, strict=True)])
+    # Of mirrored cameras their images turn.
+    side = np.array([-1.0 if _mirrored(one) else 1.0, 1, 1])
+    turns = Rotation.from_matrix([m[:3, :3] * side for m in (one, other)])
     matrix = np.eye(4)
-    matrix[:3, :3] = Slerp([0, 1], turns)(t).as_matrix() * ((1 - t) * scales[0] + t * scales[1])
+    matrix[:3, :3] = Slerp([0, 1], turns)(t).as_matrix() * side
     matrix[:3, 3] = (1 - t) * one[:3, 3] + t * other[:3, 3]
     return matrix
 
@@ -92,12 +130,7 @@ def read_camera_path(path: str | Path) -> CameraPath:
     A key has ``to_world`` (4 rows of 4 numbers, Mitsuba's) or ``origin``, ``target`` and, if not +y, ``up``; and may
     have ``fov`` in degrees with ``fov_axis`` "x" (default) or "y". Raises NgptError for files and keys that are not so.
     """
-    try:
-        content = json.loads(Path(path).read_text(encoding="utf-8"))
-    except OSError as error:
-        raise NgptError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
-        raise NgptError(f"{path}: is not JSON: {error}") from error
+    content = read_json(path)
     entries = content.get("keys") if isinstance(content, dict) else content
     if not isinstance(entries, list) or not entries:
         raise NgptError(f'{path}: holds no camera keys; write {{"keys": [{{"frame": 0, "origin": ...}}, ...]}}')
@@ -107,7 +140,10 @@ def read_camera_path(path: str | Path) -> CameraPath:
             raise NgptError(f"{path}: frame {other.frame:g} comes after frame {one.frame:g}; sort keys by frame")
         if (one.fov is None) != (other.fov is None) or one.fov_axis != other.fov_axis:
             raise NgptError(f"{path}: frames {one.frame:g} and {other.frame:g} differ in fov_axis, or one has no fov")
-    return CameraPath(keys)
+    try:
+        return CameraPath(keys)
+    except NgptError as error:
+        raise NgptError(f"{path}: {error}") from error
 
 
 def _key(entry: Any, number: int, where: str) -> Key:
@@ -127,8 +163,8 @@ def _key(entry: Any, number: int, where: str) -> Key:
         if given := [name for name in _LOOK if name in entry]:
             raise NgptError(f"{where} has both to_world and {given[0]}; leave one out")
         matrix = _numbers(entry["to_world"], (4, 4), f"{where}: to_world")
-        if not abs(np.linalg.det(matrix)) > 0 or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-            raise NgptError(f"{where}: to_world cannot be inverted, or its last row is not 0 0 0 1")
+        if not np.array_equal(matrix[3], [0, 0, 0, 1]):
+            raise NgptError(f"{where}: the last row of to_world is not 0 0 0 1")
         return Key(frame, matrix, None, fov, axis)
     for name in ("origin", "target"):
         if name not in entry:

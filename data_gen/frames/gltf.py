@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import base64
-import binascii
 import json
 import math
 import struct
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 from urllib.parse import unquote
 
@@ -15,13 +14,16 @@ import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
 
 from data_gen.frames.camera_path import CameraPath, Key
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
+from ngpt.system.reading import read_bytes
+from ngpt.system.records import check
 
 # A glTF camera looks along its -z with +x to the right, one of Mitsuba's along +z with +x to the left.
 _TURN = np.diag([-1.0, 1.0, -1.0, 1.0])
 _DEFAULTS = {"translation": [0.0, 0, 0], "rotation": [0.0, 0, 0, 1], "scale": [1.0, 1, 1]}
 # More than anyone animates; times of a broken file must not fill the memory.
 _MOST = 1_000_000
+_MOST_BYTES = 2**30  # of a file or a buffer beside it
 
 # Of one property of one node: times (K,), values (K, C) or (3K, C), and how to go from one to the next.
 Channel = tuple[np.ndarray, np.ndarray, str]
@@ -30,23 +32,24 @@ Channel = tuple[np.ndarray, np.ndarray, str]
 def read_gltf_camera(path: str | Path, fps: float) -> CameraPath:
     """The path of a file's first camera, a key for each frame; frame 0 is second 0.
 
-    Its coordinates are those of the file, in which +y is up. Raises NgptError for files that cannot be read, and where
-    no node has a perspective camera.
+    Its coordinates are those of the file, in which +y is up. Buffers are read that are in the file, or beside it or
+    below. Raises NgptError for files that cannot be read, and where no node has a perspective camera.
     """
     if not 0 < fps < math.inf:
-        raise NgptError(f"{path}: {fps:g} frames a second; give a positive number")
+        raise WrongUse(f"{path}: {fps:g} frames a second; give a positive number")
     try:
         content, binary = _load(Path(path))
         return _path(Path(path), content, binary, fps)
-    except OSError as error:
-        raise NgptError(f"{path}: cannot be read: {error.strerror}") from error
-    except (KeyError, IndexError, TypeError, ValueError, struct.error, binascii.Error) as error:
+    except NgptError:
+        raise
+    # What is missing, or of another type than it should be, shows where it is used.
+    except (LookupError, AttributeError, TypeError, ValueError, ArithmeticError, RecursionError, struct.error) as error:
         raise NgptError(f"{path}: is no glTF 2.0 file that can be understood: {error!r}") from error
 
 
 def _load(path: Path) -> tuple[dict[str, Any], bytes]:
     """The JSON of a file, and the buffer that a .glb brings with it."""
-    data = path.read_bytes()
+    data = read_bytes(path, _MOST_BYTES)
     if data[:4] != b"glTF":
         return json.loads(data), b""
     chunks, place = [b"", b""], 12
@@ -60,6 +63,7 @@ def _load(path: Path) -> tuple[dict[str, Any], bytes]:
 
 
 def _path(path: Path, content: dict[str, Any], binary: bytes, fps: float) -> CameraPath:
+    check(content, dict, f"{path}: what it holds")
     nodes = content.get("nodes", [])
     found = [i for i, node in enumerate(nodes) if "camera" in node]
     if not found:
@@ -77,13 +81,18 @@ def _path(path: Path, content: dict[str, Any], binary: bytes, fps: float) -> Cam
     if last - first > _MOST:
         raise NgptError(f"{path}: its camera moves for {last - first} frames, more than {_MOST}")
     fov = math.degrees(camera["perspective"]["yfov"])
+    if not 0 < fov < 180:
+        raise NgptError(f"{path}: yfov of its first camera is {fov:g} degrees; it must be between 0 and 180")
     keys = []
     for frame in range(first, max(first, last) + 1):
         matrix = np.eye(4)
         for number in chain:
             matrix = _local(nodes[number], number, channels, frame / fps) @ matrix
         keys.append(Key(frame, matrix @ _TURN, None, fov, "y"))
-    return CameraPath(keys)
+    try:
+        return CameraPath(keys)
+    except NgptError as error:
+        raise NgptError(f"{path}: {error}") from error
 
 
 def _channels(path: Path, content: dict[str, Any], binary: bytes, chain: list[int]) -> dict[tuple[int, str], Channel]:
@@ -95,6 +104,8 @@ def _channels(path: Path, content: dict[str, Any], binary: bytes, chain: list[in
             if where[0] in chain and where[1] in _DEFAULTS and where not in channels:
                 sampler = animation["samplers"][channel["sampler"]]
                 times, values = (_accessor(path, content, binary, sampler[end]) for end in ("input", "output"))
+                if not (np.diff(times[:, 0]) > 0).all():
+                    raise NgptError(f"{path}: times of an animation do not rise; export it anew")
                 channels[where] = (times[:, 0], values, sampler.get("interpolation", "LINEAR"))
     return channels
 
@@ -112,12 +123,26 @@ def _accessor(path: Path, content: dict[str, Any], binary: bytes, number: int) -
     elif uri.startswith("data:"):
         data = base64.b64decode(uri.partition(",")[2])
     else:
-        data = (path.parent / unquote(uri)).read_bytes()
+        data = read_bytes(_beside(path, uri), _MOST_BYTES)
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     count = accessor["count"]
     if view.get("byteStride", 4 * components) != 4 * components or count < 1:
         raise NgptError(f"{path}: accessor {number} is interleaved or empty")
-    return np.frombuffer(data, "<f4", count * components, start).reshape(count, components).astype(np.float64)
+    numbers = np.frombuffer(data, "<f4", count * components, start).reshape(count, components).astype(np.float64)
+    if not np.isfinite(numbers).all():
+        raise NgptError(f"{path}: accessor {number} has numbers that are not finite; export it anew")
+    return numbers
+
+
+def _beside(path: Path, uri: str) -> Path:
+    """The file of a relative URI; raises NgptError for one that leads elsewhere than below the folder of ``path``."""
+    name = unquote(uri)
+    place = PurePosixPath(name)
+    if place.is_absolute() or ".." in place.parts or "\\" in name or ":" in place.parts[0]:
+        raise NgptError(
+            f"{path}: its buffer '{name[:200]}' is not in its folder or below; pack it into a .glb, or embed it"
+        )
+    return path.parent / place
 
 
 def _local(node: dict[str, Any], number: int, channels: dict[tuple[int, str], Channel], time: float) -> np.ndarray:

@@ -6,10 +6,12 @@ import operator
 import re
 from collections.abc import Callable
 
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 
 # {frame}, {frame:04d}, {10 + frame * 3:.2f}
 _FIELD = re.compile(r"\{([^{}:]+)(?::([^{}]*))?\}")
+# How to write a number, as Python has it, within bounds: a width of a thousand million fills the memory.
+_FORM = re.compile(r"(.?[<>=^])?[-+ ]?#?\d{0,2}[,_]?(\.\d{1,2})?[a-zA-Z%]?")
 _OPERATORS: dict[type, Callable] = {
     ast.Add: operator.add,
     ast.Sub: operator.sub,
@@ -32,20 +34,22 @@ def filled(text: str, frame: int) -> str:
     """The text with its fields replaced: ``{frame}``, ``{frame:04d}``, ``{10 + frame * 3:.2f}``.
 
     A field is a number, ``frame``, ``pi``, + - * / // %, brackets, sin, cos, min, max, and how to write it, as in
-    Python. Raises NgptError for anything else.
+    Python, in at most 99 letters and with at most 99 places. Raises WrongUse for anything else.
     """
 
     def value(match: re.Match) -> str:
         field, form = match.groups()
+        if form and not _FORM.fullmatch(form):
+            raise WrongUse(f"'{text}': '{form}' is no way to write frame {frame}; write :04d or :.2f, with 99 at most")
         try:
             number = _value(ast.parse(field.strip(), mode="eval").body, frame)
             if form and form[-1] in "dxX" and number == int(number):
                 number = int(number)
             return format(number, form or "")
-        except NgptError as error:
-            raise NgptError(f"'{text}': {error}") from error
+        except WrongUse as error:
+            raise WrongUse(f"'{text}': {error}") from error
         except (SyntaxError, ValueError, ArithmeticError, TypeError) as error:
-            raise NgptError(f"'{text}': {match[0]} cannot be computed for frame {frame}: {error}") from error
+            raise WrongUse(f"'{text}': {match[0]} cannot be computed for frame {frame}: {error}") from error
 
     return _FIELD.sub(value, text)
 
@@ -59,9 +63,10 @@ def _value(node: ast.expr, frame: int):
         return _OPERATORS[type(node.op)](_value(node.left, frame), _value(node.right, frame))
     if isinstance(node, ast.UnaryOp) and type(node.op) in _OPERATORS:
         return _OPERATORS[type(node.op)](_value(node.operand, frame))
-    if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS:
+    known = isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in _FUNCTIONS
+    if known and not node.keywords:
         return _FUNCTIONS[node.func.id](*(_value(argument, frame) for argument in node.args))
-    raise NgptError(
+    raise WrongUse(
         f"'{ast.unparse(node)}' is not known in {{}}; known are numbers, frame, pi, + - * / // %, brackets, "
         f"{', '.join(_FUNCTIONS)}"
     )

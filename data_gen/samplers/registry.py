@@ -12,7 +12,7 @@ from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 
 if TYPE_CHECKING:
@@ -186,11 +186,11 @@ def register(entry: Sampler | FrameSampler) -> None:
 def find(name: str, facts: Facts | None = None) -> Sampler:
     """The sampler of that name. Raises NgptError if there is none, or if it refuses a scene of these ``facts``."""
     if name in FRAME_SAMPLERS:
-        raise NgptError(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
+        raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
         near = get_close_matches(name, [*SAMPLERS, *FRAME_SAMPLERS], 1)
         meant = f"did you mean '{near[0]}'? " if near else ""
-        raise NgptError(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}")
+        raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}")
     sampler = SAMPLERS[name]
     if facts is not None and (reason := sampler.refuses(facts)):
         able = [other for other in SAMPLERS.values() if not other.refuses(facts)]
@@ -214,13 +214,13 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises NgptError for options that the sampler of that name, which may be "auto", does not take."""
+    """Raises WrongUse for options that the sampler of that name, which may be "auto", does not take."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
     elif given:
         option = next(iter(given))
         having = [name for name, entry in by_standing("use").items() if option in entry.options] or ["gpt"]
-        raise NgptError(f"option '{option}' is a sampler's own; name the sampler: --sampler {', or '.join(having)}")
+        raise WrongUse(f"option '{option}' is a sampler's own; name the sampler: --sampler {', or '.join(having)}")
 
 
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:

@@ -10,6 +10,7 @@ Not handled: what is wrong in the same way whatever the noise, such as a caustic
 """
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from scipy.ndimage import gaussian_filter
@@ -35,18 +36,30 @@ FACTOR = 1.2
 def reconstruct_with_error(stack: GradientStack, method: str = "auto", **options) -> Result:
     """As ``ngpt.reconstruct``, with ``Result.error``: the standard error of the image, (H, W, 3) float32, in its unit.
 
-    It takes twice the time. A pixel whose variance is not finite counts as one without noise. The same stack gives the
-    same bits. Raises NgptError where the stack has no variances, and as ``reconstruct`` does.
+    It takes twice the time. It is NaN in pixels of which a variance is not finite, for nothing is known of their noise.
+    The same stack gives the same bits. Raises NgptError where the stack has no variances, and as ``reconstruct`` does.
     """
     result = reconstruct(stack, method, **options)
     again = reconstruct(noisier(stack), method, **options)
     factor = FACTORS.get(result.method, FACTOR)
-    error = factor * change(result.image, again.image)
+    error = factor * change(result.image, again.image, known_noise(stack))
     return replace(result, error=error.astype(np.float32), seconds=result.seconds + again.seconds)
 
 
+def known_noise(stack: GradientStack) -> np.ndarray:
+    """Where all variances are finite of what images are made of, (H, W) booleans; differences beyond the border do not
+    count, for there are none."""
+    known = np.ones((stack.height, stack.width), bool)
+    inside: Any
+    for name, inside in (("primal", np.s_[:]), ("caustic", np.s_[:]), ("dx", np.s_[:, :-1]), ("dy", np.s_[:-1])):
+        if name in stack and VARIANCES[name] in stack:
+            known[inside] &= np.isfinite(stack[VARIANCES[name]][inside]).all(axis=-1)
+    return known
+
+
 def noisier(stack: GradientStack) -> GradientStack:
-    """The stack with noise added, of the variances that it holds; raises NgptError where it lacks them."""
+    """The stack with noise added, of the variances that it holds, none where they are not finite; raises NgptError
+    where it lacks them."""
     stack.require("primal_var", why="an estimate of the error")
     for name in ("dx", "dy"):
         if name in stack:
@@ -65,9 +78,19 @@ def noisier(stack: GradientStack) -> GradientStack:
     return stack.replace(**layers)
 
 
-def change(image: np.ndarray, other: np.ndarray) -> np.ndarray:
-    """Root of the mean square of their difference, in a Gaussian window, (H, W, 3) double precision."""
+def change(image: np.ndarray, other: np.ndarray, known: np.ndarray | None = None) -> np.ndarray:
+    """Root of the mean square of their difference, in a Gaussian window, (H, W, 3) double precision.
+
+    Where there are ``known`` pixels, (H, W) booleans, the mean is over those, and the others are NaN.
+    """
     difference = other.astype(np.float64) - image
-    scale = float(np.abs(difference).max()) or 1.0
-    square = gaussian_filter(np.square(difference / scale), (SPREAD, SPREAD, 0), mode="reflect", truncate=3)
-    return scale * np.sqrt(np.maximum(square, 0))
+    if known is None or known.all():
+        scale = float(np.abs(difference).max()) or 1.0
+        return scale * np.sqrt(np.maximum(_around(np.square(difference / scale)), 0))
+    difference[~known] = 0
+    share = np.where(known, _around(known[..., None].astype(np.float64))[..., 0], np.nan)
+    return change(np.zeros_like(difference), difference) / np.sqrt(share)[..., None]
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    return gaussian_filter(values, (SPREAD, SPREAD, 0), mode="reflect", truncate=3)

@@ -2,8 +2,8 @@
 
 Verbs that render are in ``data_gen.cli``, and come by an entry point: nothing here imports the renderer.
 
-Exit status: 0 when everything asked for was done, 1 when some files failed or images differ, 2 for an error that
-stopped the command, 130 when interrupted.
+Exit status, of all verbs: 0 when everything asked for was done; 1 when work failed, for some file or for all, and when
+images differ; 2 for a call that makes no sense (``WrongUse``); 130 and 143 after Ctrl-C and SIGTERM.
 """
 
 import argparse
@@ -12,7 +12,7 @@ import sys
 from importlib import import_module
 from typing import NamedTuple, NoReturn
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.system.console import Console, run_command
 from ngpt.system.parts import NO_RENDERER, brought
 from ngpt.version import __version__
@@ -93,8 +93,9 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     """Of all ``verbs``, with the arguments of the one that is called."""
     if called and called not in verbs and verbs.keys() == VERBS.keys():
-        raise NgptError(f"there is no verb '{called}' here; {NO_RENDERER}")
+        raise WrongUse(f"there is no verb '{called}' here; {NO_RENDERER}")
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
+    parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
     for name, verb in verbs.items():

@@ -27,8 +27,9 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
@@ -115,19 +116,19 @@ def run(args: argparse.Namespace, console: Console) -> int:
     files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
-        raise NgptError(
+        raise WrongUse(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
     for _, target in pairs:
         check_output(target, args.force or args.skip_existing)
         if target.suffix.lower() != ".exr":
-            raise NgptError(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+            raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
-                raise NgptError(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+                raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
     # Their results are there, but later frames are made of them.
-    missing = [i for i, (_, target) in enumerate(pairs) if not target.exists()] if args.temporal else []
+    missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
     reference = read_image(args.ref, args.untrusted) if args.ref else None
     options = {
@@ -139,7 +140,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     overwrite = partial(write_frame, overwrite=args.force)
     frames: Any
     windows = False
-    if args.temporal and not all(args.skip_existing and target.exists() for _, target in pairs):
+    if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
         by_wcv = args.method == "wcv" and not options
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
@@ -168,6 +169,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
                 report = {"input": str(source), "error": str(report)}
             else:
                 console.say(f"[{i}/{len(pairs)}] {describe(report)}")
+                if unknown := report.get("pixels without standard error"):
+                    console.say(f"{source}: the error of {unknown} pixels is NaN, for their variances are not finite")
             reports.append(report)
             progress(i, len(pairs))
     failed = sum("error" in report for report in reports)
@@ -188,6 +191,7 @@ def _unseen(done: int, total: int) -> None:
 class Frame(NamedTuple):
     """A stack on its way from its file to that of its result; with ``there`` its result was there already.
 
+    ``cut`` says that a file is in its place that is not whole.
     ``over_time`` is what other frames were to the result, as header attributes.
     """
 
@@ -198,6 +202,7 @@ class Frame(NamedTuple):
     metrics: dict[str, float] | None = None
     groups: tuple[str, ...] = ()
     there: bool = False
+    cut: bool = False
     over_time: Mapping[str, Any] = {}
 
 
@@ -207,10 +212,11 @@ def read_frame(
     """``again``: results that are made again where they are there, since others build on them."""
     source, target = pair
     # Only now, for several machines may be at work on one folder.
-    there = args.skip_existing and target.exists()
+    there = args.skip_existing and finished(target)
     if there and target not in again:
         return Frame(source, target, None, there=True)
-    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there)
+    cut = args.skip_existing and not there and target.exists()
+    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there, cut=cut)
 
 
 def compute_frame(
@@ -244,11 +250,11 @@ def compute_frame(
 
 def write_frame(frame: Frame, overwrite: bool) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, over_time = frame
+    source, target, stack, result, metrics, groups, there, cut, over_time = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
-    write(target, result.image, like=stack, overwrite=overwrite, attributes={**result.attributes, **over_time})
+    write(target, result.image, like=stack, overwrite=overwrite or cut, attributes={**result.attributes, **over_time})
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
@@ -263,6 +269,9 @@ def write_frame(frame: Frame, overwrite: bool) -> dict:
         "standard error": result.error is not None,
         "groups": list(groups),
     }
+    if result.error is not None:
+        report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
+    report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     return report | ({"metrics": metrics} if metrics else {})
 
@@ -277,6 +286,8 @@ def describe(report: dict) -> str:
     text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
         text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if "in place of" in report:
+        text += f", in place of {report['in place of']}"
     if "history" in report:
         text += f", {report['history']:.0%} history"
     if report["groups"]:
@@ -297,11 +308,11 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
         if not folder.is_dir() and (folder.exists() or named_file):
             kind = "is a file" if folder.exists() else "is the name of a file"
-            raise NgptError(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
+            raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
         targets = [folder / path.name for path in sources]
         repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
         if repeated:
-            raise NgptError(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
+            raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
         try:
             folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:

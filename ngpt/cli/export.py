@@ -5,7 +5,7 @@ from pathlib import Path
 
 from ngpt.classical.poisson import DEFAULT_ALPHA
 from ngpt.cli.arguments import add_force
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output, check_output
 
@@ -27,7 +27,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if path is not None:
             check_output(path, args.force)
     if not args.weights and (args.statistics or args.vector):
-        raise NgptError("--statistics and --vector belong to networks; leave them out for a classical method")
+        raise WrongUse("--statistics and --vector belong to networks; leave them out for a classical method")
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
     return 0

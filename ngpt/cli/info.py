@@ -17,7 +17,7 @@ from ngpt.methods import METHODS, by_standing, choose
 from ngpt.network.describe import SUFFIXES as NETWORKS
 from ngpt.network.describe import describe
 from ngpt.stack import GradientStack
-from ngpt.system.console import Console
+from ngpt.system.console import Console, tell
 from ngpt.system.parts import find_renderer
 from ngpt.training.dataset import summary
 from ngpt.training.run_summary import is_run
@@ -179,18 +179,18 @@ def show(report: dict, as_json: bool) -> None:
         return
     for name, value in report.items():
         if isinstance(value, dict):
-            print(f"{name}:")
+            tell(f"{name}:")
             for key, item in value.items():
                 text = (
                     "  ".join(f"{k} {_number(v)}" for k, v in item.items()) if isinstance(item, dict) else _number(item)
                 )
-                print(f"  {key:16} {text}")
+                tell(f"  {key:16} {text}")
         elif isinstance(value, list) and value and isinstance(value[0], str) and max(map(len, value)) > 30:
-            print(f"{name}:")
+            tell(f"{name}:")
             for item in value:
-                print(f"  {item}")
+                tell(f"  {item}")
         else:
-            print(f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}")
+            tell(f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}")
 
 
 def _number(value: object) -> str:

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
-from ngpt.system.console import Console
+from ngpt.system.console import Console, tell
 from ngpt.system.files import check_output
 from ngpt.version import __version__
 
@@ -125,7 +125,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
-            print(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
+            tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
     formulas = {name: METRICS[name].formula for name in metrics} | ({"flicker": FLICKER} if tables else {})
     formulas |= {"change": CHANGE} if len(frames) > 1 else {}
     overview = Overview(tables=tables, formulas=formulas)
@@ -185,7 +185,7 @@ def labels(paths: list[str]) -> list[str]:
     places = [Path(os.path.abspath(path)) for path in paths]
     for place, path in zip(places, paths, strict=True):
         if places.count(place) > 1:
-            raise NgptError(f"{path}: is given twice; leave one out")
+            raise WrongUse(f"{path}: is given twice; leave one out")
     bare = [place.with_suffix("").parts for place in places]
     for depth in range(1, max(map(len, bare)) + 1):
         names = ["/".join(parts[-depth:]) for parts in bare]
@@ -212,6 +212,6 @@ def add_errors(entry: Entry, metrics: list[str], reference: np.ndarray, path: st
 def print_table(entries: list[Entry]) -> None:
     """The numbers of the page, for those who do not open it."""
     width = max(len(entry.name) for entry in entries)
-    print(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
+    tell(f"{'':{width}}" + "".join(f"{metric:>16}" for metric in entries[0].metrics))
     for entry in entries:
-        print(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))
+        tell(f"{entry.name:{width}}" + "".join(f"{value:16.4g}" for value in entry.metrics.values()))

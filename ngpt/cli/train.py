@@ -6,7 +6,7 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from ngpt.cli.arguments import add_config
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output, check_output, exclusive
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         print(cost(settings))
         return 0
     if not args.out:
-        raise NgptError("--out is missing: the folder for checkpoint, weights and log")
+        raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
     out = Path(args.out)
     try:
         out.mkdir(parents=True, exist_ok=True)

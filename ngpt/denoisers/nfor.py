@@ -12,6 +12,7 @@ variance explains instead [Rousselle et al. 2012, "Adaptive rendering with non-l
 Of two bandwidths each pixel takes a mixture by Stein's unbiased estimate of their errors, where they use the halves.
 """
 
+import math
 from collections.abc import Iterator
 from itertools import product
 
@@ -25,6 +26,9 @@ BANDWIDTHS = (0.5, 1.0)
 RIDGE = 1e-3
 # Variance, over the median of the neighbourhood, at which a pixel counts half.
 OUTLIER = 1000.0
+# Of the light of the brightest hundredth: what is above is cut, and counts no more than FLOOR in the noise that is
+# nothing beside the image. One pixel of 1e30 would leave the range of single precision, and blur all others.
+FAR, FLOOR = 1e6, 1e3
 _TILE = 48  # pixels of a tile's side: what is summed for it stays in the processor's cache
 
 
@@ -36,6 +40,9 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     """
     # As they are: averaged with their neighbours', which is safer elsewhere, they blur (docs/lab/log).
     variance = np.where(np.isfinite(variance), np.maximum(variance, 0), 0).astype(np.float32)
+    power = _power(image)
+    image = np.clip(np.ldexp(image, -power), -FAR, FAR)
+    variance = np.minimum(np.ldexp(variance, -2 * power), np.float32(FAR**2))
     design = _design(features, image.shape[:2])
     trust = _trust(image, variance)
     results, errors = [], []
@@ -47,7 +54,14 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
         errors.append(uniform_filter(error, 2 * RADIUS + 1))
     better = (errors[1] < errors[0]).astype(np.float32)
     share = uniform_filter(better, 2 * PATCH + 1)[..., None]
-    return ((1 - share) * results[0] + share * results[1]).astype(np.float32)
+    return np.ldexp(((1 - share) * results[0] + share * results[1]).astype(np.float32), power)
+
+
+def _power(image: np.ndarray) -> int:
+    """The power of two by which the brightest hundredth of an image begins at 1 to 2; of its light, if that is less."""
+    light = np.abs(image)
+    level = np.percentile(light, 99) or np.median(light[light > 0] if light.any() else 1.0)
+    return math.floor(math.log2(level))
 
 
 def estimated_variance(image: np.ndarray) -> np.ndarray:
@@ -75,7 +89,7 @@ def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
 
 def _floor(image: np.ndarray) -> float:
     """A variance that is nothing beside the image."""
-    return 1e-6 * float(np.mean(image.astype(np.float64) ** 2)) + 1e-30
+    return 1e-6 * float(np.mean(np.clip(image, -FLOOR, FLOOR).astype(np.float64) ** 2)) + 1e-30
 
 
 def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:

@@ -51,11 +51,8 @@ class Reference:
 
     def total(self, attribute: str) -> float | None:
         """The sum of a number in the files' headers, such as the samples; None where it is not in all."""
-        try:
-            value = sum(float(stack.attributes[attribute]) for stack in self.stacks)
-        except (KeyError, TypeError, ValueError):
-            return None
-        return value if np.isfinite(value) else None
+        values = [stack.number(attribute) for stack in self.stacks]
+        return None if None in values else sum(value for value in values if value is not None)
 
     @property
     def noise(self) -> float | None:

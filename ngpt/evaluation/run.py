@@ -152,7 +152,7 @@ def _scene(
                 if cell["absent"]:
                     cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
                     continue
-                rendered = _number(load().attributes.get("ngpt:seconds"))
+                rendered = load().number("ngpt:seconds")
                 seconds = {"render": rendered, "reconstruct": cell["reconstruct"], "total": None}
                 if rendered is not None:
                     seconds["total"] = rendered + cell["reconstruct"]

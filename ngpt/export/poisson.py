@@ -10,7 +10,7 @@ import math
 import onnx
 
 from ngpt.classical.poisson import DEFAULT_ALPHA
-from ngpt.errors import NgptError
+from ngpt.errors import WrongUse
 from ngpt.export.builder import END, FLOAT, Graph, Value, op
 from ngpt.version import __version__
 
@@ -25,7 +25,7 @@ def l2_model(alpha: float = DEFAULT_ALPHA) -> onnx.ModelProto:
     be finite. Metadata: ``ngpt.version``, ``ngpt.method``, ``ngpt.alpha``, ``ngpt.gradient``.
     """
     if not 0 < alpha < float("inf"):
-        raise NgptError(f"alpha {alpha}: must be a positive number; the default is {DEFAULT_ALPHA}")
+        raise WrongUse(f"alpha {alpha}: must be a positive number; the default is {DEFAULT_ALPHA}")
     graph = Graph("l2")
     primal, dx, dy = (graph.input(name, _IMAGE) for name in ("primal", "dx", "dy"))
     graph.output("image", primal + _correction(primal, dx, dy, alpha), _IMAGE)

@@ -18,9 +18,10 @@ from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
 from ngpt.io.aliases import layers_of_light as find_light
 from ngpt.io.header import read_headers
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.openexr import ExrImage, ExrPart, read_exr, regular_file, write_exr
+from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
+from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
 

@@ -40,6 +40,8 @@ class PartHeader:
     ``channels``  name -> (bytes of a value, x and y step of its subsampling)
     ``deep``      whether pixels hold lists of samples
     ``chunks``    pieces that its full-size image is stored in
+    ``table``     entries of the table that says where pieces begin: those of smaller levels too, where that is told
+    ``tiled``     whether pieces are tiles
     ``ratio``     the most bytes of image that one byte of the file can stand for
     """
 
@@ -49,6 +51,8 @@ class PartHeader:
     channels: dict[str, tuple[int, tuple[int, int]]]
     deep: bool
     chunks: int
+    table: int
+    tiled: bool
     ratio: int
 
     @property
@@ -152,7 +156,8 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
         raise _Damage(f"{label} has compression {number}, which is none of OpenEXR's")
     lines, ratio = _COMPRESSIONS[number]
     chunks = -(-height // lines)
-    if kind in (b"tiledimage", b"deeptile") or (not kind and flags & 0x200):
+    tiled = kind in (b"tiledimage", b"deeptile") or bool(not kind and flags & 0x200)
+    if tiled:
         across, down = struct.unpack_from("<2I", data("tiles", "tiledesc"))
         if not (0 < across < 2**31 and 0 < down < 2**31):
             raise _Damage(f"{label} has tiles of {across}x{down} pixels")
@@ -160,10 +165,10 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
         if across * down > max(MAX_TILE, 4 * width * height):
             raise _Excess(f"{label} is {width}x{height} pixels in tiles of {across}x{down}")
         chunks = -(-width // across) * -(-height // down)
+    table = max(struct.unpack("<i", data("chunkCount", "int"))[0], chunks) if b"chunkCount" in attributes else chunks
     channels = dict(_channels(data("channels", "chlist"), label))
-    return PartHeader(
-        name, label, (width, height), channels, kind.startswith(b"deep") or bool(flags & _DEEP), chunks, ratio
-    )
+    deep = kind.startswith(b"deep") or bool(flags & _DEEP)
+    return PartHeader(name, label, (width, height), channels, deep, chunks, table, tiled, ratio)
 
 
 def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[int, int]]]]:

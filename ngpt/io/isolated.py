@@ -18,8 +18,9 @@ import OpenEXR
 
 from ngpt.errors import NgptError
 from ngpt.io.header import read_headers
-from ngpt.io.openexr import ExrImage, read_exr, regular_file, write_exr
+from ngpt.io.openexr import ExrImage, read_exr, write_exr
 from ngpt.system.limits import limit_address_space
+from ngpt.system.reading import regular_file
 
 # Beside what its pixels take, twice over: Python, NumPy and the stacks of OpenEXR's threads.
 _BASE = 2**31

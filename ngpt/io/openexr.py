@@ -17,7 +17,6 @@ import contextlib
 import io
 import math
 import os
-import stat
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ from ngpt.errors import NgptError
 from ngpt.io.header import PartHeader, read_headers
 from ngpt.system.files import atomic_output
 from ngpt.system.limits import free_address_space, processors
+from ngpt.system.reading import regular_file
 
 _LOSSY = (
     OpenEXR.PXR24_COMPRESSION,
@@ -132,30 +132,6 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
             reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
             raise NgptError(f"{path}: cannot be written as OpenEXR: {reason}") from error
     return Path(path)
-
-
-@contextlib.contextmanager
-def regular_file(path: Path) -> Iterator[BinaryIO]:
-    """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
-    try:
-        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
-    except FileNotFoundError:
-        raise NgptError(f"{path}: not found; check the name") from None
-    except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
-        if os.path.isdir(path):  # which not every system says in its error
-            raise NgptError(f"{path}: is a directory; name an .exr file in it") from None
-        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
-    with file:
-        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
-            raise NgptError(f"{path}: is a pipe or a device, no file; save the image to disk first")
-        try:
-            yield file
-        except OSError as error:
-            raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
-
-
-def _open_at_once(name: str, flags: int) -> int:
-    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
 
 
 def _numbered(file: BinaryIO) -> str:

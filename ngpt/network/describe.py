@@ -36,7 +36,7 @@ def describe(path: str | Path) -> dict[str, Any]:
 
 
 def _onnx(path: Path) -> dict[str, Any]:
-    metadata = run_onnx.session(str(path), path.stat().st_mtime_ns, "cpu", 0).get_modelmeta().custom_metadata_map
+    metadata = run_onnx.session(path, "cpu", 0).get_modelmeta().custom_metadata_map
     training = parse_json(metadata.get("ngpt.training", "{}"), f"{path}: its record of the training")
     claims = f"method '{metadata.get('ngpt.method', '')}', written by ngpt {metadata.get('ngpt.version', '?')}"
     if FRAMES in metadata:

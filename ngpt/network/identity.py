@@ -9,6 +9,7 @@ from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.network.run import WEIGHTS
+from ngpt.system.reading import regular_file
 
 
 @dataclass(frozen=True)
@@ -36,7 +37,8 @@ class Identity:
 def identify(path: str | Path) -> Identity:
     """Raises NgptError where the file cannot be read."""
     try:
-        digest = _digest(str(path), Path(path).stat().st_mtime_ns)
+        with regular_file(Path(path)):
+            digest = _digest(str(path), Path(path).stat().st_mtime_ns)
         ours = {_digest(str(own), own.stat().st_mtime_ns): own.stem for own in sorted(WEIGHTS.glob("*.onnx"))}
     except OSError as error:
         raise NgptError(f"{path}: cannot be read: {error.strerror}") from error

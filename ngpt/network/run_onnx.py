@@ -28,6 +28,8 @@ DEVICES = {
     "directml": "DmlExecutionProvider",
     "coreml": "CoreMLExecutionProvider",
 }
+# As ONNX Runtime calls them.
+_FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
 Progress = Callable[[int, int], None]
 
@@ -53,7 +55,7 @@ class Network:
 
     def __init__(self, path: str | Path, device: str = "auto", threads: int = 0):
         self.path, self.device, self.threads = Path(path), "cpu" if device == "auto" else device, threads
-        self.session = self._session(self.path)
+        self.session = session(self.path, self.device, threads)
         metadata = self.session.get_modelmeta().custom_metadata_map
         try:
             names = metadata["ngpt.inputs"].split(", ")
@@ -85,6 +87,7 @@ class Network:
         graph = {given.name for given in self.session.get_inputs()}
         # Those that a host may leave out have a value in the graph.
         optional = {given.name for given in self.session.get_overridable_initializers()}
+        self.types, self.output = floats(self.session, self.path)
         if not graph <= own <= graph | optional:
             raise NgptError(
                 f"{self.path}: its inputs are {', '.join(sorted(graph | optional))}, its metadata tell of "
@@ -177,7 +180,8 @@ class Network:
 
     def _run(self, session, feed: dict[str, np.ndarray]) -> np.ndarray:
         try:
-            result = session.run(None, feed)[0]
+            feed = {name: values.astype(self.types[name], copy=False) for name, values in feed.items()}
+            result = session.run([self.output], feed)[0]
         except Exception as error:
             if isinstance(error, MemoryError) or "allocate memory" in str(error) or "bad_alloc" in str(error):
                 raise _OutOfMemory(
@@ -189,15 +193,34 @@ class Network:
             raise NgptError(f"network {self.path}: gives {result.shape} where {expected} is due; export it anew")
         return result
 
-    def _session(self, path: Path):
-        if not path.is_file():
-            raise NgptError(f"{path}: no such file; `python -m export` writes it")
-        return session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
+
+def floats(session, path: Path) -> tuple[dict[str, type], str]:
+    """The type of each input of a network, and the name of its first output.
+
+    Files of elsewhere may take and give anything. Single, half and double precision are converted; NgptError is raised
+    for whole numbers, texts, sequences, maps and what else ONNX has.
+    """
+    inputs = [*session.get_inputs(), *session.get_overridable_initializers()]
+    output = next(iter(session.get_outputs()))
+    for what, given in [*(("input", given) for given in inputs), ("output", output)]:
+        if given.type not in _FLOATS:
+            raise NgptError(
+                f"{path}: its {what} '{given.name}' is {given.type}; it must be one of {', '.join(_FLOATS)}: export it "
+                "anew"
+            )
+    return {given.name: _FLOATS[given.type] for given in inputs}, output.name
+
+
+def session(path: Path, device: str, threads: int):
+    """The session of a file; made again when the file has changed. Raises NgptError where ONNX Runtime cannot."""
+    # Neither a pipe nor a device, which it would read without an end.
+    if not path.is_file():
+        raise NgptError(f"{path}: no such file; `python -m export` writes it")
+    return _made(str(path), path.stat().st_mtime_ns, device, threads)
 
 
 @lru_cache(maxsize=8)
-def session(path: str, _modified: int, device: str, threads: int):
-    """The session of a file; made again when the file has changed."""
+def _made(path: str, _modified: int, device: str, threads: int):
     try:
         import onnxruntime
     except ModuleNotFoundError as error:

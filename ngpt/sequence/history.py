@@ -81,7 +81,7 @@ class Temporal:
         """
         data = repair(stack, gradients=False)
         now = np.asarray(image, np.float32) - data.direct
-        frame = stack.attributes.get("ngpt:frame")
+        frame = stack.number("ngpt:frame")
         relative = np.ones(now.shape[:2], np.float32)
         features = data.features
         self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
@@ -124,5 +124,5 @@ def _follows(stack: GradientStack, before: _History) -> bool:
     """Whether the last frame is the one that the stack's motion leads to."""
     if "motion" not in stack or stack["motion"].shape[:2] != before.light.shape[:2]:
         return False
-    previous = stack.attributes.get("ngpt:previousFrame")
+    previous = stack.number("ngpt:previousFrame")
     return previous is None or before.frame is None or previous == before.frame

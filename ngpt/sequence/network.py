@@ -132,13 +132,15 @@ class Network:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        if not self.path.is_file():
-            raise NgptError(f"{path}: no such file")
-        self._session = run_onnx.session(str(path), self.path.stat().st_mtime_ns, "cpu", 0)
+        self._session = run_onnx.session(self.path, "cpu", 0)
         metadata = self._session.get_modelmeta().custom_metadata_map
         if metadata.get(FRAMES) != ", ".join(INPUTS):
             raise NgptError(f"{path}: is no network that blends frames, or of another version of ngpt; export it anew")
-        self.alignment, self.overlap = (int(metadata[f"ngpt.{name}"]) for name in ("alignment", "overlap"))
+        try:
+            self.alignment, self.overlap = (int(metadata[f"ngpt.{name}"]) for name in ("alignment", "overlap"))
+        except (KeyError, ValueError) as error:
+            raise NgptError(f"{path}: its metadata {error} is missing, or no whole number; export it anew") from error
+        self.types, self.output = run_onnx.floats(self._session, self.path)
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """In strips of rows; their height does not change the result."""
@@ -147,7 +149,8 @@ class Network:
         rows = max(STRIP // padded.shape[1] // self.alignment, 1) * self.alignment
         result = np.empty((*padded.shape[:2], BANDS), np.float32)
         for strip, around in tiles.spans(len(padded), rows, self.overlap):
-            (made,) = self._session.run(None, {"inputs": run_onnx.planes(padded[around])[None]})
+            given: np.ndarray = run_onnx.planes(padded[around])[None].astype(self.types["inputs"], copy=False)
+            (made,) = self._session.run([self.output], {"inputs": given})
             result[strip] = np.moveaxis(made[0, :, tiles.within(strip, around)], 0, -1)
         return result[:height, :width]
 

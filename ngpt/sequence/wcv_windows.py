@@ -52,7 +52,7 @@ def reconstruct_shot(
 def _follows(stack: GradientStack, before: GradientStack) -> bool:
     if any(name not in stack for name in LINK) or stack["primal"].shape != before["primal"].shape:
         return False
-    frame, previous = before.attributes.get("ngpt:frame"), stack.attributes.get("ngpt:previousFrame")
+    frame, previous = before.number("ngpt:frame"), stack.number("ngpt:previousFrame")
     return previous is None or frame is None or previous == frame
 
 

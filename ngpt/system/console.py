@@ -5,16 +5,15 @@ Everything goes to standard error; standard output is kept for results (JSON, ta
 
 import io
 import os
-import signal
 import sys
-import threading
 import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TextIO
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
+from ngpt.system.interrupts import raised
 from ngpt.system.limits import address_space
 
 # Elsewhere than on a terminal, a line at most this often, and the next when work has gone on for one part more of so
@@ -29,12 +28,12 @@ FEWEST_MIB = 512
 def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "interrupted") -> int:
     """The exit status of a command: what ``run`` returns, or that of whatever stopped it, which is told in one line.
 
-    2 for an error, 130 when interrupted, 1 when nobody reads standard output any more. ``interrupted`` says what an
-    interrupt means for the work.
+    1 for an error, and where nobody reads standard output any more; 2 for ``WrongUse``; 130 after Ctrl-C and 143 after
+    SIGTERM. ``interrupted`` says what an interrupt means for the work.
     """
     _open_standard_streams()
     console = Console(name=name)
-    with _own_stderr(), _noted_interrupts() as pressed:
+    with _own_stderr(), raised() as interrupt:
         try:
             _check_address_space()
             try:
@@ -48,13 +47,13 @@ def run_command(run: Callable[[], int], name: str = "ngpt", interrupted: str = "
             if isinstance(error, OSError):
                 _close(sys.stdout)
             # Libraries that are interrupted, while they are imported above all, raise what they like.
-            if pressed or isinstance(error, KeyboardInterrupt):
+            if interrupt() or isinstance(error, KeyboardInterrupt):
                 console.error(interrupted)
-                return 130
+                return interrupt.status
             if isinstance(error, BrokenPipeError):
                 return 1
             console.error(_explanation(error))
-            return 2
+            return 2 if isinstance(error, WrongUse) else 1
 
 
 def _explanation(error: BaseException) -> str:
@@ -69,29 +68,6 @@ def _explanation(error: BaseException) -> str:
     raise error
 
 
-@contextmanager
-def _noted_interrupts() -> Iterator[list[int]]:
-    """Yields a list that is empty until Ctrl-C is pressed."""
-    pressed: list[int] = []
-
-    def note(number, frame):
-        pressed.append(number)
-        raise KeyboardInterrupt
-
-    # Neither where nobody is to hear it, in the background of a script, nor where signals do not arrive, in a thread.
-    if (
-        signal.getsignal(signal.SIGINT) is not signal.default_int_handler
-        or threading.current_thread() is not threading.main_thread()
-    ):
-        yield pressed
-        return
-    signal.signal(signal.SIGINT, note)
-    try:
-        yield pressed
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
-
-
 def _check_address_space() -> None:
     """Raises NgptError for a limit (``ulimit -v``) at which the libraries we load hang or abort, OpenBLAS first."""
     limit = address_space()
@@ -101,10 +77,25 @@ def _check_address_space() -> None:
         )
 
 
+def printable(text: str) -> str:
+    """One line of text as it may go to a terminal: what files call their things may hold sequences that control one.
+
+    Control characters, line breaks and marks of direction become what Python writes for them, ``\\x1b``.
+    """
+    if text.isprintable():
+        return text
+    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
+
+
+def tell(line: str) -> None:
+    """A line of the result, on standard output."""
+    print(printable(line))
+
+
 def print_line(text: str, stream: TextIO) -> None:
     """A message, at once. That nobody takes it, as when the disk with the log is full, stops no work."""
     try:
-        print(text, file=stream, flush=True)
+        print(printable(text), file=stream, flush=True)
     except OSError:
         _close(stream)
 
@@ -168,7 +159,7 @@ class Console:
         if self.quiet:
             yield lambda done, total: None
         elif self.terminal:
-            with _bar(label, unit, rate) as update:
+            with _bar(printable(label), unit, rate) as update:
                 yield update
         else:
             yield _Lines(self, label, unit, rate)

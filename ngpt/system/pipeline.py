@@ -4,7 +4,7 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 
 Item = TypeVar("Item")
 Read = TypeVar("Read")
@@ -18,9 +18,9 @@ def overlapped(
     """``write(compute(read(item)))`` of each item, in order; of an item that fails, its NgptError.
 
     ``read`` is one item ahead and ``write`` one behind, each in a thread of its own; ``compute`` runs in the caller's.
-    So at most three items are held at once. Any other error is raised when its item's turn has come. Whatever ends the
-    work early, an interrupt or ``close()``, the threads finish what they have begun and start nothing else. A single
-    item needs no threads. Raises MemoryError where there is no room for two.
+    So at most three items are held at once. Any other error, and WrongUse, which is that of all, is raised when its
+    item's turn has come. Whatever ends the work early, an interrupt or ``close()``, the threads finish what they have
+    begun and start nothing else. A single item needs no threads. Raises MemoryError where there is no room for two.
     """
     if len(items) == 1:
         yield _told(_attempt(write, _attempt(compute, _attempt(read, items[0]))))
@@ -57,6 +57,6 @@ def _attempt(stage: Callable[[Any], Any], value: Any) -> Any:
 
 def _told(outcome: Any) -> Any:
     """The outcome of an item, unless it is an error that concerns all of them."""
-    if isinstance(outcome, Exception) and not isinstance(outcome, NgptError):
+    if isinstance(outcome, Exception) and (isinstance(outcome, WrongUse) or not isinstance(outcome, NgptError)):
         raise outcome
     return outcome

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from ngpt.errors import NgptError
+from ngpt.system.reading import read_text
 
 T = TypeVar("T")
 
@@ -32,11 +33,7 @@ def parse_json(text: str, where: str) -> Any:
 
 
 def _parsed(parser: Callable[[str], Any], path: str | Path) -> Any:
-    try:
-        text = Path(path).read_text(encoding="utf-8")
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
-    return _call(parser, text, str(path))
+    return _call(parser, read_text(path), str(path))
 
 
 def _call(parser: Callable[[str], Any], text: str, where: str) -> Any:

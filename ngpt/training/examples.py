@@ -59,7 +59,7 @@ class StackCrop:
         self.scene, self.inputs = folder.name, len(stacks)
         self._stacks, self._reference = stacks, reference
         held = [read(str(path)) for path in stacks]
-        self.spp = tuple(int(stack.attributes.get("ngpt:spp", 0)) for stack in held)
+        self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
         self._caustic = ["caustic" in stack for stack in held]
         self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
 

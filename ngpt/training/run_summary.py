@@ -9,6 +9,7 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.network.identity import identify
+from ngpt.system.reading import read_text, regular_file
 from ngpt.system.records import check, parse_json, read_json
 
 CHECKPOINT, LOG, SETTINGS, WEIGHTS = "checkpoint.safetensors", "log.jsonl", "settings.json", "weights.safetensors"
@@ -56,10 +57,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
 def _entries(path: Path) -> list[dict[str, float]]:
     """The lines of a log; the last one may be cut short, as it is while it is written."""
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except (OSError, ValueError) as error:
-        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
+    lines = read_text(path).splitlines()
     entries = []
     for number, line in enumerate(lines, 1):
         where = f"{path}: line {number}"
@@ -78,7 +76,7 @@ def _entries(path: Path) -> list[dict[str, float]]:
 def _header(path: Path) -> dict[str, Any]:
     """The record in a checkpoint, without its tensors: a safetensors file begins with a length and so much JSON."""
     try:
-        with open(path, "rb") as file:
+        with regular_file(path) as file:
             (length,) = struct.unpack("<Q", file.read(8))
             if length > _MAX_HEADER:
                 raise ValueError

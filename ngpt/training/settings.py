@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.network.features import PARTS
 from ngpt.network.model import ModelConfig
 from ngpt.system.records import from_table, read_toml
@@ -155,7 +155,7 @@ def _check(settings: Settings, path: str) -> None:
 def _change(values: dict[str, Any], change: str) -> None:
     name, equals, text = change.partition("=")
     if not equals:
-        raise NgptError(f"--set {change}: give it as table.key=value, for example run.steps=1000")
+        raise WrongUse(f"--set {change}: give it as table.key=value, for example run.steps=1000")
     try:
         value = tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
@@ -164,5 +164,5 @@ def _change(values: dict[str, Any], change: str) -> None:
     for name in tables:
         values = values.setdefault(name, {})
         if not isinstance(values, dict):
-            raise NgptError(f"--set {change}: '{name}' is not a table")
+            raise WrongUse(f"--set {change}: '{name}' is not a table")
     values[key] = value

@@ -56,12 +56,36 @@ def test_without_noise_there_is_none(stack):
     assert not ngpt.reconstruct_with_error(silent, "wcv").error.any()
 
 
-def test_variances_that_are_not_finite_count_as_no_noise(stack):
-    variance = stack["primal_var"].copy()
-    variance[3, 4], variance[5, 6] = np.nan, np.inf
-    noisy = noisier(stack.replace(primal_var=variance))
+def test_of_variances_that_are_not_finite_the_error_is_not_known(stack):
+    variance, of_dx = stack["primal_var"].copy(), stack["dx_var"].copy()
+    variance[3, 4], variance[5, 6], of_dx[7, 8], of_dx[:, -1] = np.nan, np.inf, np.nan, np.nan
+    holes = stack.replace(primal_var=variance, dx_var=of_dx)
+    noisy = noisier(holes)
     assert np.array_equal(noisy["primal"][[3, 5], [4, 6]], stack["primal"][[3, 5], [4, 6]])
-    assert np.isfinite(ngpt.reconstruct_with_error(stack.replace(primal_var=variance), "wcv").error).all()
+    error = ngpt.reconstruct_with_error(holes, "wcv").error
+    assert [tuple(place) for place in np.argwhere(np.isnan(error).any(axis=-1))] == [(3, 4), (5, 6), (7, 8)]
+    whole = ngpt.reconstruct_with_error(stack, "wcv").error
+    assert np.nanmax(np.abs(error - whole)[9:, 12:] / whole[9:, 12:]) < 0.02
+    nothing = stack.replace(primal_var=np.full_like(variance, np.nan))
+    assert np.isnan(ngpt.reconstruct_with_error(nothing, "l1").error).all()
+
+
+def test_pixels_of_unknown_noise_do_not_count_as_silent_ones(rng):
+    """Beside them the error is that of those whose noise is known."""
+    other = rng.standard_normal((60, 60, 3))
+    known = rng.random((60, 60)) < 0.5
+    found = change(np.zeros_like(other), other, known)
+    assert np.array_equal(np.isnan(found[..., 0]), ~known)
+    assert np.nanmean(found**2) == pytest.approx(1, rel=0.1)
+
+
+def test_the_command_says_of_how_many_pixels_the_error_is_not_known(stack, tmp_path, capsys):
+    variance = stack["primal_var"].copy()
+    variance[3:5, 4] = np.nan
+    ngpt.write(tmp_path / "s.exr", stack.replace(primal_var=variance))
+    assert main(["denoise", str(tmp_path / "s.exr"), "-m", "l2", "--error", "-o", str(tmp_path / "o.exr")]) == 0
+    assert "s.exr: the error of 2 pixels is NaN, for their variances are not finite" in capsys.readouterr().err
+    assert np.isnan(ngpt.read(tmp_path / "o.exr")["error"]).sum() == 6
 
 
 def test_the_light_apart_is_part_of_the_primal(stack, rng):

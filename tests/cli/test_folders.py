@@ -94,7 +94,7 @@ def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
     before = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     (out / "2.exr").unlink()
     capsys.readouterr()
-    assert main(words) == 2
+    assert main(words) == 1
     assert "--force" in capsys.readouterr().err and not (out / "2.exr").exists()
     assert main([*words, "--skip-existing", "--json"]) == 0
     told = capsys.readouterr()
@@ -104,6 +104,15 @@ def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
     after = {path.name: path.stat().st_mtime_ns for path in out.iterdir()}
     assert after.keys() == before.keys() and {n for n in after if after[n] != before[n]} == {"2.exr"}
     assert np.array_equal(ngpt.read_image(out / "2.exr"), ngpt.denoise(ngpt.read(frames / "2.exr"), "l2"))
+    # What a full disk left of a result is none.
+    for cut in (b"", (out / "2.exr").read_bytes()[:-9]):
+        (out / "2.exr").write_bytes(cut)
+        assert main([*words, "--skip-existing", "--json"]) == 0
+        told = capsys.readouterr()
+        skipped = [f.get("skipped", False) for f in json.loads(told.out)["files"]]
+        assert skipped == [True, True, False, True, True, True]
+        assert "2.exr: l2, " in told.err and "in place of a file that was not whole" in told.err
+        assert np.array_equal(ngpt.read_image(out / "2.exr"), ngpt.denoise(ngpt.read(frames / "2.exr"), "l2"))
     # One of the two, not both.
     with pytest.raises(SystemExit):
         main([*words, "--skip-existing", "--force"])

@@ -1,6 +1,7 @@
 """Options of methods from the command line, and methods that are others with options of their own."""
 
 import json
+import shutil
 
 import numpy as np
 import pytest
@@ -93,11 +94,14 @@ def test_help_and_lists_have_methods_by_standing(source, capsys):
         (["-m", "ngpt-fast", "-O", "memory=much"], "option 'memory': 'much' is not allowed; it takes a whole number"),
     ],
 )
-def test_errors_are_those_of_the_method(source, arguments, message, capfd):
+def test_errors_are_those_of_the_method(source, tmp_path, arguments, message, capfd):
     if "oidn" in arguments and "alpha=1" not in arguments and oidn.missing():
         pytest.skip(oidn.missing())
-    assert main(["denoise", source, *arguments]) == 1
-    assert message in capfd.readouterr().err
+    other = shutil.copy(source, tmp_path / "other.exr")
+    # That of all stacks: said once, and the others are not tried.
+    assert main(["denoise", source, str(other), *arguments, "-o", f"{tmp_path}/out/"]) == 2
+    errors = capfd.readouterr().err
+    assert message in errors and errors.count("error:") == 1
 
 
 def test_an_option_without_a_value_is_wrong_usage(source, capfd):

@@ -47,7 +47,7 @@ def test_nothing_is_overwritten_unasked(tmp_path, what, capsys):
     else:
         folder.mkdir()
         (folder / "dy.f32").write_text("mine")
-    assert main(["unpack", str(tmp_path / "s.exr"), str(folder)]) == 2
+    assert main(["unpack", str(tmp_path / "s.exr"), str(folder)]) == 1
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "raw" in error
     if what == "an older layer":

@@ -2,19 +2,24 @@
 
 import base64
 import json
+import math
+import os
 import struct
 
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from data_gen.frames.camera_path import look_at
+from data_gen.frames.camera_path import look_at, read_camera_path
 from data_gen.frames.gltf import read_gltf_camera
 from ngpt.errors import NgptError
 
 TIMES = np.array([0, 1], np.float32)
 MOVES = np.array([[0, 1, 4], [2, 1, 4]], np.float32)
 TURNS = np.array([[0, 0, 0, 1], Rotation.from_euler("y", 60, degrees=True).as_quat()], np.float32)
+
+# Times that never end, where content() has its own.
+INFINITE = np.full(64, np.inf, np.float32).tobytes()
 
 
 def content(buffer, way="LINEAR", moves=MOVES, turns=TURNS):
@@ -96,17 +101,86 @@ def test_steps_and_splines(tmp_path):
         (lambda scene: scene["cameras"][0].update(type="orthographic"), "must be perspective"),
         (lambda scene: scene.pop("accessors"), "can be understood"),
         (lambda scene: scene["accessors"][1].update(count=1000), "can be understood"),
-        (lambda scene: scene["buffers"][0].update(uri="gone.bin"), "cannot be read"),
+        (lambda scene: scene["buffers"][0].update(uri="gone.bin"), "gone.bin: not found"),
         (lambda scene: scene["accessors"][0].update(componentType=5123), "export them as floats"),
+        (lambda scene: scene["buffers"][0].update(uri=5), "can be understood"),
+        (lambda scene: scene["buffers"][0].update(uri="/dev/zero"), "'/dev/zero' is not in its folder or below"),
+        (lambda scene: scene["buffers"][0].update(uri="a/../../b.bin"), "is not in its folder or below"),
+        (lambda scene: scene["buffers"][0].update(uri="%2e%2e/b.bin"), "'../b.bin' is not in its folder"),
+        (lambda scene: scene["buffers"][0].update(uri="http://a.b/c.bin"), "is not in its folder or below"),
+        (lambda scene: scene["buffers"][0].update(uri="c:\\b.bin"), "is not in its folder or below"),
+        (lambda scene: scene["buffers"][0].update(uri="pipe.bin"), "pipe.bin: is a pipe or a device"),
+        (lambda scene: scene["buffers"][0].update(uri=embedded(INFINITE)), "accessor 0 has numbers that are not"),
+        (lambda scene: scene["animations"][0]["channels"][0].update(target=[]), "can be understood"),
+        (lambda scene: scene["nodes"][1].update(translation=[0, math.nan, 0]), "frame 0: .* not finite, or beyond"),
+        (lambda scene: scene["nodes"][1].update(translation=[0, 1e200, 0]), "frame 0: .* not finite, or beyond"),
+        (lambda scene: scene["nodes"][1].update(scale=[0, 1, 1]), "frame 0: .* flattens space"),
+        (lambda scene: scene["nodes"][1].update(matrix=[0] * 16), "frame 0: .* flattens space"),
+        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=math.nan), "yfov .* between 0 and 180"),
+        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=0), "yfov"),
+        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=-1), "yfov"),
+        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=10), "yfov"),
+        (lambda scene: scene["cameras"][0]["perspective"].update(yfov=math.inf), "yfov"),
     ],
 )
 def test_files_that_cannot_be_used_are_refused(tmp_path, change, complaint):
     scene, _ = content(embedded)
     change(scene)
+    os.mkfifo(tmp_path / "pipe.bin")
     path = tmp_path / "a.gltf"
     path.write_text(json.dumps(scene))
     with pytest.raises(NgptError, match=complaint):
         read_gltf_camera(path, 24)
-    path.write_bytes(b"glTF123")
-    with pytest.raises(NgptError, match="can be understood"):
+
+
+@pytest.mark.parametrize("data", [b"glTF123", b"[]", b'"text"', b"5", b"null", b"[" * 100_000, b"\xff\xfe{}"])
+def test_what_is_no_gltf_is_refused(tmp_path, data):
+    path = tmp_path / "a.gltf"
+    path.write_bytes(data)
+    with pytest.raises(NgptError, match=r"can be understood|what it holds is"):
         read_gltf_camera(path, 24)
+    with pytest.raises(NgptError, match=r"cannot be read|holds no camera keys|key 0"):
+        read_camera_path(path)
+
+
+def test_times_that_do_not_rise_are_refused(tmp_path):
+    scene, data = content(embedded)
+    scene["buffers"][0]["uri"] = embedded(np.array([1, 0], np.float32).tobytes() + data[8:])
+    path = tmp_path / "a.gltf"
+    path.write_text(json.dumps(scene))
+    with pytest.raises(NgptError, match="do not rise"):
+        read_gltf_camera(path, 24)
+
+
+def test_scaled_cameras_and_parents_are_cameras_without_scale(tmp_path):
+    path = tmp_path / "a.gltf"
+    paths = []
+    for scale in ([1, 1, 1], [2, 2, 2], [1e-3, 1e-3, 1e-3]):
+        scene, _ = content(embedded)
+        # The camera's own place is in units of its parent.
+        scene["nodes"][1]["scale"], scene["nodes"][2]["scale"] = scale, [3, 4, 5]
+        path.write_text(json.dumps(scene))
+        paths.append(read_gltf_camera(path, 24))
+    plain, *others = paths
+    for other, factor in zip(others, (2, 1e-3), strict=True):
+        for one, two in zip(plain.keys, other.keys, strict=True):
+            assert np.allclose(one.to_world[:3, :3], two.to_world[:3, :3])
+            up = np.array([0, 1, 0])
+            assert np.allclose(factor * (one.to_world[:3, 3] - up), two.to_world[:3, 3] - up)
+
+
+@pytest.mark.parametrize("scale", [[2, 2, 2], [-1, 1, 1]])
+def test_mitsuba_renders_scaled_and_mirrored_cameras(renderer, tmp_path, scale):
+    import data_gen
+
+    images = []
+    for given in ([1, 1, 1], scale):
+        node = {"camera": 0, "translation": [0, 1, 4], "scale": given}
+        camera = {"type": "perspective", "perspective": {"yfov": 0.7}}
+        (tmp_path / "a.gltf").write_text(json.dumps({"nodes": [node], "cameras": [camera]}))
+        shot = data_gen.render_frames("diffuse", [0], 4, size=(17, 12), sampler="primal", camera=tmp_path / "a.gltf")
+        images.append(next(iter(shot))[1]["albedo"])
+    assert images[0].std() > 0.01
+    mirrored = images[0][:, ::-1] if scale[0] < 0 else images[0]
+    # 0.015, by points of other places in each pixel, and 0.15 were it not mirrored.
+    assert np.abs(images[1] - mirrored).mean() < 0.04

@@ -8,7 +8,7 @@ import pytest
 from bdpt_scenes import SCENES
 from unbiased import light_of_gradients, load, render_ours
 
-from ngpt.errors import NgptError
+from ngpt.errors import Interrupted, NgptError
 
 
 @pytest.mark.parametrize("radius", [0.3, 0.05, 0.004])
@@ -197,13 +197,14 @@ def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
         calls.clear()
 
 
-def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch):
+@pytest.mark.parametrize("kind", [KeyboardInterrupt, Interrupted])
+def test_an_interrupt_while_a_plugin_is_made_is_one(renderer, monkeypatch, kind):
     """Mitsuba makes a text of what a plugin raises."""
     from data_gen.samplers import find
     from data_gen.samplers.photons.surfaces.ppm import PPM
 
     def interrupted(self, props):
-        raise KeyboardInterrupt
+        raise kind
 
     scene = load(renderer, "diffuse", (4, 4))
     monkeypatch.setattr(PPM, "__init__", interrupted)

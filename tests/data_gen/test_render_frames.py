@@ -13,6 +13,7 @@ from data_gen.frames.pattern import filled
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.system.console import Console
+from ngpt.system.interrupts import Interrupt
 
 
 def test_frames_are_ranges_lists_and_steps():
@@ -29,6 +30,7 @@ def test_frames_that_make_no_sense_are_refused(text):
 def test_text_changes_from_frame_to_frame():
     assert filled("{frame}", 7) == "7" and filled("shot.{frame:04d}.exr", 7) == "shot.0007.exr"
     assert filled("{10 + frame * 1.5:.2f},0", 3) == "14.50,0" and filled("{sin(pi * frame / 2):.1f}", 1) == "1.0"
+    assert filled("{frame:*>8.3f}|{frame:+,d}|{frame:#x}|{frame:99}", 4000)[:22] == "4000.000|+4,000|0xfa0|"
     assert (
         filled("{-(frame // 2) % 5}", 4) == "3"
         and filled("plain", 1) == "plain"
@@ -37,7 +39,11 @@ def test_text_changes_from_frame_to_frame():
 
 
 @pytest.mark.parametrize(
-    "text", ["{frames}", "{frame.real}", "{__import__('os')}", "{frame / 0}", "{frame:q}", "{frame +}"]
+    "text",
+    [
+        *("{frames}", "{frame.real}", "{__import__('os')}", "{frame / 0}", "{frame:q}", "{frame +}"),
+        *("{min(frame, 1, key=print)}", "{max(*frame)}", "{frame:.999999999f}", "{frame:0999999999d}", "{frame:100}"),
+    ],
 )
 def test_text_that_cannot_be_computed_is_refused(text):
     with pytest.raises(NgptError, match="frame"):
@@ -81,11 +87,16 @@ def test_a_shot_is_rendered_and_gone_on_with(renderer, tmp_path, capsys):
     ]
     assert main(["render", "diffuse", "--frames", "0:2", *words]) == 0
     first = (tmp_path / "shot/diffuse.0001.exr").read_bytes()
-    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 2
+    assert main(["render", "diffuse", "--frames", "0:3", *words]) == 1
     assert "exists already" in capsys.readouterr().err
     assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
     assert "2 of 3 frames were skipped" in capsys.readouterr().err
     assert (tmp_path / "shot/diffuse.0001.exr").read_bytes() == first
+    (tmp_path / "shot/diffuse.0001.exr").write_bytes(first[:-5])
+    assert main(["render", "diffuse", "--frames", "0:3", *words, "--skip-existing"]) == 0
+    told = capsys.readouterr().err
+    assert "2 of 3 frames were skipped" in told and "in place of a file that was not whole" in told
+    assert len((tmp_path / "shot/diffuse.0001.exr").read_bytes()) == len(first)
     stack = ngpt.read(tmp_path / "shot/diffuse.0002.exr")
     assert stack.attributes["ngpt:frame"] == 2 and abs(stack["motion"]).max() > 0.05
 
@@ -161,7 +172,9 @@ def test_ctrl_c_interrupts_a_cluster_at_once_and_no_render_that_is_done(renderer
     words = ["render", "diffuse", "--frames", "0:2", "--cluster", "tcp://nowhere:1", "-o", str(tmp_path / "shot")]
     args = parser_of(words)
     assert render.run(args, Console(quiet=True)) == 0 and seen == [before]
-    pressed = contextmanager(lambda noted: iter([lambda: True]))
+    interrupt = Interrupt()
+    interrupt.signal = signal.SIGINT
+    pressed = contextmanager(lambda noted: iter([interrupt]))
     monkeypatch.setattr(render, "stop_on_ctrl_c", pressed)
     one = ["render", "diffuse", "--size", "8x8", "-q", "--sampler", "primal", "-o", str(tmp_path / "a.exr")]
     assert main(one) == 0 and ngpt.read(tmp_path / "a.exr").attributes["ngpt:spp"] == 32

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from data_gen.frames.camera_path import CameraPath, Key, horizontal, look_at, read_camera_path
 from ngpt.errors import NgptError
@@ -96,8 +97,28 @@ def test_matrices_turn_evenly_between_keys():
         matrix[:3, 3] = degrees, 0, 0
         return matrix
 
-    path = CameraPath([Key(0, turned(0, 1)), Key(2, turned(80, 3))])
-    assert np.allclose(path.at(1).to_world, turned(40, 2))
+    path = CameraPath([Key(0, turned(0, 1)), Key(2, turned(80, 1))])
+    assert np.allclose(path.at(1).to_world, turned(40, 1))
+    # Scales, which exporters write, are none of a camera's business.
+    scaled = CameraPath([Key(0, turned(0, 1e-3)), Key(2, turned(80, np.array([3, 0.5, 70])))])
+    assert np.allclose(scaled.at(1).to_world, turned(40, 1)) and np.allclose(scaled.at(2).to_world, turned(80, 1))
+    # Mirrored ones stay so.
+    side = np.array([-2, 1, 1])
+    mirrored = CameraPath([Key(0, turned(0, side)), Key(2, turned(80, side))])
+    assert np.allclose(mirrored.at(1).to_world, turned(40, np.sign(side)))
+    with pytest.raises(NgptError, match="mirrored in one of the frames 0 and 2"):
+        CameraPath([Key(0, turned(0, 1)), Key(2, turned(80, side))])
+
+
+def test_a_sheared_camera_looks_the_same_way_with_the_same_side_up():
+    """As below a parent of uneven scale; as other programs take it."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.diag([1, 3, 1]) @ Rotation.from_euler("xyz", [30, 40, 50], degrees=True).as_matrix()
+    (key,) = CameraPath([Key(0, matrix)]).keys
+    axes = key.to_world[:3, :3]
+    assert np.allclose(axes.T @ axes, np.eye(3)) and np.isclose(np.linalg.det(axes), 1)
+    assert np.allclose(np.cross(axes[:, 2], matrix[:3, 2]), 0) and axes[:, 2] @ matrix[:3, 2] > 0
+    assert np.isclose(axes[:, 0] @ matrix[:3, 1], 0) and axes[:, 1] @ matrix[:3, 1] > 0
 
 
 def test_the_look_at_of_a_path_is_that_of_mitsuba(renderer):
@@ -114,7 +135,7 @@ def test_fields_of_view_of_the_height_are_turned_into_those_of_the_width():
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("{", "is not JSON"),
+        ("{", "cannot be read: Expecting"),
         ("{}", "holds no camera keys"),
         ("[5]", "key 0 is 5"),
         ('[{"frame": 0, "fow": 3}]', "has 'fow'; known are"),
@@ -122,7 +143,7 @@ def test_fields_of_view_of_the_height_are_turned_into_those_of_the_width():
         ('[{"origin": [0, 0, 1], "target": [0, 0]}]', "target is .*must be 3 finite numbers"),
         ('[{"origin": [0, 0, 1], "target": [0, 0, 1]}]', "at its target"),
         ('[{"to_world": [[1, 0, 0, 0]]}]', "must be 4 x 4"),
-        ('[{"to_world": [[0,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "cannot be inverted"),
+        ('[{"to_world": [[0,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]', "frame 0: the camera's matrix flattens space"),
         ('[{"origin": [0, 0, 1], "target": [0, 0, 0], "fov": 190}]', "between 0 and 180"),
         ('[{"origin": [0, 0, 1], "target": [0, 0, 0], "fov": NaN}]', "finite number"),
         (

@@ -55,6 +55,30 @@ def test_noise_falls_and_texture_stays(room, name):
     assert image.mean() == pytest.approx(clean.mean(), rel=0.03)
 
 
+@pytest.mark.parametrize("variance", [None, np.inf, 1e38])
+def test_one_pixel_of_1e30_leaves_nfor_the_others(room, variance):
+    stack, clean = room
+    usual = reconstruct(stack, "nfor").image
+    primal, variances = stack["primal"].copy(), stack["primal_var"].copy()
+    primal[10, 9] = 1e30
+    if variance is not None:
+        variances[10, 9] = variance
+    image = reconstruct(stack.replace(primal=primal, primal_var=variances), "nfor").image
+    assert np.isfinite(image).all()
+    far = np.ones(image.shape[:2], bool)
+    far[:21, :20] = False  # its neighbourhood
+    assert np.median(np.abs(image - usual)[far] / clean[far]) < 0.01
+
+
+@pytest.mark.parametrize("power", [-100, -60, 60, 100])
+def test_nfor_scales_with_the_image_to_the_bit(room, power):
+    stack, _ = room
+    silent = stack.replace(primal_var=0 * stack["primal_var"])
+    scaled = silent.replace(primal=np.ldexp(silent["primal"], power))
+    image = reconstruct(silent, "nfor").image
+    assert np.array_equal(np.ldexp(reconstruct(scaled, "nfor").image, -power), image)
+
+
 @pytest.mark.parametrize("name", ["nfor", "nlm"])
 def test_exposure_only_scales(room, name):
     if METHODS[name].missing():

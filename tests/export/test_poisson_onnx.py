@@ -48,7 +48,7 @@ def test_command(tmp_path, capfd):
     target = tmp_path / "l2.onnx"
     assert main(["-o", str(target)]) == 0
     assert ort.InferenceSession(target, providers=["CPUExecutionProvider"]).get_inputs()[0].name == "primal"
-    assert main(["-o", str(target)]) == 2
+    assert main(["-o", str(target)]) == 1
     assert main(["-o", str(tmp_path / "b.onnx"), "--alpha", "-1"]) == 2
     assert "alpha -1.0: must be a positive number" in capfd.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["l2.onnx"]

@@ -1,4 +1,4 @@
-"""Ctrl-C, and output that nobody takes: one line or none, a status that says so, and no traceback."""
+"""Ctrl-C, SIGTERM, and output that nobody takes: one line or none, a status that says so, and no traceback."""
 
 import fcntl
 import os
@@ -23,55 +23,110 @@ from processes import (
 )
 from reliability import record
 
-INTERRUPTED = "interrupted, status 130, one line"
-EARLY = "while Python starts and imports its own modules: its traceback"
+import ngpt
+from ngpt.system.console import run_command
+
+SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM}
+EARLY = "while Python starts and imports its own modules: as Python does"
 DONE = "done before"
+NGPT = (sys.executable, "-m", "ngpt")
 
 
-def interrupt_campaign(kind, folder, interrupts):
-    """Ctrl-C at moments spread over a whole run."""
+def interrupt_campaign(kind, folder, interrupts, name):
+    """Ctrl-C or SIGTERM at moments spread over a whole run."""
+    number = SIGNALS[name]
+    interrupted = f"interrupted, status {128 + number}, one line"
     job, rng, clock = make_work(kind, folder), np.random.default_rng(2), time.monotonic()
     out = folder / "out"
     assert complete(job.arguments(out)).returncode == 0
-    duration, outcomes = time.monotonic() - clock, {INTERRUPTED: 0, EARLY: 0, DONE: 0}
+    duration, outcomes = time.monotonic() - clock, {interrupted: 0, EARLY: 0, DONE: 0}
     for i in range(interrupts):
         out = folder / f"out{i}"
         arguments = job.arguments(out)
         with start(arguments) as process:
-            status = ended(process, rng.uniform(0, duration), signal.SIGINT)
+            status = ended(process, rng.uniform(0, duration), number)
             errors = process.stderr.read()
         assert half_written(out) == [] and temporary_files(out) == []
-        # Python sends itself the signal where it was inside of `exec`, which is 130 for a shell, too.
-        if status == 130 or (status == -signal.SIGINT and one_error(errors)):
+        if status == 128 + number:
             # train.py says on standard output that it stops, and keeps what it has learnt.
             assert one_error(errors) or (kind == "train" and ": error: " not in errors), errors
-            outcomes[INTERRUPTED] += 1
+            outcomes[interrupted] += 1
         else:
-            early = status == -signal.SIGINT or "Fatal Python error: init" in errors
+            early = status == -number or "Fatal Python error: init" in errors
             assert (early or status == 0) and "in run_command" not in errors, (status, errors)
+            assert ": error: " not in errors, (status, errors)
             outcomes[EARLY if status else DONE] += 1
-    assert outcomes[INTERRUPTED]
-    record(f"Ctrl-C at random moments of {job.name}", interrupts, outcomes, seconds=round(time.monotonic() - clock))
+    assert outcomes[interrupted]
+    record(f"{name} at random moments of {job.name}", interrupts, outcomes, seconds=round(time.monotonic() - clock))
 
 
-@pytest.mark.parametrize("kind", ["denoise", "export"])
-def test_a_few_interrupts(tmp_path, kind):
-    interrupt_campaign(kind, tmp_path, 4)
+@pytest.mark.parametrize(("kind", "name"), [("denoise", "Ctrl-C"), ("denoise", "SIGTERM"), ("export", "Ctrl-C")])
+def test_a_few_interrupts(tmp_path, kind, name):
+    interrupt_campaign(kind, tmp_path, 4, name)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
+@pytest.mark.parametrize("name", SIGNALS)
 @pytest.mark.parametrize("kind", COMMANDS)
-def test_many_interrupts(tmp_path, kind):
-    interrupt_campaign(kind, tmp_path, 20)
+def test_many_interrupts(tmp_path, kind, name):
+    interrupt_campaign(kind, tmp_path, 20, name)
+
+
+def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
+    """As a queue ends a job that has used up its time."""
+    pytest.importorskip("mitsuba")
+    out = tmp_path / "s.exr"
+    words = ["diffuse", "--size", "48x32", "--sampler", "primal", "--spp", 2_000_000_000, "-o", out]
+    with start([*NGPT, "render", *words]) as process:
+        assert ": 0/" in process.stderr.readline()  # progress, as the first pass begins
+        process.terminate()
+        errors = process.stderr.read()
+        assert process.wait(60) == 143
+    spp = ngpt.read(out).attributes["ngpt:spp"]
+    assert spp > 0 and one_error(errors) and f"interrupted: {out} holds the {spp} samples per pixel" in errors
+    assert os.listdir(tmp_path) == ["s.exr"]
+
+
+@pytest.mark.parametrize("name", SIGNALS)
+def test_the_status_is_told_wherever_it_comes(name, tmp_path):
+    """Python 3.11 ends itself by SIGINT after a KeyboardInterrupt in code that was compiled from a text."""
+    (tmp_path / "texts.py").write_text(
+        "import os, sys\nfrom ngpt.system.console import run_command\n"
+        f"sys.exit(run_command(lambda: exec('os.kill(os.getpid(), {int(SIGNALS[name])}); [0 for i in range(9)]')))"
+    )
+    run = complete([sys.executable, "-m", "texts"], cwd=tmp_path)
+    assert (run.returncode, run.stderr) == (128 + SIGNALS[name], "ngpt: error: interrupted\n")
+
+
+def test_a_second_sigterm_discards_them():
+    from data_gen.session import stop_on_ctrl_c
+
+    def run():
+        with stop_on_ctrl_c() as stop:
+            os.kill(os.getpid(), signal.SIGTERM)
+            assert stop() and stop.status == 143
+            os.kill(os.getpid(), signal.SIGTERM)
+        return 0
+
+    before = [signal.getsignal(number) for number in SIGNALS.values()]
+    assert run_command(run) == 143
+    assert [signal.getsignal(number) for number in SIGNALS.values()] == before
+
+
+def test_handlers_of_others_stay(capfd):
+    """A host that has one of its own for SIGTERM, and runs a command within itself."""
+    got = []
+    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
+    try:
+        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def shell(line, *arguments):
     """Runs a line of shell in which "$@" is a command."""
     return complete(["bash", "-c", f"set -o pipefail; {line}", "bash", *arguments])
-
-
-NGPT = (sys.executable, "-m", "ngpt")
 
 
 @pytest.fixture(scope="module")
@@ -139,7 +194,7 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
 
 def test_results_that_cannot_be_printed_are_an_error(stack):
     run = shell('"$@" > /dev/full', *NGPT, "info", stack, "--json")
-    assert run.returncode == 2 and one_error(run.stderr) and "No space left" in run.stderr
+    assert run.returncode == 1 and one_error(run.stderr) and "No space left" in run.stderr
 
 
 def test_a_reader_that_takes_its_time_gets_everything(stack):

@@ -110,10 +110,11 @@ def test_workers_end_with_a_killed_parent_and_its_lock_does_too(pool, tmp_path):
         pass
 
 
-def test_workers_end_with_an_interrupted_parent_without_a_word(pool):
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_workers_end_with_an_interrupted_parent_without_a_word(pool, number):
     workers = children(pool.pid)
-    pool.send_signal(signal.SIGINT)
-    assert pool.wait(20) == 130
+    pool.send_signal(number)
+    assert pool.wait(20) == 128 + number
     assert pool.stderr.read() == "ngpt: error: interrupted\n"
     assert wait_for(lambda: not any(running(pid) for pid in workers), 20)
 

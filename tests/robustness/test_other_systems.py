@@ -100,7 +100,7 @@ def test_the_same_image(tmp_path, python, options):
     np.testing.assert_allclose(ngpt.read_image(out), expected, rtol=1e-4, atol=1e-5)
     assert temporary_files(tmp_path) == []
     again = run(python, "-m", "ngpt", "denoise", source, "-o", out, *options)
-    assert again.returncode == 2 and "exists already" in again.stderr and one_error(again.stderr)
+    assert again.returncode == 1 and "exists already" in again.stderr and one_error(again.stderr)
 
 
 def test_letters_that_the_terminal_lacks(tmp_path, python):

@@ -176,7 +176,7 @@ def test_a_folder_that_another_run_writes_to_is_refused(tmp_path, kind):
     with start([sys.executable, "-c", code, out], stdin=-1, stdout=-1) as other:
         other.stdout.readline()
         run = complete(job.arguments(out))
-        assert run.returncode == 2 and "another process is writing there" in run.stderr and one_error(run.stderr)
+        assert run.returncode == 1 and "another process is writing there" in run.stderr and one_error(run.stderr)
         other.stdin.write("\n")
         other.stdin.close()
     assert complete(job.arguments(out)).returncode == 0

@@ -55,7 +55,7 @@ def test_files_that_cannot_be_read(tmp_path, reader, data):
         path.write_bytes(data)
     with pytest.raises(NgptError) as caught:
         reader(path)
-    assert str(caught.value).startswith(f"{path}: cannot be read: ")
+    assert str(caught.value).startswith(f"{path}: not found" if data is None else f"{path}: cannot be read: ")
     with pytest.raises(NgptError, match=r"^here: cannot be read: "):
         parse_json("[", "here")
 

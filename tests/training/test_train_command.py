@@ -79,17 +79,18 @@ def test_a_dry_run_says_what_it_would_cost(train):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "complaint"),
+    ("arguments", "expected", "complaint"),
     [
-        (["--config", "nowhere.toml", "--dry-run"], "nowhere.toml: cannot be read"),
-        (["--config", "configs/fast.toml"], "--out is missing"),
-        (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], "no such folder"),
-        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], "choose one of"),
+        (["--config", "nowhere.toml", "--dry-run"], 1, "nowhere.toml: cannot be read"),
+        (["--config", "configs/fast.toml"], 2, "--out is missing"),
+        (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], 1, "no such folder"),
+        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], 1, "choose one of"),
+        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base"], 2, "give it as table.key=value"),
     ],
 )
-def test_mistakes_end_in_one_line(train, tmp_path, arguments, complaint):
+def test_mistakes_end_in_one_line(train, tmp_path, arguments, expected, complaint):
     status, _, errors = train(*[str(tmp_path) if a == "OUT" else a for a in arguments])
-    assert status == 2
+    assert status == expected
     assert complaint in errors and errors.count("\n") == 1
 
 

@@ -94,7 +94,7 @@ def main(arguments: list[str] | None = None) -> int:
         path = build(given.output, given.runtime, given.example, given.model, given.force)
     except NgptError as error:
         print(f"error: {error}", file=sys.stderr)
-        return 2
+        return 1
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB")
     return 0
 

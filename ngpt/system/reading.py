@@ -1,0 +1,53 @@
+"""Input files: regular ones, and no more of them than makes sense."""
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import BinaryIO
+
+from ngpt.errors import NgptError
+
+MOST_TEXT = 2**28  # bytes of a configuration or a record
+
+
+@contextmanager
+def regular_file(path: Path) -> Iterator[BinaryIO]:
+    """The file, opened for reading; pipes and devices, which may keep a reader waiting for ever, are refused."""
+    try:
+        file = open(path, "rb", opener=_open_at_once)  # noqa: SIM115
+    except FileNotFoundError:
+        raise NgptError(f"{path}: not found; check the name") from None
+    except (OSError, ValueError) as error:  # ValueError: a name with a zero in it
+        if os.path.isdir(path):  # which not every system says in its error
+            raise NgptError(f"{path}: is a directory; name a file in it") from None
+        raise NgptError(f"{path}: cannot be read: {getattr(error, 'strerror', '') or error}") from error
+    with file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise NgptError(f"{path}: is a pipe or a device, no file; save it to disk first")
+        try:
+            yield file
+        except OSError as error:
+            raise NgptError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _open_at_once(name: str, flags: int) -> int:
+    return os.open(name, flags | getattr(os, "O_NONBLOCK", 0))
+
+
+def read_bytes(path: str | Path, most: int) -> bytes:
+    """All of a regular file; raises NgptError where that cannot be read, and where it has more than ``most`` bytes."""
+    with regular_file(Path(path)) as file:
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise NgptError(f"{path}: is larger than {most >> 20} MiB, the most that is read of such a file")
+    return data
+
+
+def read_text(path: str | Path) -> str:
+    """The text of a regular file, at most ``MOST_TEXT`` bytes of UTF-8; raises NgptError for anything else."""
+    try:
+        return read_bytes(path, MOST_TEXT).decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise NgptError(f"{path}: cannot be read: {error}") from error

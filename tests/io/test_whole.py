@@ -1,0 +1,72 @@
+"""Whole files are told from cut ones by their tables."""
+
+import os
+
+import numpy as np
+import OpenEXR
+import pytest
+from exr_files import write_levels, write_raw
+from full_stack import full_stack
+
+import ngpt
+from ngpt.io.header import read_headers
+from ngpt.io.whole import finished
+
+PIXELS = np.random.default_rng(3).random((70, 50)).astype(np.float32)
+
+
+def tiles(across, down):
+    described = OpenEXR.TileDescription()
+    described.xSize, described.ySize = across, down
+    return described
+
+
+def scanlines(path):
+    ngpt.write(path, full_stack(40, 50, seed=1))
+
+
+def tiled(path):
+    write_raw(path, ({"Y": PIXELS}, {"type": OpenEXR.tiledimage, "tiles": tiles(16, 32)}))
+
+
+def parts(path):
+    second = {"type": OpenEXR.tiledimage, "tiles": tiles(16, 16)}
+    write_raw(path, ({"Y": PIXELS}, {}, "a"), ({"Y": PIXELS}, second, "b"))
+
+
+def levels(path):
+    write_levels(path, np.ones((4, 4, 3)), rip=False)
+
+
+@pytest.mark.parametrize("make", [scanlines, tiled, parts, levels])
+def test_a_file_is_finished_and_no_beginning_of_it_is(tmp_path, make):
+    path = tmp_path / "a.exr"
+    make(path)
+    assert finished(path)
+    data = path.read_bytes()
+    # The smaller levels, which nobody reads, may be cut.
+    least = 0.8 if make is levels else 1.0
+    for size in [0, 3, 8, *np.linspace(9, least * len(data) - 1, 60).astype(int)]:
+        path.write_bytes(data[:size])
+        assert not finished(path), f"{size} of {len(data)} bytes"
+    path.unlink()
+    assert not finished(path)
+
+
+def test_a_table_that_was_never_filled_in_is_seen(tmp_path):
+    path = tmp_path / "a.exr"
+    scanlines(path)
+    data = bytearray(path.read_bytes())
+    with open(path, "rb") as file:
+        (part,) = read_headers(file, "a")
+        begin = file.tell()
+    data[begin : begin + 8 * part.table] = bytes(8 * part.table)
+    path.write_bytes(data)
+    assert not finished(path)
+    path.write_bytes(b"\xff" * len(data))
+    assert not finished(path)
+
+
+def test_what_is_no_file_is_not_ours_to_replace(tmp_path):
+    os.mkfifo(tmp_path / "pipe.exr")
+    assert finished(tmp_path / "pipe.exr") and finished(tmp_path)
