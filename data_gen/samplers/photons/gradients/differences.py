@@ -17,6 +17,7 @@ from data_gen.paths.world import World
 from data_gen.samplers.photons.gradients.camera import Level
 from data_gen.samplers.photons.gradients.near import Near
 from data_gen.samplers.photons.gradients.pairs import Pairs, pieces
+from data_gen.samplers.photons.map.edges import spread
 from data_gen.samplers.photons.passes import Begun, Passes
 
 # Levels are joined until they have so many paths for each camera sample.
@@ -136,7 +137,9 @@ def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most
     """Of what is ``near`` to a level's paths, the differences."""
     at_surfaces = passes.walk.at_surfaces(level, passes.frozen)
     if near.on_surfaces is not None:
-        yield from differences(passes, near.on_surfaces, at_surfaces, longest, most)
+        receivers = passes.frozen(spread_out, near.on_surfaces, passes.world, at_surfaces)
+        dr.eval(receivers)
+        yield from differences(passes, near.on_surfaces, receivers, longest, most)
     if near.in_media is not None:
         yield from differences(passes, near.in_media, level.paths, longest, most)
 
@@ -175,6 +178,16 @@ class Found:
     Δ: list  # gradient samples, with the thing for its own copy; where it is not, with none
     shifts: mi.Float  # that the pair takes part in
     apart: list  # of each shift whether a copy is to be looked for
+
+
+def spread_out(near: Near, world: World, paths: list) -> list:
+    """Paths that end at surfaces, their β times π r² / A: of each its own."""
+    weighted = []
+    for path in paths:
+        x = path.vertex()
+        receives = path.alive & x.is_valid() & world.materials.connectable(x.bsdf())
+        weighted.append(replace(path, β=path.β * spread(world, x, near.radius2, receives)))
+    return weighted
 
 
 def where(near: Near, world: World, base: Any) -> tuple:
