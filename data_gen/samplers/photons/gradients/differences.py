@@ -17,7 +17,6 @@ from data_gen.paths.world import World
 from data_gen.samplers.photons.gradients.camera import Level
 from data_gen.samplers.photons.gradients.near import Near
 from data_gen.samplers.photons.gradients.pairs import Pairs, pieces
-from data_gen.samplers.photons.map.edges import spread
 from data_gen.samplers.photons.passes import Begun, Passes
 
 # Levels are joined until they have so many paths for each camera sample.
@@ -31,7 +30,7 @@ PAIR_BYTES = 192
 class Gathered:
     """What is near to camera paths in a photon map, or in a part of it."""
 
-    on_surfaces: Near | None
+    on_surfaces: Any  # ``gpm.OnSurfaces`` or None
     in_media: Near | None = None
 
 
@@ -180,14 +179,8 @@ class Found:
     apart: list  # of each shift whether a copy is to be looked for
 
 
-def spread_out(near: Near, world: World, paths: list) -> list:
-    """Paths that end at surfaces, their β times π r² / A: of each its own."""
-    weighted = []
-    for path in paths:
-        x = path.vertex()
-        receives = path.alive & x.is_valid() & world.materials.connectable(x.bsdf())
-        weighted.append(replace(path, β=path.β * spread(world, x, near.radius2, receives)))
-    return weighted
+def spread_out(near: Any, world: World, paths: list) -> list:
+    return near.spread(world, paths)
 
 
 def where(near: Near, world: World, base: Any) -> tuple:

@@ -39,7 +39,7 @@ from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
-from data_gen.samplers.photons.map.edges import spread
+from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import faces, light, photon_of
 from data_gen.samplers.photons.map.vertices import on_surfaces
@@ -55,6 +55,7 @@ class Gathering:
     grid: Grid
     radius2: mi.Float
     K: mi.Float  # 1 / (π r² N)
+    number: mi.UInt32  # of the pass
     max_depth: mi.UInt32
 
     def __init__(self, world: World, traced: Traced, max_depth: int):
@@ -62,7 +63,7 @@ class Gathering:
         self.grid = Grid(self.photons.p, on_surfaces(self.photons), radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
-        self.max_depth = dr.opaque(mi.UInt32, max_depth)
+        self.number, self.max_depth = number_of(traced.seed, traced.number), dr.opaque(mi.UInt32, max_depth)
 
     def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
@@ -74,7 +75,7 @@ class Gathering:
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
         L = self.grid.gather(si.p, self.radius2, active, one, zero)
-        return self.K * spread(self.world, si, self.radius2, active) * L
+        return self.K * L * spread(self.world, si, self.radius2, self.number, active & (dr.max(L) > 0))
 
 
 class PPM(PhotonIntegrator):
