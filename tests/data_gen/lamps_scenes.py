@@ -31,7 +31,10 @@ def lamps() -> dict:
 
 
 def lit_by(only=None, fog: bool = False) -> dict:
-    """A floor, a lacquered wall and a ball lit by all ``lamps``, or by one; in a box of fog, or not."""
+    """A floor, a lacquered wall and a ball lit by all ``lamps``, or by one; in a box of fog, or not.
+
+    Lamps hide from the camera: their edges would be noisier than all that is gathered.
+    """
     import mitsuba as mi
 
     from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere, _wall
@@ -39,10 +42,10 @@ def lit_by(only=None, fog: bool = False) -> dict:
     lacquer = {"type": "roughplastic", "alpha": 0.3, "nonlinear": True, "diffuse_reflectance": _rgb(0.3, 0.5, 0.7)}
     lit = {
         "type": "scene",
-        "integrator": {"type": "volpath" if fog else "path", "max_depth": 4, "rr_depth": 2},
+        "integrator": {"type": "volpath" if fog else "path", "max_depth": 4, "rr_depth": 2, "hide_emitters": True},
         "sensor": _camera([0.3, 1.2, 4], [0, 0.7, 0], 36),
-        "floor": _wall([0, 0, 0], [0, 1, 0], (4, 4), _diffuse(0.6, 0.5, 0.4)),
-        "wall": _wall([0, 1, -1], [0.2, 0, 1], (4, 2.4), {"type": "twosided", "nested": lacquer}),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (2.6, 2.6), _diffuse(0.6, 0.5, 0.4)),
+        "wall": _wall([0, 1, -1], [0.2, 0, 1], (2.6, 2), {"type": "twosided", "nested": lacquer}),
         "ball": _sphere([-0.5, 0.5, 0.2], 0.45, _diffuse(0.5, 0.6, 0.3)),
     }
     lit |= {name: lamp for name, lamp in lamps().items() if only in (None, name)}
