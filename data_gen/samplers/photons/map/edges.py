@@ -53,8 +53,8 @@ def spread(world: World, x: mi.SurfaceInteraction3f, radius2: mi.Float, number: 
     while dr.hint(going, label="probes of edges"):
         if begins:
             total += term
-            u = [mi.Float(number >> 8) * 2.0**-24 for number in mi.sample_tea_32(place, rays, ROUNDS)]
-            disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(*u))
+            u, v = mi.sample_tea_32(place, rays, ROUNDS)
+            disk = mi.warp.square_to_uniform_disk_concentric(mi.Point2f(u >> 8, v >> 8) * 2.0**-24)
             half = dr.sqrt(radius2 * dr.maximum(1 - dr.squared_norm(disk), 0))
             ray.o = x.p + frame.to_world(mi.Vector3f(disk.x, disk.y, 0)) * radius + n * half
             ray.maxt = 2 * half
