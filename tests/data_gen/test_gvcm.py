@@ -182,7 +182,7 @@ class Beside:
             old = getattr(kept.vertices, name)
             setattr(kept.vertices, name, type(old)(value) + dr.zeros(type(old), n))
         kept.photon = dr.full(mi.UInt32, 1, n)
-        self.photons = Photons(kept, radius, n)
+        self.photons = Photons(kept, radius, n, mi.UInt32(0))
         self.places = np.array(z.si.p).T, np.array(z.si.p + aside).T
         self.merging = ShiftedMerging(self.photons, copies.plan)
 

@@ -41,6 +41,7 @@ class Traced:
     starts: LightRay  # the light's end of each light path
     paths: int  # light paths of the pass
     number: int  # of the pass
+    seed: int  # of the render
     first_radius: float  # that photons are gathered within in pass 0
 
     def radius(self, dimension: int = 2) -> float:
@@ -106,7 +107,7 @@ class PhotonIntegrator(GradientIntegrator):
         edges = self.edges and world.fog is not None
         starts, maps = trace(world, random, limits.max_depth - 1, limits.rr_depth, frozen=passes.frozen, edges=edges)
         for photons in maps:
-            yield Traced(photons, starts, n, camera.first, self.options["radius"] * passes.width)
+            yield Traced(photons, starts, n, camera.first, camera.seed, self.options["radius"] * passes.width)
 
 
 def _refuse_lamps_never_chosen(scene, sampler: str) -> None:

@@ -41,24 +41,30 @@ class ShiftedMerging(Merging):
             for offset, y, material in zip(offsets, vertices, materials, strict=True)
         ]
 
+        # Along with the base path, or not at all
+        alike = [~(offset.apart | offset.joined) for offset in offsets]
+        area = self.spread(z.si, active)
+        areas = [
+            dr.select(offset.apart, self.spread(y, active & offset.apart & own), area)
+            for offset, y, own in zip(offsets, vertices, receives, strict=True)
+        ]
+
         def one_more(sums, i, near):
             """The ``sums`` of light and of Δ, with photon ``i`` of the grid."""
             # --------------------- At the base path ----------------------
             photon, end, near = self.photon(i, z, near)
             g, p, q = brought(photon, z.si, bsdf, near)
             g = dr.select(near & dr.isfinite(dr.sum(g)), g, 0)
-            C, others = z.β * g, mis.others_merged(z.end, q, end, p, photons.η)
+            C, others = z.β * g * area, mis.others_merged(z.end, q, end, p, photons.η)
             lit, found = dr.max(C) > 0, []
 
             # ----------------------- At each copy ------------------------
-            for offset, y, material, own in zip(offsets, vertices, materials, receives, strict=True):
+            for k, (offset, y, material, own) in enumerate(zip(offsets, vertices, materials, receives, strict=True)):
                 own = own & lit & (offset.joined | is_near(photon, y, photons.radius2))
                 g1, p1, q1 = brought(photon, y, material, own)
-                # Along with the base path, or not at all
-                alike = ~(offset.apart | offset.joined)
-                g1 = dr.select(alike, g, dr.select(own, g1, 0))
-                p1, q1 = dr.select(alike, p, p1), dr.select(alike, q, q1)
-                C1, others1 = offset.β * g1, mis.others_merged(offset.end, q1, end, p1, photons.η)
+                g1 = dr.select(alike[k], g, dr.select(own, g1, 0))
+                p1, q1 = dr.select(alike[k], p, p1), dr.select(alike[k], q, q1)
+                C1, others1 = offset.β * g1 * areas[k], mis.others_merged(offset.end, q1, end, p1, photons.η)
                 own_map = difference_of_one(C, others, C1, offset.r, others1)
                 found.append(dr.select(offset.apart, own_map, difference(C, others, C1, offset.r, others1)))
             return tuple(total + one for total, one in zip(sums, (weighted(C, others), *found), strict=True))

@@ -62,7 +62,7 @@ class GVCM(VCM):
         dr.eval(sight.ray, sight.importance, shifted)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
         if self.plan(world).joins:
-            photons, sight, marks = self.light_pass(passes, sight, camera.first, film.splats("primal"))
+            photons, sight, marks = self.light_pass(passes, sight, camera, film.splats("primal"))
             self.shift_splats(passes, camera, film, marks, photons.η)
         L, Le, Δ = frozen(self.shifted_camera_pass, world, sight, shifted, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}

@@ -45,6 +45,7 @@ from data_gen.samplers.bdpt.integrator import BDPT, Splatter
 from data_gen.samplers.bdpt.integrator import refuse as refuse_camera
 from data_gen.samplers.bdpt.light_path import light_path
 from data_gen.samplers.common import like_path
+from data_gen.samplers.photons.map.edges import number_of
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.passes import Passes, refuse_variants
 from data_gen.samplers.vcm.merging import VERTEX_BYTES, Keeper, Map, Merging, Photons, eta
@@ -109,7 +110,7 @@ class VCM(BDPT):
         dr.eval(sight.ray, sight.importance)
         values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
         if self.plan(world).joins:
-            photons, sight, _ = self.light_pass(passes, sight, camera.first, film.splats("primal"))
+            photons, sight, _ = self.light_pass(passes, sight, camera, film.splats("primal"))
         L, Le = frozen(self.camera_pass, world, sight, photons, fixed=True)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         dr.eval(values)
@@ -117,17 +118,20 @@ class VCM(BDPT):
 
     # ----------------------- Light paths: splats, and photons ------------------------
 
-    def light_pass(self, passes: Passes, sight: Sight, number: int, splats: Splats) -> tuple[Photons, Sight, Any]:
-        """The light paths of pass ``number``, whose ends at the camera are splatted: their vertices as photons, the
+    def light_pass(
+        self, passes: Passes, sight: Sight, camera: CameraSamples, splats: Splats
+    ) -> tuple[Photons, Sight, Any]:
+        """The light paths of a pass, whose ends at the camera are splatted: their vertices as photons, the
         ``sight`` with random numbers to go on by, and the splatter's state."""
-        n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(number)
+        n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
         kept, numbers, state, sums = passes.frozen(
             self.light_paths, passes.world, sight, η, empty, fixed=True, sums=splats.zeros
         )
         dr.eval(kept, numbers, state, sums)
         splats.take(sums)
-        return Photons(kept, radius, n), replace(sight, random=type(sight.random)(numbers)), state
+        photons = Photons(kept, radius, n, number_of(camera.seed, camera.first))
+        return photons, replace(sight, random=type(sight.random)(numbers)), state
 
     def light_paths(self, world: World, sight: Sight, η: mi.Float, empty: Map, sums: tuple) -> tuple:
         """Fills the ``empty`` map and the ``sums`` of splats; with them random numbers, and the splatter's state."""

@@ -19,6 +19,7 @@ from data_gen.samplers.bdpt.light_path import LightPath, Seen, Visitor
 from data_gen.samplers.bdpt.mis import Partial
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.bdpt.vertex import RADIANCE, Vertex, evaluate, record_class
+from data_gen.samplers.photons.map.edges import spread
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon, faces
 
@@ -92,9 +93,10 @@ class Photons:
     radius2: mi.Float
     K: mi.Float
     η: mi.Float
+    number: mi.UInt32  # of the pass
 
-    def __init__(self, kept: Map, radius: float, paths: int):
-        self.kept, vertices = kept, kept.vertices
+    def __init__(self, kept: Map, radius: float, paths: int, number: mi.UInt32):
+        self.kept, self.number, vertices = kept, number, kept.vertices
         exist = (vertices.depth > 0) & (kept.photon > 0)
         self.grid = Grid(mi.Point3f(vertices.o + vertices.d * vertices.t), exist, radius)
         self.radius2, self.η = dr.opaque(mi.Float, radius**2), dr.opaque(mi.Float, eta(radius, paths))
@@ -105,7 +107,7 @@ class Merging:
     """Merges camera paths of at most ``plan.longest`` edges, photons and theirs together; as ``bdpt`` asks for it."""
 
     def __init__(self, photons: Photons, plan: Plan):
-        self.photons, self.materials, self.longest = photons, plan.materials, plan.longest
+        self.photons, self.plan, self.materials, self.longest = photons, plan, plan.materials, plan.longest
 
     def light(self, z: Vertex, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Spectrum:
         """That of the photons near to the vertex ``z``, weighted."""
@@ -118,7 +120,12 @@ class Merging:
             return dr.select(near & dr.isfinite(dr.sum(C)), C, 0)
 
         zero = dr.zeros(mi.Spectrum, dr.width(z.depth))
-        return photons.K * photons.grid.gather(z.si.p, photons.radius2, active, one, zero)
+        L = photons.grid.gather(z.si.p, photons.radius2, active, one, zero)
+        return photons.K * L * self.spread(z.si, active & (dr.max(L) > 0))
+
+    def spread(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Float:
+        """What K is to be multiplied by at a vertex: along edges there is less area. Weights stay as they are."""
+        return spread(self.plan, x, self.photons.radius2, self.photons.number, active)
 
     def photon(self, i: mi.UInt32, z: Vertex, near: mi.Bool) -> tuple[Photon, Partial, mi.Bool]:
         """The photon of place ``i`` in the grid, ``near`` to z; its light path's end; and whether it is gathered."""

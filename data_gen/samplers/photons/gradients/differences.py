@@ -30,7 +30,7 @@ PAIR_BYTES = 192
 class Gathered:
     """What is near to camera paths in a photon map, or in a part of it."""
 
-    on_surfaces: Near | None
+    on_surfaces: Any  # ``gpm.OnSurfaces`` or None
     in_media: Near | None = None
 
 
@@ -136,7 +136,9 @@ def parts(passes: Passes, near: Gathered, level: Level, longest: mi.UInt32, most
     """Of what is ``near`` to a level's paths, the differences."""
     at_surfaces = passes.walk.at_surfaces(level, passes.frozen)
     if near.on_surfaces is not None:
-        yield from differences(passes, near.on_surfaces, at_surfaces, longest, most)
+        receivers = passes.frozen(spread_out, near.on_surfaces, passes.world, at_surfaces)
+        dr.eval(receivers)
+        yield from differences(passes, near.on_surfaces, receivers, longest, most)
     if near.in_media is not None:
         yield from differences(passes, near.in_media, level.paths, longest, most)
 
@@ -175,6 +177,10 @@ class Found:
     Δ: list  # gradient samples, with the thing for its own copy; where it is not, with none
     shifts: mi.Float  # that the pair takes part in
     apart: list  # of each shift whether a copy is to be looked for
+
+
+def spread_out(near: Any, world: World, paths: list) -> list:
+    return near.spread(world, paths)
 
 
 def where(near: Near, world: World, base: Any) -> tuple:

@@ -251,7 +251,7 @@ class BEAMS(PhotonIntegrator):
 def among_beams(passes: Passes, traced: Traced) -> Iterator[Along]:
     """What is near in a photon map: photons on surfaces, and beams, some parts of them at a time."""
     max_depth, fog = passes.integrator.limits.max_depth, passes.world.fog
-    on_surfaces: Gathering | None = Gathering(traced, max_depth)
+    on_surfaces: Gathering | None = Gathering(passes.world, traced, max_depth)
     for parts in parts_of(passes, traced, PARTS * traced.paths):
         yield Along(on_surfaces, AlongBeams(parts, traced, max_depth, fog.media.grids))
         on_surfaces = None

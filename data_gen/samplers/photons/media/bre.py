@@ -137,7 +137,7 @@ class BRE(PhotonIntegrator):
 def beside_rays(passes: Passes, traced: Traced) -> Iterator[Along]:
     """What is near in a photon map: photons on surfaces, and beside rays."""
     max_depth = passes.integrator.limits.max_depth
-    yield Along(Gathering(traced, max_depth), AlongRays(passes.world.fog, traced, max_depth))
+    yield Along(Gathering(passes.world, traced, max_depth), AlongRays(passes.world.fog, traced, max_depth))
 
 
 def media_pass(integrator, passes: Passes, camera: CameraSamples, film: GradientFilm, near: Callable) -> None:
@@ -145,7 +145,7 @@ def media_pass(integrator, passes: Passes, camera: CameraSamples, film: Gradient
     begun = Begun.of(passes, camera)
     maps = integrator.maps(passes, camera)
     if passes.world.fog is None:
-        gathered = (Gathering(traced, integrator.limits.max_depth) for traced in maps)
+        gathered = (Gathering(passes.world, traced, integrator.limits.max_depth) for traced in maps)
     else:
         gathered = (one for traced in maps for one in near(passes, traced))
     image_pass(passes, begun, gathered, integrator.light, film)

@@ -28,6 +28,7 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths import media
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.world import World
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.integrator import MEDIA_MAP_BYTES, PhotonIntegrator, Traced
 from data_gen.samplers.photons.map.fog import Fog
@@ -103,11 +104,13 @@ class VPM(PhotonIntegrator):
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         begun = Begun.of(passes, camera)
         maps = self.maps(passes, camera)
-        image_pass(passes, begun, (self.near(passes.world.fog, traced) for traced in maps), self.light, film)
+        image_pass(passes, begun, (self.near(passes.world, traced) for traced in maps), self.light, film)
 
-    def near(self, fog: Fog | None, traced: Traced) -> Gathering | InBoth:
-        on_surfaces = Gathering(traced, self.limits.max_depth)
-        return InBoth(on_surfaces, GatheringInMedia(fog, traced, self.limits.max_depth)) if fog else on_surfaces
+    def near(self, world: World, traced: Traced) -> Gathering | InBoth:
+        on_surfaces = Gathering(world, traced, self.limits.max_depth)
+        if world.fog is None:
+            return on_surfaces
+        return InBoth(on_surfaces, GatheringInMedia(world.fog, traced, self.limits.max_depth))
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:
         return by_vertices(self, *path)

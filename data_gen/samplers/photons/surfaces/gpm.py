@@ -20,7 +20,7 @@ section 4.3; Gruson et al. 2018, "Gradient-Domain Volumetric Photon Density Esti
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -36,6 +36,7 @@ from data_gen.samplers.photons.gradients.copies import LightPaths, copy
 from data_gen.samplers.photons.gradients.differences import PAIR_BYTES, PAIRS, Gathered, chosen, gradient_pass
 from data_gen.samplers.photons.gradients.pairs import Points
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import Photon, is_near, light, photon_of
 from data_gen.samplers.photons.map.vertices import on_surfaces
@@ -62,12 +63,14 @@ class OnSurfaces:
     grid: Grid
     radius2: mi.Float
     K: mi.Float  # of the kernel, over N
+    number: mi.UInt32  # of the pass
 
     def __init__(self, traced: Traced):
         self.paths, radius = LightPaths(traced.starts, traced.photons), traced.radius()
         self.grid = Grid(traced.photons.p, on_surfaces(traced.photons), radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
+        self.number = number_of(traced.seed, traced.number)
 
     def where(self, world: World, base: Path) -> tuple[Points, mi.Bool]:
         x = base.vertex()
@@ -77,6 +80,15 @@ class OnSurfaces:
         o, d, hit, β, alive = chosen(fields_of, paths, which, index)
         x = hit.compute_surface_interaction(mi.Ray3f(o, d))
         return AtVertex(x, β, alive & x.is_valid() & world.materials.connectable(x.bsdf()))
+
+    def spread(self, world: World, paths: list[Path]) -> list[Path]:
+        """The paths, their β times π r² / A: of each its own."""
+        return [self.spread_one(world, path) for path in paths]
+
+    def spread_one(self, world: World, path: Path) -> Path:
+        x = path.vertex()
+        receives = path.alive & x.is_valid() & world.materials.connectable(x.bsdf())
+        return replace(path, β=path.β * spread(world, x, self.radius2, self.number, receives))
 
     def thing(self, place: mi.UInt32) -> Photon:
         return photon_of(self.paths.photons, dr.gather(mi.UInt32, self.grid.index, place))

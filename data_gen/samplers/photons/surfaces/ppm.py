@@ -6,7 +6,8 @@ a radius of the point that the camera path meets. That blurs the light over the 
 
     x           a vertex of the camera path, at a material that scatters widely
     b, d, Φ     a photon within radius r of it, the direction it came along, its power
-    L(x)        Σ f(x; -d) Φ / (π r² N),    N: light paths of the pass
+    A           area of what photons are gathered from: π r², and less along edges (edges.py)
+    L(x)        Σ f(x; -d) Φ / (A N),    N: light paths of the pass
     β           throughput of the camera path
 
 A camera path goes on by mirrors, glass, sharp gloss and holes. It ends where light is scattered smoothly by a material
@@ -38,6 +39,7 @@ from data_gen.paths.world import World
 from data_gen.samplers.bdpt.vertex import RADIANCE, context
 from data_gen.samplers.common import like_path
 from data_gen.samplers.photons.integrator import PhotonIntegrator, Traced
+from data_gen.samplers.photons.map.edges import number_of, spread
 from data_gen.samplers.photons.map.grid import Grid
 from data_gen.samplers.photons.map.photon import faces, light, photon_of
 from data_gen.samplers.photons.map.vertices import on_surfaces
@@ -48,18 +50,20 @@ from data_gen.samplers.photons.passes import Begun, Passes, Start
 class Gathering:
     """The photons of a map, where they are gathered on surfaces; for paths of at most ``max_depth`` edges."""
 
+    world: World
     photons: Any
     grid: Grid
     radius2: mi.Float
-    K: mi.Float  # of the kernel, over N
+    K: mi.Float  # 1 / (π r² N)
+    number: mi.UInt32  # of the pass
     max_depth: mi.UInt32
 
-    def __init__(self, traced: Traced, max_depth: int):
-        self.photons, radius = traced.photons, traced.radius()
+    def __init__(self, world: World, traced: Traced, max_depth: int):
+        self.world, self.photons, radius = world, traced.photons, traced.radius()
         self.grid = Grid(self.photons.p, on_surfaces(self.photons), radius)
         self.radius2 = dr.opaque(mi.Float, radius**2)
         self.K = dr.opaque(mi.Float, 1 / (np.pi * radius**2 * traced.paths))
-        self.max_depth = dr.opaque(mi.UInt32, max_depth)
+        self.number, self.max_depth = number_of(traced.seed, traced.number), dr.opaque(mi.UInt32, max_depth)
 
     def light(self, si, place: None, bsdf: mi.BSDFPtr, depth: mi.UInt32, active: mi.Bool) -> mi.Spectrum:
         """L(x) at the vertex ``si``, on a surface, behind ``depth`` edges, of paths that are not too long."""
@@ -70,7 +74,8 @@ class Gathering:
             return light(photon, si, bsdf, near & faces(photon, si) & (photon.depth <= longest))
 
         zero = dr.zeros(mi.Spectrum, dr.width(depth))
-        return self.K * self.grid.gather(si.p, self.radius2, active, one, zero)
+        L = self.grid.gather(si.p, self.radius2, active, one, zero)
+        return self.K * L * spread(self.world, si, self.radius2, self.number, active & (dr.max(L) > 0))
 
 
 class PPM(PhotonIntegrator):
@@ -96,7 +101,7 @@ class PPM(PhotonIntegrator):
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         begun = Begun.of(passes, camera)
-        near = (Gathering(traced, self.limits.max_depth) for traced in self.maps(passes, camera))
+        near = (Gathering(passes.world, traced, self.limits.max_depth) for traced in self.maps(passes, camera))
         image_pass(passes, begun, near, self.light, film)
 
     def light(self, *path) -> tuple[mi.Spectrum, mi.Spectrum]:

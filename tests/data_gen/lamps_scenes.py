@@ -1,0 +1,88 @@
+"""Lamps of all kinds that light can be traced from, over a floor before a wall."""
+
+import numpy as np
+
+
+def lamps() -> dict:
+    """Of each kind one: areas (a textured rectangle, a coarse mesh with smooth normals), points, and what is far."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _light, _rgb
+
+    rng, toward = np.random.default_rng(5), mi.ScalarTransform4f().look_at
+    texels = {"type": "bitmap", "bitmap": mi.Bitmap((rng.random((3, 5, 3)) ** 3 * 30).astype(np.float32)), "raw": True}
+    slide = {"type": "bitmap", "bitmap": mi.Bitmap(rng.random((4, 4, 3)).astype(np.float32)), "raw": True}
+    picture = {"type": "area", "radiance": texels, "sampling_weight": 2.5}
+    return {
+        "picture": _light([0.7, 1.8, 0.3], [0, -1, 0], (0.8, 0.5), (1, 1, 1)) | {"emitter": picture},
+        "glow": bowl([0.7, 0.45, 0.5], 0.25) | {"emitter": {"type": "area", "radiance": _rgb(4, 5, 2)}},
+        "point": {"type": "point", "position": [-0.8, 1.6, 1], "intensity": _rgb(1.5, 2, 2.5)},
+        "spot": {
+            "type": "spot",
+            "to_world": toward([1, 1.8, 1.2], [0, 0.2, 0], [0, 1, 0]),
+            "intensity": _rgb(12, 9, 7),
+            "cutoff_angle": 25,
+            "beam_width": 8,
+            "texture": slide,
+        },
+        "sun": {"type": "directional", "direction": [0.4, -1, -0.6], "irradiance": _rgb(1, 0.8, 0.5)},
+        "sky": {"type": "constant", "radiance": _rgb(0.2, 0.25, 0.4), "sampling_weight": 0.5},
+    }
+
+
+def lit_by(only=None, fog: bool = False) -> dict:
+    """A floor, a lacquered wall and a ball lit by all ``lamps``, or by one; in a box of fog, or not.
+
+    Lamps hide from the camera: their edges would be noisier than all that is gathered.
+    """
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _camera, _diffuse, _rgb, _sphere, _wall
+
+    lacquer = {"type": "roughplastic", "alpha": 0.3, "nonlinear": True, "diffuse_reflectance": _rgb(0.3, 0.5, 0.7)}
+    lit = {
+        "type": "scene",
+        "integrator": {"type": "volpath" if fog else "path", "max_depth": 4, "rr_depth": 2, "hide_emitters": True},
+        "sensor": _camera([0.3, 1.2, 4], [0, 0.7, 0], 36),
+        "floor": _wall([0, 0, 0], [0, 1, 0], (2.6, 2.6), _diffuse(0.6, 0.5, 0.4)),
+        "wall": _wall([0, 1, -1], [0.2, 0, 1], (2.6, 2), {"type": "twosided", "nested": lacquer}),
+        "ball": _sphere([-0.5, 0.5, 0.2], 0.45, _diffuse(0.5, 0.6, 0.3)),
+    }
+    lit |= {name: lamp for name, lamp in lamps().items() if only in (None, name)}
+    if fog:
+        air = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.3}
+        place = mi.ScalarTransform4f().translate([0, 1, 0.3]).scale([1.6, 0.95, 1.2])
+        lit["box"] = {"type": "cube", "to_world": place, "bsdf": {"type": "null"}, "interior": air}
+    return lit
+
+
+def bowl(centre, radius: float, rows: int = 6) -> dict:
+    """A sphere of few faces, which meet at up to 60 degrees, with the normals of a sphere at its vertices."""
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _diffuse
+
+    θ, φ = np.linspace(0.02, np.pi - 0.02, rows)[:, None], np.linspace(0, 2 * np.pi, rows + 1)[None, :-1]
+    normals = np.stack(np.broadcast_arrays(np.sin(θ) * np.cos(φ), np.cos(θ), np.sin(θ) * np.sin(φ)), -1).reshape(-1, 3)
+    faces = []
+    for i in range(rows - 1):
+        for j in range(rows):
+            a, b = i * rows + j, i * rows + (j + 1) % rows
+            faces += [[a, b, a + rows], [b, b + rows, a + rows]]
+    mesh = mi.Mesh("glow", len(normals), len(faces), has_vertex_normals=True)
+    params = mi.traverse(mesh)
+    params["vertex_positions"] = np.ravel(np.array(centre) + radius * normals).astype(np.float32)
+    params["vertex_normals"] = np.ravel(normals).astype(np.float32)
+    params["faces"] = np.ravel(faces).astype(np.uint32)
+    params.update()
+    path = _kept(mesh)
+    return {"type": "ply", "filename": path, "bsdf": _diffuse(0.5, 0.2, 0.1)}
+
+
+def _kept(mesh) -> str:
+    """Where a mesh is written to: Mitsuba takes none with normals and emitters from memory."""
+    import tempfile
+
+    path = f"{tempfile.mkdtemp()}/mesh.ply"
+    mesh.write_ply(path)
+    return path
