@@ -11,5 +11,6 @@ register(
         options={"features": Option(True, "albedo, normal, depth and emission seen directly")},
         gradients=False,
         tried=True,
+        by_place=True,
     )
 )
