@@ -108,7 +108,8 @@ def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndar
         emitter = dr.gather(mi.EmitterPtr, emitters, index)
         light, radiance = emitter.sample_direction(si, pair(), active)
         cos = dr.maximum(dr.dot(side.n, light.d), 0)
-        L = dr.mean(mi.unpolarized_spectrum(radiance)) * cos
+        # Of all colours: a red lamp has as much noise in one of them as a white one in each.
+        L = dr.sqrt(dr.mean(dr.square(mi.unpolarized_spectrum(radiance)))) * cos
         L *= dr.select(light.delta, 1, dr.rcp(1 + dr.square(cos * dr.inv_pi * n / light.pdf)))
         lit = active & (light.pdf > 0) & (L > 0)
         lit &= ~scene.ray_test(si.spawn_ray_to(light.p), lit)
