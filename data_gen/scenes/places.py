@@ -106,9 +106,11 @@ def learn(scene: mi.Scene, lamp: np.ndarray, squares: np.ndarray, at: np.ndarray
     lamps, side = len(whole), _SIDE
     while side > 1 and side**3 * lamps > _LARGEST:
         side //= 2
-    # Where all but a few vertices are: one far away would leave the others a single cell.
+    # Where all but a few vertices are: one far away would leave the others a single cell. By odd margins, since a wall
+    # between two cells would be in either by rounding alone, and a path and its shifted copy may not agree in which.
     low, high = np.quantile(at, 0.005, axis=0), np.quantile(at, 0.995, axis=0)
-    size = np.maximum((high - low) / side, 1e-6 * (high - low).max() + 1e-30)
+    extent = np.maximum(high - low, 1e-3 * (high - low).max() + 1e-30)
+    low, size = low - 0.0137 * extent, 1.0411 * extent / side
     cell = np.clip((at - low) / size, 0, side - 1).astype(int)
     means = np.full((1, 1, 1, lamps), np.nan)
     for cells in _doubling(side):
