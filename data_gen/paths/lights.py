@@ -27,14 +27,13 @@ class Lights:
     """
 
     def __init__(self, scene: mi.Scene, places: Places | None = None):
-        self.places = places
         lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
         far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
         uniform = [shape.emitter().class_name() == "AreaLight" and is_uniform(shape) for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
         self.shared = sum(uniform) + sum(far) == len(scene.emitters())
-
+        self.places = places
 
     def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
         """The direction sample of ``scene.sample_emitter_direction(x, u, False, active)``, its Le / p, and the lamp.
@@ -91,8 +90,8 @@ def replay_lamp(
 ) -> tuple[LightSample, mi.Float]:
     """The same of a lamp ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
 
-    Its ``p`` counts the probability P to choose the lamp at ``y``, its ``weight`` that at ``x``. P(y) / P(x), which is a
-    factor of r, is returned as well.
+    Its ``p`` counts the probability P to choose the lamp at ``y``, its ``weight`` that at ``x``. P(y) / P(x), a factor
+    of r, is returned as well.
     """
     places = lights.places
 

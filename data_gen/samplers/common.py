@@ -18,8 +18,8 @@ from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.lamps import weighed
-from data_gen.scenes.places import Places
 from data_gen.scenes.load import path_depths, reference_integrator
+from data_gen.scenes.places import Places
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
 from ngpt.options import written
