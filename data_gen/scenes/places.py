@@ -36,18 +36,38 @@ class Chosen:
     u: mi.Point2f
 
 
-class Places:
-    """The probability of each lamp in each cell.
+@dataclass
+class Table:
+    """The probability of each lamp in each cell: ``p``, (cells + 1, lamps), of rows that sum to 1.
 
-    ``table``  (cells + 1, lamps), rows sum to 1; the last is for what is nowhere: paths that have ended
-    ``low``, ``size``, ``side``  the first corner of all cells, the size of one, and how many there are along each axis
+    The last row is for what is nowhere: paths that have ended. ``low`` is the first corner of all cells, ``size`` that
+    of one, (3,); there are ``side`` along each axis.
     """
 
-    def __init__(self, scene: mi.Scene, table: np.ndarray, low: np.ndarray, size: np.ndarray, side: int):
-        self.emitters, self.lamps, self.side = scene.emitters_dr(), table.shape[1], side
-        self.low, self.per_size = mi.Point3f(*low.tolist()), mi.Vector3f(*(1 / size).tolist())
-        self.p = mi.Float(table.ravel().astype(np.float32))
-        upto = np.cumsum(table, axis=1).astype(np.float32)
+    p: np.ndarray
+    low: np.ndarray
+    size: np.ndarray
+    side: int
+
+    def of(self, lamp: np.ndarray, at: np.ndarray) -> np.ndarray:
+        """The probability of these lamps at these places, (N, 3)."""
+        i, j, k = cell_of(at, self.low, self.size, self.side).T
+        return self.p[(i * self.side + j) * self.side + k, lamp]
+
+
+def cell_of(at: np.ndarray, low: np.ndarray, size: np.ndarray, side: int) -> np.ndarray:
+    """The numbers of cells along each axis, (N, 3); what is beyond them belongs to the nearest."""
+    return np.clip((at - low) / size, 0, side - 1).astype(int)
+
+
+class Places:
+    """A table on the device, and the emitters of the scene that it is of."""
+
+    def __init__(self, scene: mi.Scene, table: Table):
+        self.emitters, self.lamps, self.side = scene.emitters_dr(), table.p.shape[1], table.side
+        self.low, self.per_size = mi.Point3f(*table.low.tolist()), mi.Vector3f(*(1 / table.size).tolist())
+        self.p = mi.Float(table.p.ravel().astype(np.float32))
+        upto = np.cumsum(table.p, axis=1).astype(np.float32)
         # More than any random number, lest rounding leave one beyond
         upto[:, -1] = 2
         self.upto = mi.Float(upto.ravel())
@@ -98,7 +118,7 @@ class Places:
         return dr.gather(mi.UInt32, self.indices, dr.reinterpret_array(mi.UInt32, emitter), active)
 
 
-def learn(scene: mi.Scene, lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> Places:
+def learn(lamp: np.ndarray, squares: np.ndarray, at: np.ndarray, whole: np.ndarray) -> Table:
     """From samples of a pilot: the number of its ``lamp``, the square of what that brings, and its vertex, (N, 3).
 
     ``whole``: weights of lamps in the whole scene, (lamps,), none 0.
@@ -111,7 +131,7 @@ def learn(scene: mi.Scene, lamp: np.ndarray, squares: np.ndarray, at: np.ndarray
     low, high = np.quantile(at, 0.005, axis=0), np.quantile(at, 0.995, axis=0)
     extent = np.maximum(high - low, 1e-3 * (high - low).max() + 1e-30)
     low, size = low - 0.0137 * extent, 1.0411 * extent / side
-    cell = np.clip((at - low) / size, 0, side - 1).astype(int)
+    cell = cell_of(at, low, size, side)
     means = np.full((1, 1, 1, lamps), np.nan)
     for cells in _doubling(side):
         key = np.ravel_multi_index((*(cell * cells // side).T, lamp), (cells, cells, cells, lamps))
@@ -126,7 +146,7 @@ def learn(scene: mi.Scene, lamp: np.ndarray, squares: np.ndarray, at: np.ndarray
     roots = np.sqrt(means.reshape(-1, lamps))
     total = roots.sum(axis=1, keepdims=True)
     table = np.where(total > 0, (1 - _FLOOR) * roots / np.maximum(total, 1e-300) + _FLOOR * whole, whole)
-    return Places(scene, np.vstack([table, whole]), low, size, side)
+    return Table(np.vstack([table, whole]), low, size, side)
 
 
 def _doubling(side: int) -> list[int]:

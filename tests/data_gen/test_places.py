@@ -13,8 +13,11 @@ from unbiased import DISTANCES, gradient_tests, load, render_ours, render_refere
 LANES = 1 << 14
 
 
-def gallery(flat=True, sky=True, fog=False):
-    """Fourteen lamps over a floor, a wall and a mirror; not all ``flat`` ones, beside a ``sky``, in ``fog``."""
+def gallery(flat=True, sky=True, fog=False, low=False):
+    """Fourteen lamps over a floor, a wall and a mirror; not all ``flat`` ones, beside a ``sky``, in ``fog``.
+
+    Lamps that hang ``low`` light up little of the floor each.
+    """
     import mitsuba as mi
 
     from data_gen.scenes.builtin import _camera, _diffuse, _sphere
@@ -25,7 +28,7 @@ def gallery(flat=True, sky=True, fog=False):
         x, z = -1.6 + 0.8 * (number % 5), -1.5 + 1.2 * (number // 5)
         radiance = {"type": "rgb", "value": (10 ** rng.uniform(0.2, 1.3) * rng.uniform(0.3, 1, 3)).tolist()}
         if flat or number % 3:
-            at = place().translate([x, rng.uniform(1.2, 1.8), z]).rotate([1, 0, 0], 90).scale(0.12)
+            at = place().translate([x, 0.3 if low else rng.uniform(1.2, 1.8), z]).rotate([1, 0, 0], 90).scale(0.12)
             parts[f"lamp_{number}"] = {"type": "rectangle", "to_world": at, "emitter": {"type": "area"}}
             parts[f"lamp_{number}"]["emitter"]["radiance"] = radiance
         elif number % 2:
@@ -57,12 +60,12 @@ def gallery(flat=True, sky=True, fog=False):
 
 def any_places(scene, side=4, seed=1):
     """A table of probabilities that have nothing to do with the scene."""
-    from data_gen.scenes.places import Places
+    from data_gen.scenes.places import Places, Table
 
     lamps = len(scene.emitters())
     table = np.random.default_rng(seed).dirichlet(np.full(lamps, 0.5), side**3 + 1)
     low, high = np.array([-2.5, -0.1, -2.5]), np.array([2.5, 2.5, 2.5])
-    return Places(scene, 0.8 * table + 0.2 / lamps, low, (high - low) / side, side)
+    return Places(scene, Table(0.8 * table + 0.2 / lamps, low, (high - low) / side, side))
 
 
 @pytest.fixture
@@ -116,7 +119,7 @@ def test_no_lamp_is_out_of_the_question(renderer):
     from data_gen.scenes import lamps
     from data_gen.scenes.lamps import weighed
 
-    description = gallery()
+    description = gallery(low=True)
     hidden = {"type": "rectangle", "emitter": {"type": "area"}}
     hidden["to_world"] = renderer.ScalarTransform4f().translate([0, -3, 0]).rotate([1, 0, 0], 90)
     scene = load(renderer, lambda: description | {"hidden": hidden}, (16, 16))
@@ -132,7 +135,7 @@ def test_taken_for_many_lamps_that_the_scene_leaves_open(renderer):
     from data_gen.scenes.lamps import weighed
 
     def places_of(change=None, lamps="power", by_place=True):
-        description = gallery()
+        description = gallery(low=True)
         if change:
             change(description)
         with weighed(load(renderer, lambda: description, (8, 8)), lamps, by_place) as places:
@@ -142,6 +145,7 @@ def test_taken_for_many_lamps_that_the_scene_leaves_open(renderer):
     assert not places_of(lamps="uniform")
     assert not places_of(by_place=False)
     assert not places_of(lambda scene: scene["lamp_3"]["emitter"].update(sampling_weight=0.0))
+    assert not places_of(lambda scene: scene.update(gallery()))  # each lights up all of it
     assert not places_of(lambda scene: [scene.pop(f"lamp_{number}") for number in range(9)])
 
 
