@@ -100,9 +100,9 @@ def replay_lamp(
         return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
 
     sample = _replayed(lights, base, base_weight, y, lit, anew)
+    ratio = places.probability(y, chosen.lamp) / chosen.p
     # A base path that has ended is nowhere: seen from the other side it takes no part, and the weight is 1/2.
-    ratio = dr.select(x.is_valid(), places.probability(y, chosen.lamp) / chosen.p, 1)
-    return replace(sample, p=sample.p * ratio), ratio
+    return replace(sample, p=sample.p * ratio), dr.select(x.is_valid(), ratio, 1)
 
 
 def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit: mi.Bool, sample) -> LightSample:

@@ -176,9 +176,14 @@ def test_a_shifted_path_keeps_its_lamp(renderer):
             assert (np.abs(np.array(one / other)[lit] - 1) < 2e-3).mean() > 0.99
         came = np.array((dr.max(weight) > 0) & (base.pdf > 0))
         assert (np.abs(np.array(back.p / base.pdf)[came] - 1) < 2e-3).mean() > 0.99
-        # A base path that is nowhere has the weight 1/2 from the other side.
+        # A base path that is nowhere has the weight 1/2 from the other side; but the density is that of the vertex.
         x.t = mi.Float(np.inf)
-        assert np.array_equal(np.array(replay_lamp(lights, base, weight, chosen, x, y, lit=yes)[1]), np.ones(LANES))
+        base, weight, chosen = lights.sample(scene, x, u, yes)
+        there, r = replay_lamp(lights, base, weight, chosen, x, y, lit=yes)
+        assert np.array_equal(np.array(r), np.ones(LANES))
+        own, _ = places.sample(y, replace(chosen, p=places.probability(y, chosen.lamp)), yes)
+        lit = np.array((there.p > 0) & (own.pdf > 0))
+        assert (np.abs(np.array(there.p / own.pdf)[lit] - 1) < 2e-3).mean() > 0.99
 
 
 def test_emission_that_is_met_has_the_density_of_the_vertex(renderer):
