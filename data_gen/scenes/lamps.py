@@ -15,7 +15,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.scenes.places import Places, learn
+from data_gen.scenes.places import Places, Table, learn
 
 # Camera paths of the pilot, and vertices of each that lamps are sampled at
 _PATHS, _VERTICES = 1 << 14, 3
@@ -23,7 +23,7 @@ _PATHS, _VERTICES = 1 << 14, 3
 _PATHS_BY_PLACE, MANY = 1 << 17, 8
 # Lamps are chosen by place if that promises less than so much of the variance of direct light. Where all is matt the
 # promise is kept; glossy materials, of which the pilot knows nothing, were seen to cost a factor of two.
-_PROMISE = 0.45
+PROMISE = 0.45
 # Of all lamps alike: those that the pilot did not see may bring light elsewhere, and light paths begin there, too.
 _FLOOR = 0.2
 # Mean squares are over all but so many of a lamp's largest, lest a single vertex close to it decide.
@@ -78,19 +78,24 @@ def lamp_weights(scene: mi.Scene) -> np.ndarray:
 
 
 def lamp_places(scene: mi.Scene, weights: np.ndarray) -> Places | None:
-    """How often each lamp is chosen by place, beside the ``weights`` of the whole scene; None where that is no better.
+    """How often each lamp is chosen by place, beside the ``weights`` of the whole scene; None where that does not pay."""
+    share, table = promised(scene, weights)
+    return Places(scene, table) if table and share < PROMISE else None
 
-    One half of the pilot's samples tells what they are, the other how much better.
+
+def promised(scene: mi.Scene, weights: np.ndarray) -> tuple[float, Table | None]:
+    """What choosing by place promises to leave of the variance of direct light, and by what table.
+
+    One half of a pilot's samples tells how often each lamp is chosen, and the other how much better that is. Where the
+    pilot meets nothing there is no table.
     """
     lamp, L, at = _pilot(scene, _PATHS_BY_PLACE)
     squares, half = np.square(L), np.random.default_rng(0).random(len(L)) < 0.5
-    if not squares[half].any():
-        return None
+    if half.all() or not half.any():
+        return 1.0, None
     p = learn(lamp[half], squares[half], at[half], weights).of(lamp, at)
     by_place, as_before = ((squares / share)[~half].sum() for share in (p, weights[lamp]))
-    if not by_place < _PROMISE * as_before:
-        return None
-    return Places(scene, learn(lamp, squares, at, weights))
+    return by_place / as_before if as_before > 0 else 1.0, learn(lamp, squares, at, weights)
 
 
 def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
