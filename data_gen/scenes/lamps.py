@@ -78,7 +78,7 @@ def lamp_weights(scene: mi.Scene) -> np.ndarray:
 
 
 def lamp_places(scene: mi.Scene, weights: np.ndarray) -> Places | None:
-    """How often each lamp is chosen by place, beside the ``weights`` of the whole scene; None where that does not pay."""
+    """How often each lamp is chosen by place, beside ``weights`` of the whole scene; None where that does not pay."""
     share, table = promised(scene, weights)
     return Places(scene, table) if table and share < PROMISE else None
 
