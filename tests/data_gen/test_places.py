@@ -232,11 +232,12 @@ def test_unbiased(renderer, name, by_any_places):
 
 
 @pytest.mark.slow
-def test_the_z_test_sees_a_ratio_that_is_left_out(renderer, by_any_places, monkeypatch):
+def test_the_z_test_sees_a_density_of_the_other_end(renderer, by_any_places, monkeypatch):
     from data_gen.samplers.gpt import offset_path
 
     def forgetful(*args, replayed=offset_path.replay_lamp, **more):
-        return replayed(*args, **more)[0], 1
+        light, r = replayed(*args, **more)
+        return replace(light, p=light.p / r), r
 
     monkeypatch.setattr(offset_path, "replay_lamp", forgetful)
     scene = load(renderer, gallery, (32, 32))
