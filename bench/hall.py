@@ -1,6 +1,7 @@
 """Writes a scene of 100 small lamps of very different powers, in a hall with bays on both sides of an aisle.
 
     python -m bench.hall out/hall.xml
+    python -m bench.hall out/hall-25.xml --lamps 25
 
 Each place is lit by a few lamps near by; partitions hide the others. It is for choosing lamps by place.
 """
@@ -14,7 +15,6 @@ import numpy as np
 
 BAYS, WIDE, DEEP, AISLE, HEIGHT = 6, 4.0, 4.5, 3.0, 3.5
 LENGTH, HALF = BAYS * WIDE, AISLE / 2 + DEEP
-LAMPS = 100
 
 HEAD = """<scene version="3.0.0">
     <integrator type="path">
@@ -60,7 +60,7 @@ def _row(values) -> str:
     return ", ".join(f"{value:.3f}" for value in values)
 
 
-def hall() -> str:
+def hall(lamps: int = 100) -> str:
     """The scene in Mitsuba's XML, the same each time."""
     rng = np.random.default_rng(1)
     parts = [HEAD]
@@ -78,7 +78,7 @@ def hall() -> str:
         x, z = rng.choice((-1, 1)) * rng.uniform(AISLE / 2 + 0.5, HALF - 0.5), rng.uniform(0.5, LENGTH - 0.5)
         high = rng.uniform(0.4, 1.1)
         parts.append(cube((x - 0.4, 0, z - 0.3), (x + 0.4, high, z + 0.3)))
-    for number in range(LAMPS):
+    for number in range(lamps):
         at = rng.uniform(-HALF + 0.3, HALF - 0.3), rng.uniform(1.7, 2.7), rng.uniform(0.3, LENGTH - 0.3)
         # Powers over three decades, those of most lamps small
         parts.append(lamp(number, at, rng.uniform(0.08, 0.3), 10 ** rng.uniform(0, 2.5)))
@@ -88,9 +88,10 @@ def hall() -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="the file to write")
-    out = parser.parse_args().out
-    out.parent.mkdir(parents=True, exist_ok=True)
-    out.write_text(hall())
+    parser.add_argument("--lamps", type=int, default=100)
+    args = parser.parse_args()
+    args.out.parent.mkdir(parents=True, exist_ok=True)
+    args.out.write_text(hall(args.lamps))
 
 
 if __name__ == "__main__":

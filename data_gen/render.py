@@ -74,7 +74,8 @@ def render_stack(
     if settings.get("points") == "sobol" and (spp is None or adaptive is not None):
         settings["points"] = "rounds"
     limits["points"] = settings.get("points", "independent")
-    with weighed(scene, settings["lamps"]):
+    with weighed(scene, settings["lamps"], entry.by_place) as places:
+        more |= {"places": places} if places else {}
         sample = entry.make(scene, **own(settings), **more)
         if adaptive is None:
             film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)

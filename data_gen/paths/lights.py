@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.camera import CameraSamples
+from data_gen.scenes.places import Chosen, Places
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
 _UNIFORM_SHAPES = ("Rectangle", "Disk", "Cylinder")
@@ -22,15 +23,27 @@ class Lights:
     ``shared``, if there are no others in the scene (a kernel with both kinds of code gained nothing).
 
     ``near``, ``far``: whether there are emitters of finite and of infinite distance.
+    ``places``: how often each is chosen, by place; None: as often as the scene says, everywhere.
     """
 
-    def __init__(self, scene: mi.Scene):
+    def __init__(self, scene: mi.Scene, places: Places | None = None):
         lamps = [shape for shape in scene.shapes() if shape.is_emitter()]
         far = [mi.has_flag(emitter.flags(), mi.EmitterFlags.Infinite) for emitter in scene.emitters()]
         uniform = [shape.emitter().class_name() == "AreaLight" and is_uniform(shape) for shape in lamps]
         self.near, self.far = not all(far), any(far)
         # Emitters that are neither infinitely far away nor on a shape (point lights) are not counted as uniform.
         self.shared = sum(uniform) + sum(far) == len(scene.emitters())
+        self.places = places
+
+    def sample(self, scene, x: mi.SurfaceInteraction3f, u: mi.Point2f, active: mi.Bool) -> tuple:
+        """The direction sample of ``scene.sample_emitter_direction(x, u, False, active)``, its Le / p, and the lamp.
+
+        That is None where it is not chosen by place.
+        """
+        if not self.places:
+            return *scene.sample_emitter_direction(x, u, False, active), None
+        chosen = self.places.choose(x, u)
+        return *self.places.sample(x, chosen, active), chosen
 
 
 def is_uniform(shape: mi.Shape) -> bool:
@@ -69,8 +82,33 @@ def replay_light(
 
     ``base`` is the direction sample there and ``base_weight`` its Le / p.
     """
+    return _replayed(lights, base, base_weight, y, lit, lambda anew: sample_light(scene, y, u, anew, False))
+
+
+def replay_lamp(
+    lights: Lights, base, base_weight, chosen: Chosen, x, y: mi.SurfaceInteraction3f, *, lit: mi.Bool
+) -> tuple[LightSample, mi.Float]:
+    """The same of a lamp ``chosen`` by place at vertex ``x``: the same point on the same lamp, seen from ``y``.
+
+    Its ``p`` counts the probability P to choose the lamp at ``y``, its ``weight`` that at ``x``. P(y) / P(x), a factor
+    of r, is returned as well.
+    """
+    places = lights.places
+
+    def anew(active: mi.Bool) -> LightSample:
+        light, weight = places.sample(y, chosen, active)
+        return LightSample(light.d, light.pdf, light.delta, dr.select(active & (light.pdf != 0), weight, 0), light.p)
+
+    sample = _replayed(lights, base, base_weight, y, lit, anew)
+    ratio = places.probability(y, chosen.lamp) / chosen.p
+    # A base path that has ended is nowhere: seen from the other side it takes no part, and the weight is 1/2.
+    return replace(sample, p=sample.p * ratio), dr.select(x.is_valid(), ratio, 1)
+
+
+def _replayed(lights: Lights, base, base_weight, y: mi.SurfaceInteraction3f, lit: mi.Bool, sample) -> LightSample:
+    """The direction sample ``base`` as seen from ``y``, taken by ``sample`` (active) where it cannot be taken over."""
     if not lights.shared:
-        return sample_light(scene, y, u, lit, False)
+        return sample(lit)
     far = mi.Bool(lights.far)
     if lights.far and lights.near:
         far = mi.has_flag(base.emitter.flags(), mi.EmitterFlags.Infinite)
@@ -84,30 +122,37 @@ def replay_light(
     shared = (base.pdf > 0) & (far | (ratio > 0)) & dr.isfinite(J) & (J > 0)
     anew, shared = lit & ~shared, lit & shared
     p, weight = dr.select(shared, base.pdf / J, 0), dr.select(shared, base_weight * J, mi.Spectrum(0))
-    sample = LightSample(d, p, base.delta, weight, dr.select(far, y.p + d * base.dist, base.p))
-    return dr.if_stmt((sample,), anew, lambda _: sample_light(scene, y, u, anew, False), lambda sample: sample)
+    known = LightSample(d, p, base.delta, weight, dr.select(far, y.p + d * base.dist, base.p))
+    return dr.if_stmt((known,), anew, lambda _: sample(anew), lambda known: known)
 
 
-def emission(scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled) -> tuple:
+def emission(
+    scene, si: mi.SurfaceInteraction3f, ref: mi.SurfaceInteraction3f, active, sampled, places: Places | None = None
+) -> tuple:
     """Le at ``si`` toward ``ref`` where ``active``, and the density with which emitter sampling finds it where
-    ``sampled``."""
+    ``sampled``; lamps may be chosen by ``places``."""
     light = mi.DirectionSample3f(scene, si, ref)
-    return light.emitter.eval(si, active), scene.pdf_emitter_direction(ref, light, sampled)
+    p = places.density(ref, light, sampled) if places else scene.pdf_emitter_direction(ref, light, sampled)
+    return light.emitter.eval(si, active), p
 
 
-def shared_emission(scene, lights: Lights, x1, Le, p, *, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
-    """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` at the same vertex ``x1``, seen from elsewhere.
+def shared_emission(scene, lights: Lights, x1, Le, p, *, x, y, y1, J) -> tuple[mi.Spectrum, mi.Float]:
+    """``emission(scene, y1, y, True, True)`` by way of ``Le`` and ``p`` of the same vertex ``x1``, as seen from ``x``.
 
     ``y1`` is ``x1`` with another incident direction, of which ``J`` is the ratio d'²/d² of squared distances.
     """
+    places = lights.places
     if not lights.shared:
-        return emission(scene, y1, y, True, True)
+        return emission(scene, y1, y, True, True, places)
     escapes = ~x1.is_valid()
     ratio = dr.select(escapes, 1, y1.wi.z / x1.wi.z)
     shared = escapes | ((ratio > 0) & dr.isfinite(ratio))
     p1 = dr.select(shared, p * dr.select(escapes, 1, J / dr.abs(ratio)), 0)
+    if places:
+        lamp = places.index_of(x1.emitter(scene), p1 > 0)
+        p1 *= places.probability(y, lamp) / places.probability(x, lamp)
     anew = (x1.emitter(scene) != None) & ~shared  # noqa: E711 - a comparison of arrays of pointers
-    return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew), lambda *known: known)
+    return dr.if_stmt((Le, p1), anew, lambda *_: emission(scene, y1, y, anew, anew, places), lambda *known: known)
 
 
 def emission_seen(scene, integrator, medium, ray: mi.RayDifferential3f, active) -> mi.Spectrum:

@@ -19,6 +19,7 @@ from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
+from data_gen.scenes.places import Places
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.layers import LAYERS
 from ngpt.options import written
@@ -63,6 +64,8 @@ class GradientIntegrator(mi.SamplingIntegrator):
         if not self.nested:
             self.limits = Limits.read(props)
         self.channels: list[str] = []
+        # By which lamps are chosen, where the sampler does so by place and there are many
+        self.places: Places | None = None
 
     def prepare(self, scene) -> SamplePass:
         """What takes the samples of a pass."""
@@ -76,7 +79,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
             "batch": entry.batch,
             "points": self.options.get("points", "independent"),
         }
-        with weighed(scene, self.options["lamps"]):
+        with weighed(scene, self.options["lamps"], entry.by_place) as self.places:
             return render_passes(self.prepare(scene), sensor, seed, spp, **limits)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):

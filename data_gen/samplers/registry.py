@@ -122,6 +122,7 @@ class Sampler(Entry):
     ``together``    whether pixels share paths, so that a pass has all of them, with as many samples each
     ``lane_bytes``  memory that a lane, one sample of one pixel, takes in a pass
     ``counts``      whether it replays numbers one by one, so that they must be independent: it takes no ``points``
+    ``by_place``    whether it can choose lamps by place: ``make`` takes ``places``
     ``biased``      whether its mean is that of Mitsuba's integrator only as the number of samples grows
     """
 
@@ -134,6 +135,7 @@ class Sampler(Entry):
     batch: int = field(default=0, kw_only=True)
     together: bool = field(default=False, kw_only=True)
     lane_bytes: int = field(default=LANE_BYTES, kw_only=True)
+    by_place: bool = field(default=False, kw_only=True)
     biased: bool = field(default=False, kw_only=True)
     counts: bool = field(default=False, kw_only=True)
 

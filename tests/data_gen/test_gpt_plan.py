@@ -158,7 +158,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
     direction = dr.select(x1.is_valid(), dr.normalize(x1.p - y.p), ray.d)
     y1 = seen_from(x1, direction)
     J = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
-    shared = shared_emission(scene, lights, x1, Le, p, y=y, y1=y1, J=J)
+    shared = shared_emission(scene, lights, x1, Le, p, x=x, y=y, y1=y1, J=J)
     own = emission(scene, y1, y, yes, yes)
     assert dr.any(dr.max(own[0]) > 0) or name == "directional"
     assert mostly(dr.all(dr.abs(shared[0] - own[0]) <= 1e-3 * dr.abs(own[0])))

@@ -52,6 +52,7 @@ register(
         },
         rank=1,
         diagnoses=True,
+        by_place=True,
         tried=True,
         compiles=2.0,
     )

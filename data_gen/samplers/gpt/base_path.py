@@ -16,6 +16,7 @@ from data_gen.paths.vertex import DELTA, SMOOTH, event_kind
 from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
+from data_gen.scenes.places import Chosen
 
 
 @dataclass
@@ -56,6 +57,7 @@ class Step:
     # Emitter sampling
     light: mi.DirectionSample3f
     light_weight: mi.Spectrum  # Le / p
+    lamp: Chosen | None  # None where lamps are not chosen by place
     T_light: mi.Spectrum | int  # transmittance
     lit: mi.Bool  # the sample is seen from x, or is of no use
     L_light: mi.Spectrum  # f m Le V / p
@@ -115,7 +117,7 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
     bsdf = x.bsdf()
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(place)
     # Offset paths take over the point on a shared emitter, with shadow rays of their own: Le / p must come without V.
-    light, light_weight = scene.sample_emitter_direction(x, u_light, False, lit)
+    light, light_weight, lamp = plan.lights.sample(scene, x, u_light, lit)
     lit &= light.pdf != 0
     # Toward the emitter and along a new direction at once
     f, p, sample, f_p = media.evaluate_and_sample(bsdf, x, place, x.to_local(light.d), u_lobe, u_direction)
@@ -148,7 +150,7 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
     f_p *= segment.weight
     β1 = path.β * f_p
     # After a mirror or a hole emitter sampling could not have found x1: p_light = 0, and m = 1.
-    Le, p_light = emission(scene, x1, x, goes_on & sky.meets(x1), goes_on & (kind == SMOOTH))
+    Le, p_light = emission(scene, x1, x, goes_on & sky.meets(x1), goes_on & (kind == SMOOTH), plan.lights.places)
     L_bsdf = Le * mis_weight(sample.pdf, p_light)
 
     # ------------------- The layer ``caustic`` -------------------
@@ -178,6 +180,7 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
         drawn=drawn,
         light=light,
         light_weight=light_weight,
+        lamp=lamp,
         T_light=T_light,
         lit=lit,
         L_light=L_light,

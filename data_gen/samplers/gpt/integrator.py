@@ -55,6 +55,7 @@ from data_gen.samplers.gpt.plan import Plan, make_plan
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name, media_of
+from data_gen.scenes.places import Places
 from ngpt.errors import NgptError
 
 
@@ -110,9 +111,8 @@ class GPT(GradientIntegrator):
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
         volumes = self.volumes and bool(media_of(scene))
-        return make_plan(
-            scene, self.limits, self.roughness_threshold, self.shift, caustic=self.caustic, volumes=volumes
-        )
+        more = {"caustic": self.caustic, "volumes": volumes, "places": self.places}
+        return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
     def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
@@ -168,15 +168,17 @@ def count(flags: list[mi.Bool]) -> mi.Float:
     return sum(dr.select(flag, mi.Float(1), 0) for flag in flags)
 
 
-def make(scene: mi.Scene, **options) -> SamplePass:
+def make(scene: mi.Scene, places: Places | None = None, **options) -> SamplePass:
     """The sampler ``gpt``: our integrator with the parameters of the scene's own ``path``, and options of the class."""
-    return stand_in(scene, **options).prepare(scene)
+    return stand_in(scene, places, **options).prepare(scene)
 
 
-def stand_in(scene: mi.Scene, **options) -> GPT:
-    """The plugin with the parameters of the scene's own ``path``: see ``like_path()``."""
+def stand_in(scene: mi.Scene, places: Places | None = None, **options) -> GPT:
+    """The plugin with the parameters of the scene's own ``path``, see ``like_path()``; lamps chosen by ``places``."""
     volumes = integrator_name(scene) in VOLUMETRIC
-    return like_path(scene, "gpt", volumes=volumes, **options)
+    integrator = like_path(scene, "gpt", volumes=volumes, **options)
+    integrator.places = places
+    return integrator
 
 
 mi.register_integrator("gpt", lambda props: GPT(props))

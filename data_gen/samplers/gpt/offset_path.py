@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths import caustic, media, shift
-from data_gen.paths.lights import emission, replay_light, shared_emission
+from data_gen.paths.lights import emission, replay_lamp, replay_light, shared_emission
 from data_gen.paths.segments import Segment
 from data_gen.paths.shift import mis_weight
 from data_gen.paths.vertex import DELTA, SMOOTH, event_kind, seen_from
@@ -101,6 +101,9 @@ def first_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Of
     A loop keeps the kernel small; its state rotates, so that each path stays in registers when its turn comes.
     """
 
+    if not offsets:
+        return []
+
     def rotate(i, y, *others):
         y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
         return i + 1, *others, y
@@ -115,6 +118,8 @@ def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Of
 
     Rare branches are real ones, not masks: they cost 2.5 times less.
     """
+    if not offsets:
+        return []
     busy, apart = mi.Bool(False), mi.Bool(False)
     for y in offsets:
         busy |= y.joined
@@ -155,9 +160,9 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     own = Own(y, path.place, bsdf, plan.materials.connectable(bsdf) | scatters)
 
     # ----------------- Emitter sampling: replay ------------------
-    w2_light = shift.gradient_weight(path.r, True)
+    L_light, r_light = replayed_light(scene, plan, step, path, own)
     # Survey, eq. 16, with the weights of eq. 17; β' holds the |J| of all steps before.
-    L_light = replayed_light(scene, plan, step, path, own)
+    w2_light = shift.gradient_weight(path.r * r_light, True)
     Δ = path.Δ + w2_light * (path.β * L_light - step.β * step.L_light)
 
     # ------------- BSDF sampling: reconnect, or part -------------
@@ -195,16 +200,21 @@ def step_apart(scene, plan: Plan, step: Step, path: Offset) -> Offset:
     )
 
 
-def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> mi.Spectrum:
-    """f m Le V / p of the emitter that the base path's random numbers lead to from y.
+def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tuple[mi.Spectrum, mi.Float | int]:
+    """f m Le V / p of the emitter that the base path's random numbers lead to from y, and a factor of r.
 
     Densities of the same numbers cancel (survey, eq. 6 and 7), so r stays what it was, and the numbers lead to, or
     near, the same point of an emitter. It is never rejected: an emitter that y does not see is a sample of value 0, and
-    the reverse shift knows it as such.
+    the reverse shift knows it as such. Of an emitter that is chosen by place, the same one is taken from y, where it
+    has another probability: the ratio of the two does not cancel.
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
-    light = replay_light(scene, plan.lights, step.light, step.light_weight, step.u_light, y, lit=lit)
+    base = (plan.lights, step.light, step.light_weight)
+    if step.lamp is None:
+        light, r = replay_light(scene, *base, step.u_light, y, lit=lit), 1
+    else:
+        light, r = replay_lamp(*base, step.lamp, step.x, y, lit=lit)
     f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
     # A shadow ray where there is something to be shadowed
     L_light = f * light.weight
@@ -213,7 +223,7 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> mi.
     L_light = dr.select(visible, L_light, 0) * (T * light_mis(light.delta, light.p, p))
     if plan.caustic:
         L_light, _ = caustic.split(caustic.lit_late(path.rough, mi.Bool(False), own.connectable), L_light)
-    return L_light
+    return L_light, r
 
 
 def no_move(path: Offset) -> Move:
@@ -255,7 +265,7 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     # Le may depend on the direction of arrival, and p_light does on the distance: m is not that of the base path.
     y1 = seen_from(x1, direction)
     ratio = dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
-    Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, y=y, y1=y1, J=ratio)
+    Le, p_light = shared_emission(scene, plan.lights, x1, step.Le, step.p_light, x=step.x, y=y, y1=y1, J=ratio)
     return Move(
         ray=mi.Ray3f(y.p, direction, y.time, y.wavelengths),
         hit=move.hit,
@@ -289,7 +299,8 @@ def part(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     segment = plan.space.fly(y, own.place, y.spawn_ray(y.to_world(leaves.wo)), step.drawn, found)
     y1 = plan.space.end(y, segment)
     reaches = found & y1.is_valid()
-    Le, p_light = emission(scene, y1, y, reaches | (found & sky.seen), found & (kind == SMOOTH))
+    seen, smooth = reaches | (found & sky.seen), found & (kind == SMOOTH)
+    Le, p_light = emission(scene, y1, y, seen, smooth, plan.lights.places)
 
     # ----------------- Would it be shifted back? -----------------
     # Reject what would not be, or the weights of the pair would not sum to 1 (survey, section 3.5).

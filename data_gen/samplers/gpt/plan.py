@@ -10,6 +10,7 @@ from data_gen.paths.lights import Lights
 from data_gen.paths.space import Filled, Space
 from data_gen.paths.vertex import Materials
 from data_gen.paths.walk import Limits
+from data_gen.scenes.places import Places
 from ngpt.errors import NgptError
 
 
@@ -47,8 +48,11 @@ def make_plan(
     *,
     caustic: bool = True,
     volumes: bool = False,
+    places: Places | None = None,
 ) -> Plan:
     """Inspects the scene; the parameters are those of ``gpt``. Without ``volumes`` its media are not seen.
+
+    With ``places``, lamps are chosen by them.
 
     Raises NgptError for shifts that know no media.
     """
@@ -60,7 +64,7 @@ def make_plan(
     replays = not materials.all_connectable
     return Plan(
         materials,
-        Lights(scene),
+        Lights(scene, places),
         space,
         limits,
         replays=replays,

@@ -12,5 +12,6 @@ register(
         gradients=False,
         tried=True,
         compiles=1.0,
+        by_place=True,
     )
 )

@@ -1,0 +1,246 @@
+"""Lamps by place: probabilities, shifts that keep their lamp, and images whose means are Mitsuba's.
+
+Most tests take tables of any probabilities, far from each other in cells side by side: what a pilot learns is smooth,
+and hides what is wrong.
+"""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from unbiased import DISTANCES, gradient_tests, load, render_ours, render_references
+
+LANES = 1 << 14
+
+
+def gallery(flat=True, sky=True, fog=False, low=False):
+    """Fourteen lamps over a floor, a wall and a mirror; not all ``flat`` ones, beside a ``sky``, in ``fog``.
+
+    Lamps that hang ``low`` light up little of the floor each.
+    """
+    import mitsuba as mi
+
+    from data_gen.scenes.builtin import _camera, _diffuse, _sphere
+
+    place = mi.ScalarTransform4f
+    rng, parts = np.random.default_rng(4), {}
+    for number in range(14):
+        x, z = -1.6 + 0.8 * (number % 5), -1.5 + 1.2 * (number // 5)
+        radiance = {"type": "rgb", "value": (10 ** rng.uniform(0.2, 1.3) * rng.uniform(0.3, 1, 3)).tolist()}
+        if flat or number % 3:
+            at = place().translate([x, 0.3 if low else rng.uniform(1.2, 1.8), z]).rotate([1, 0, 0], 90).scale(0.12)
+            parts[f"lamp_{number}"] = {"type": "rectangle", "to_world": at, "emitter": {"type": "area"}}
+            parts[f"lamp_{number}"]["emitter"]["radiance"] = radiance
+        elif number % 2:
+            ball = _sphere([x, 1.5, z], 0.12, _diffuse(0.5, 0.5, 0.5))
+            parts[f"lamp_{number}"] = ball | {"emitter": {"type": "area", "radiance": radiance}}
+        else:
+            parts[f"lamp_{number}"] = {"type": "point", "position": [x, 1.5, z], "intensity": 0.1}
+    if sky:
+        parts["sky"] = {"type": "constant", "radiance": 0.2}
+    wall = place().translate([0.2, 0.6, 0]).rotate([0, 1, 0], 90).scale([1.5, 0.6, 1])
+    both = {"type": "twosided", "nested": _diffuse(0.6, 0.5, 0.4)}
+    scene = {
+        "type": "scene",
+        "integrator": {"type": "path", "max_depth": 5},
+        "sensor": _camera([0, 1.4, 4.5], [0, 0.6, 0], 50),
+        "floor": {"type": "rectangle", "to_world": place().rotate([1, 0, 0], -90).scale(2.5), "bsdf": both},
+        "wall": {"type": "rectangle", "to_world": wall, "bsdf": both},
+        "mirror": _sphere([-1, 0.4, 0.3], 0.4, {"type": "conductor"}),
+        "shiny": _sphere([1.1, 0.4, 0.5], 0.4, {"type": "roughconductor", "alpha": 0.2}),
+        **parts,
+    }
+    if fog:
+        scene["integrator"] = {"type": "volpath", "max_depth": 5}
+        around = {"type": "homogeneous", "albedo": 0.7, "sigma_t": 0.2}
+        box = place().translate([0, 1, 0]).scale([2.8, 1.3, 2.8])
+        scene["box"] = {"type": "cube", "to_world": box, "bsdf": {"type": "null"}, "interior": around}
+    return scene
+
+
+def any_places(scene, side=4, seed=1):
+    """A table of probabilities that have nothing to do with the scene."""
+    from data_gen.scenes.places import Places, Table
+
+    lamps = len(scene.emitters())
+    table = np.random.default_rng(seed).dirichlet(np.full(lamps, 0.5), side**3 + 1)
+    low, high = np.array([-2.5, -0.1, -2.5]), np.array([2.5, 2.5, 2.5])
+    return Places(scene, Table(0.8 * table + 0.2 / lamps, low, (high - low) / side, side))
+
+
+@pytest.fixture
+def by_any_places(monkeypatch):
+    """Renders choose lamps by such a table, with however few lamps."""
+    from data_gen.scenes import lamps
+
+    monkeypatch.setattr(lamps, "lamp_places", lambda scene, weights: any_places(scene))
+    monkeypatch.setattr(lamps, "MANY", 2)
+
+
+def vertices(mi, seed):
+    """Points in the gallery, with normals."""
+    import drjit as dr
+
+    random = mi.PCG32(LANES, seed)
+    si = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    si.p = mi.Point3f(5 * random.next_float32() - 2.5, 2 * random.next_float32(), 5 * random.next_float32() - 2.5)
+    si.n, si.t = mi.Normal3f(0, 0, 1), mi.Float(1)
+    return si, mi.Point2f(random.next_float32(), random.next_float32())
+
+
+def test_probabilities_are_those_of_the_choice(renderer):
+    import drjit as dr
+
+    mi, scene = renderer, load(renderer, gallery, (4, 4))
+    places = any_places(scene)
+    x, u = vertices(mi, 3)
+    chosen = places.choose(x, u)
+    lamp, p, left = np.array(chosen.lamp), np.array(chosen.p), np.array(chosen.u)[0]
+    assert lamp.max() == len(scene.emitters()) - 1
+    assert np.array_equal(p, np.array(places.probability(x, chosen.lamp)))
+    assert left.min() >= 0 and left.max() < 1 and abs(left.mean() - 0.5) < 0.02
+    # In each cell: the sum over lamps, and how often each is chosen where numbers are even.
+    total = sum(places.probability(x, mi.UInt32(number)) for number in range(len(scene.emitters())))
+    assert np.allclose(np.array(total), 1, atol=1e-5)
+    one = dr.zeros(mi.SurfaceInteraction3f, LANES)
+    one.p, one.t = mi.Point3f(0.3, 1, -0.2), mi.Float(1)
+    even = mi.Point2f((dr.arange(mi.Float, LANES) + 0.5) / LANES, 0.5)
+    counts = np.bincount(np.array(places.choose(one, even).lamp), minlength=len(scene.emitters()))
+    shares = [float(places.probability(one, mi.UInt32(number))[0]) for number in range(len(counts))]
+    assert np.allclose(counts / LANES, shares, atol=2 / LANES)
+    # What is nowhere has the last row, wherever it says it is.
+    one.p, one.t = mi.Point3f(np.nan), mi.Float(np.inf)
+    shares = [float(places.probability(one, mi.UInt32(number))[0]) for number in range(len(counts))]
+    assert np.allclose(shares, np.array(places.p)[-len(counts) :])
+
+
+def test_no_lamp_is_out_of_the_question(renderer):
+    """Not even one that the pilot sees nothing of; each place has its own."""
+    from data_gen.scenes import lamps
+    from data_gen.scenes.lamps import weighed
+
+    description = gallery(low=True)
+    hidden = {"type": "rectangle", "emitter": {"type": "area"}}
+    hidden["to_world"] = renderer.ScalarTransform4f().translate([0, -3, 0]).rotate([1, 0, 0], 90)
+    scene = load(renderer, lambda: description | {"hidden": hidden}, (16, 16))
+    with weighed(scene, "power", by_place=True) as places:
+        table = np.array(places.p).reshape(-1, len(scene.emitters()))
+    assert len(scene.emitters()) >= lamps.MANY
+    assert np.allclose(table.sum(axis=1), 1, atol=1e-5)
+    assert table.min() > 0.01 / len(scene.emitters())
+    assert (table.max(axis=0) > 3 * table.min(axis=0)).sum() > 10
+
+
+def test_taken_for_many_lamps_that_the_scene_leaves_open(renderer):
+    from data_gen.scenes.lamps import weighed
+
+    def places_of(change=None, lamps="power", by_place=True):
+        description = gallery(low=True)
+        if change:
+            change(description)
+        with weighed(load(renderer, lambda: description, (8, 8)), lamps, by_place) as places:
+            return places
+
+    assert places_of()
+    assert not places_of(lamps="uniform")
+    assert not places_of(by_place=False)
+    assert not places_of(lambda scene: scene["lamp_3"]["emitter"].update(sampling_weight=0.0))
+    assert not places_of(lambda scene: scene.update(gallery()))  # each lights up all of it
+    assert not places_of(lambda scene: [scene.pop(f"lamp_{number}") for number in range(9)])
+
+
+def test_a_shifted_path_keeps_its_lamp(renderer):
+    """It has the density of its own end and the weight of the base path's, and r(T(x)) r(x) = 1."""
+    import drjit as dr
+
+    from data_gen.paths.lights import Lights, replay_lamp
+
+    mi = renderer
+    for flat in (True, False):
+        scene = load(mi, lambda flat=flat: gallery(flat), (4, 4))
+        places = any_places(scene)
+        lights = Lights(scene, places)
+        assert lights.shared == flat
+        (x, u), (y, _) = vertices(mi, 3), vertices(mi, 5)
+        yes = mi.Bool(True)
+        base, weight, chosen = lights.sample(scene, x, u, yes)
+        there, r = replay_lamp(lights, base, weight, chosen, x, y, lit=yes)
+        chosen = replace(chosen, p=places.probability(y, chosen.lamp))
+        own, own_weight = places.sample(y, chosen, yes)
+        back, r_back = replay_lamp(lights, own, own_weight, chosen, y, x, lit=yes)
+        assert np.allclose(np.array(r * r_back), 1, rtol=1e-5)
+        assert np.array(r).std() > 1
+        lit = np.array((dr.max(own_weight) > 0) & (own.pdf > 0))
+        assert lit.mean() > 0.2
+        for one, other in ((there.p, own.pdf), (dr.max(there.weight), dr.max(own_weight) * r)):
+            assert (np.abs(np.array(one / other)[lit] - 1) < 2e-3).mean() > 0.99
+        came = np.array((dr.max(weight) > 0) & (base.pdf > 0))
+        assert (np.abs(np.array(back.p / base.pdf)[came] - 1) < 2e-3).mean() > 0.99
+        # A base path that is nowhere has the weight 1/2 from the other side; but the density is that of the vertex.
+        x.t = mi.Float(np.inf)
+        base, weight, chosen = lights.sample(scene, x, u, yes)
+        there, r = replay_lamp(lights, base, weight, chosen, x, y, lit=yes)
+        assert np.array_equal(np.array(r), np.ones(LANES))
+        own, _ = places.sample(y, replace(chosen, p=places.probability(y, chosen.lamp)), yes)
+        lit = np.array((there.p > 0) & (own.pdf > 0))
+        assert (np.abs(np.array(there.p / own.pdf)[lit] - 1) < 2e-3).mean() > 0.99
+
+
+def test_emission_that_is_met_has_the_density_of_the_vertex(renderer):
+    import drjit as dr
+
+    from data_gen.paths.lights import Lights, emission, shared_emission
+    from data_gen.paths.vertex import seen_from
+
+    mi, scene = renderer, load(renderer, gallery, (4, 4))
+    places = any_places(scene)
+    lights, yes = Lights(scene, places), mi.Bool(True)
+    (x, u), (y, _) = vertices(mi, 3), vertices(mi, 5)
+    light, weight, _ = lights.sample(scene, x, u, yes)
+    x1 = scene.ray_intersect(x.spawn_ray(light.d))
+    Le, p = emission(scene, x1, x, yes, yes, places)
+    met = np.array((x1.emitter(scene) == light.emitter) & (light.pdf > 0) & (dr.max(weight) > 0))
+    assert met.mean() > 0.2
+    assert (np.abs(np.array(p / light.pdf)[met] - 1) < 2e-3).mean() > 0.99
+    d = dr.select(x1.is_valid(), dr.normalize(x1.p - y.p), light.d)
+    y1, J = seen_from(x1, d), dr.squared_norm(x1.p - y.p) / dr.square(x1.t)
+    Le1, p1 = shared_emission(scene, lights, x1, Le, p, x=x, y=y, y1=y1, J=J)
+    own, p_own = emission(scene, y1, y, yes, yes, places)
+    lit = np.array(dr.max(own) > 0)
+    assert lit.mean() > 0.1
+    assert (np.abs(np.array(p1 / p_own)[lit] - 1) < 5e-3).mean() > 0.99
+    assert np.array_equal(np.array(dr.max(Le1) > 0), lit)
+
+
+SCENES = {
+    "flat": lambda: gallery(),
+    "balls and points": lambda: gallery(flat=False, sky=False),
+    "fog": lambda: gallery(fog=True),
+}
+
+
+@pytest.mark.parametrize("name", ["flat", *(pytest.param(name, marks=pytest.mark.slow) for name in list(SCENES)[1:])])
+def test_unbiased(renderer, name, by_any_places):
+    """Differences of ``gpt``, and the primal by its base paths alone."""
+    scene = load(renderer, SCENES[name], (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    for pixels in DISTANCES:
+        for layer, result in gradient_tests(render_ours(scene, "gpt", pixels=pixels), references, pixels=pixels):
+            assert result.passed, f"{layer} over {pixels} pixels: {result}"
+    for layer, result in gradient_tests(render_ours(scene, "primal", features=False), references):
+        assert result.passed, f"{layer} of primal: {result}"
+
+
+@pytest.mark.slow
+def test_the_z_test_sees_a_density_of_the_other_end(renderer, by_any_places, monkeypatch):
+    from data_gen.samplers.gpt import offset_path
+
+    def forgetful(*args, replayed=offset_path.replay_lamp, **more):
+        light, r = replayed(*args, **more)
+        return replace(light, p=light.p / r), r
+
+    monkeypatch.setattr(offset_path, "replay_lamp", forgetful)
+    scene = load(renderer, gallery, (32, 32))
+    references = render_references(renderer, scene, spp=128)
+    tests = dict(gradient_tests(render_ours(scene, "gpt", pixels=8), references, pixels=8))
+    assert tests["primal"].passed and not (tests["dx"].passed and tests["dy"].passed)
