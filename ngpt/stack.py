@@ -20,7 +20,8 @@ class GradientStack:
     1 for depth and alpha. Given are arrays of any real type and memory layout, (H, W) too where C is 1; they are
     converted, without a copy where none is needed, and never modified. Every float value is legal, NaN and Inf
     included. A layer of variances given in double precision stays so where float32 cannot hold it: light of 1e30 or
-    1e-30 has such variances. Files hold 32 bits of them. The last column of dx and the last row of dy are unused; they are kept as they are.
+    1e-30 has such variances. Files hold 32 bits of them. The last column of dx and the last row of dy are unused; they
+    are kept as they are.
 
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
     ``source`` is the file the stack was read from (``ngpt.io.exr.StackSource``), for what passes through it.

@@ -1,4 +1,4 @@
-"""Every method on light of any exposure, and on images that are hardly any: in one frame, over time, in light groups."""
+"""Every method on light of any exposure, and on images that are hardly any: frames, shots and light groups."""
 
 import numpy as np
 import pytest
@@ -106,7 +106,7 @@ def test_light_groups_and_errors_follow_the_exposure(scale):
 
 @pytest.mark.parametrize("power", [-ORDINARY, -1, 0, ORDINARY])
 def test_ordinary_light_stays_as_it_is(power):
-    layers = {name: layer for name, layer in full_layers(9, 12).items()}
+    layers = full_layers(9, 12)
     layers["primal"][:] = 1.5
     stack = times(layers, 2.0**power)
     assert magnitude(stack) == 0 and scaled(stack, 0) is stack
@@ -142,7 +142,7 @@ def odd_images():
     layers = full_layers(9, 12)
     light = [name for name in layers if name in LIGHT]
     none = np.zeros_like(layers["primal"])
-    exact = layers | {name: none for name in light}
+    exact = layers | dict.fromkeys(light, none)
     firefly = layers["primal"].copy()
     firefly[4, 6] = 1e30
     flat = {"albedo": none + 0.5, "normal": none + np.float32([0, 0, 1]), "depth": np.ones((9, 12, 1))}
@@ -157,7 +157,7 @@ def odd_images():
         "negative": (layers | {name: -layers[name] for name in ("primal", "dx", "dy")}, None),
         "no variance": (layers | {name: none + np.nan for name in VARIANCES if name in layers}, None),
         "no features": (layers | {name: np.full_like(layers[name], np.nan) for name in flat}, None),
-        "all": (layers | {name: none + np.nan for name in light}, "layer 'primal' has no finite pixel among 108"),
+        "all": (layers | dict.fromkeys(light, none + np.nan), "layer 'primal' has no finite pixel among 108"),
     } | {f"{h}x{w}": (full_layers(h, w), None) for h, w in ((1, 1), (1, 13), (11, 1), (2, 2))}
 
 
