@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from data_gen.film import GradientFilm
 from data_gen.paths.camera import CameraSamples
@@ -28,7 +29,11 @@ PACKET = 16
 _BLOCK_LANES = 1 << 21
 # Lanes are numbered with 32 bits.
 _MOST_LANES = 1 << 30
-# Lanes of the first pass: enough to render small images at one go, and to judge how long the next may be.
+# Lanes of the first pass of a render that time may end: fewer leave cores idle.
+_FEWEST_LANES = 1 << 13
+# Of the time that is left, what a pass that ends the render is expected to take.
+_CAUTION = 0.9
+# Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20
 # A pass this long makes little of the time that it takes to start one, and reacts soon enough.
 PASS_SECONDS = 2.0
@@ -56,8 +61,9 @@ def render_passes(
     """Calls ``sample`` with the camera samples of pass after pass, and returns the film it filled.
 
     Rendered are ``spp`` samples per pixel, or as many as ``seconds`` of wall-clock time allow, compilation of kernels
-    included; with both, whichever comes first. Time is kept in whole passes: the first is always rendered, and no
-    further one that is expected to take longer than the time left. ``stop`` is asked after each pass whether to end
+    included; with both, whichever comes first. The first pass is always rendered, and no further one that is expected
+    to take longer than the time left; of the last block there may be a part. Passes are short at first where ``points``
+    are "rounds", which is how their number is not known before. ``stop`` is asked after each pass whether to end
     there. ``progress`` is called with (samples per pixel so far, spp) before the first pass and after each, or, where
     there are ``seconds``, with whole (seconds gone, seconds).
 
@@ -75,7 +81,9 @@ def render_passes(
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
     film, block, most = film_within(memory, sensor, total, lane_bytes, batch, instead, net=net)
+    grows = points == "rounds" and not batch
     start = now = time.perf_counter()
+    done: list[tuple[int, float]] = []
 
     def report(finished: bool = False) -> None:
         if seconds is None:
@@ -84,26 +92,77 @@ def render_passes(
             limit = math.ceil(seconds)
             progress(limit if finished else min(limit - 1, int(now - start)), limit)
 
-    blocks = FIRST_LANES // (film.pixels * block) if seconds is None else 1
-    report()
-    while film.samples < total:
-        left = total - film.samples
+    def next_pass(size: int) -> int:
+        """Samples of the next pass, where ``size`` is that of its blocks; 0 for none."""
+        left, time_left = total - film.samples, math.inf if seconds is None else seconds - (now - start)
         # What is left over at the end is a block of its own.
-        n = left if left < block else block * max(1, min(blocks, most, left // block))
-        begin = now
-        with recording():
-            sample(CameraSamples(sensor, seed, n, film.samples, min(n, block), net=net), film)
-            film.end_pass(min(n, block))
-        dr.sync_thread()
-        now = time.perf_counter()
-        time_left = float("inf") if seconds is None else seconds - (now - start)
-        each = (now - begin) / n * block
-        finished = film.samples >= total or stop() or time_left < each
-        report(finished)
-        if finished:
+        if left < size and seconds is None:
+            return left
+        blocks = min(most, max(left // size, 1)) if size == block else 1
+        if not done:
+            return min(left, size * (1 if seconds else max(1, min(blocks, FIRST_LANES // (film.pixels * size)))))
+        begin, each = foretold(done)
+        # Where a pass takes long to begin, it goes on for longer.
+        wanted = min(time_left - begin, max(PASS_SECONDS - begin, 3 * begin)) / each
+        n = min(left, size * max(1, min(blocks, int(wanted / size))))
+        if begin + each * n <= time_left:
+            return n
+        # Part of a block: no other can follow it. It may take longer than others did.
+        return 0 if batch else max(0, min(n, int((_CAUTION * time_left - begin) / each)))
+
+    report()
+    while True:
+        size = growing_block(film.pixels, film.samples, block) if grows else block
+        n = next_pass(size)
+        if n == 0:
             break
-        blocks = int(min(time_left, PASS_SECONDS) / each)
+        begin = now
+        with recording(), compilation() as compiled:
+            sample(CameraSamples(sensor, seed, n, film.samples, min(n, size), net=net), film)
+            film.end_pass(min(n, size))
+            dr.sync_thread()
+        now = time.perf_counter()
+        done.append((n, max(now - begin - sum(compiled), 1e-6)))
+        if n % size or film.samples >= total or stop():
+            break
+        report()
+    report(finished=True)
     return film
+
+
+def growing_block(pixels: int, done: int, block: int) -> int:
+    """Samples of a pixel side by side in the next block after so many that are ``done``: few at first, where time may
+    end a render at any moment, and then as many as there are, up to ``block``."""
+    first = 1
+    while first < block and pixels * first < _FEWEST_LANES:
+        first *= 2
+    return min(block, max(first, done))
+
+
+def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
+    """Seconds to begin a pass and seconds of a block of it, from those of passes: a line, by least squares.
+
+    Of the last eight, without the first of all, which compiles kernels.
+    """
+    blocks, seconds = np.array(done[1:][-8:] or done).T
+    fastest = float((seconds / blocks).min())
+    if np.ptp(blocks) == 0:
+        return 0.0, fastest
+    each = float(np.clip(np.polyfit(blocks, seconds, 1)[0], 0.1 * fastest, fastest))
+    return max(float(np.median(seconds - each * blocks)), 0.0), each
+
+
+@contextmanager
+def compilation() -> Iterator[list[float]]:
+    """Yields a list that has the seconds for which kernels were compiled in it, once that is over."""
+    compiled: list[float] = []
+    if dr.flag(dr.JitFlag.KernelHistory):  # Whoever asked for it reads it, which empties it.
+        yield compiled
+        return
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
+        dr.kernel_history_clear()
+        yield compiled
+        compiled += [kernel.get("backend_time", 0) / 1000 for kernel in dr.kernel_history()]
 
 
 def film_within(

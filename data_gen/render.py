@@ -49,8 +49,8 @@ def render_stack(
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
 
-    The same seed, options and number of samples give the same bits, however they came about. Where ``spp`` does not say
-    how many there will be, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says.
+    The same seed, options and number of samples give the same bits, however they came about. Where it is not known
+    before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says.
 
     Raises NgptError for options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
@@ -70,13 +70,16 @@ def render_stack(
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
-    limits = {"progress": progress, "seconds": seconds, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    if settings.get("points") == "sobol" and (spp is None or adaptive is not None):
+    limits = {"progress": progress, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
+    # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
+    if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
     limits["points"] = settings.get("points", "independent")
     with weighed(scene, settings["lamps"], entry.by_place) as places:
         more |= {"places": places} if places else {}
         sample = entry.make(scene, **own(settings), **more)
+        # However long it took to weigh the lamps, the render is begun.
+        limits["seconds"] = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
         if adaptive is None:
             film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
         else:

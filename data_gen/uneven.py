@@ -11,7 +11,7 @@ import numpy as np
 
 from data_gen import passes
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, lanes_within, recording
+from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, foretold, lanes_within, recording
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import LANE_BYTES
@@ -106,16 +106,3 @@ class UnevenRender:
         dr.sync_thread()
         self.blocks_left -= len(some)
         self.passes.append((len(some), time.perf_counter() - start))
-
-
-def foretold(done: list[tuple[int, float]]) -> tuple[float, float]:
-    """Seconds to begin a pass and seconds of a block of it, from those of passes: a line, by least squares.
-
-    Of the last eight, without the first of all, which compiles kernels.
-    """
-    blocks, seconds = np.array(done[1:][-8:] or done).T
-    fastest = float((seconds / blocks).min())
-    if np.ptp(blocks) == 0:
-        return 0.0, fastest
-    each = float(np.clip(np.polyfit(blocks, seconds, 1)[0], 0.1 * fastest, fastest))
-    return max(float(np.median(seconds - each * blocks)), 0.0), each

@@ -13,6 +13,7 @@ import numpy as np
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse
+from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.run import OPTIONS, Shipped
@@ -266,12 +267,14 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
-    data = repair(stack, gradients="dx" in reads)
+    power = magnitude(stack)
+    data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
     with np.errstate(over="ignore", invalid="ignore"):
         image = entry.run(data, **values) + data.direct
         if data.caustic is not None:
             image += caustic.denoised(data, by_oidn="denoised" in reads)
+    image = enlarged(image, power)
     seconds = time.perf_counter() - start
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
@@ -279,7 +282,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         what = f"method '{name}'" if weights is None or weights.shipped else f"own network {weights}"
         raise NgptError(
             f"{stack.path}: {what} gave {lost} non-finite pixels; the largest input value is "
-            f"{np.abs(data.image).max():.3g}: scale the stack down, or use another method"
+            f"{enlarged(np.abs(data.image).max(), power):.3g}: scale the stack down, or use another method"
         )
     return Result(
         np.ascontiguousarray(image, np.float32),
@@ -291,6 +294,13 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         unusual(entry.options, {key: value for key, value in values.items() if key != "weights"}),
         () if own else tuple(layer for layer in entry.estimates if layer not in data.known_variances()),
     )
+
+
+def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:
+    """The stack without those layers of which nothing is known, and which are ``estimates`` of the method then."""
+    unknown = [name for name in estimates if name in stack and not np.isfinite(stack[name]).any()]
+    layers = {name: stack[name] for name in stack.names if name not in unknown}
+    return replace(stack, layers=layers) if unknown else stack
 
 
 def denoise(stack: GradientStack, method: str = "auto", **options) -> np.ndarray:

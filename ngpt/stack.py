@@ -19,7 +19,9 @@ class GradientStack:
     ``layers`` maps names of the contract (``ngpt.layers.LAYERS``) to C-contiguous float32 arrays (H, W, C): C is 3, and
     1 for depth and alpha. Given are arrays of any real type and memory layout, (H, W) too where C is 1; they are
     converted, without a copy where none is needed, and never modified. Every float value is legal, NaN and Inf
-    included. The last column of dx and the last row of dy are unused; they are kept as they are.
+    included. A layer of variances given in double precision stays so where float32 cannot hold it: light of 1e30 or
+    1e-30 has such variances. Files hold 32 bits of them. The last column of dx and the last row of dy are unused; they
+    are kept as they are.
 
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
     ``source`` is the file the stack was read from (``ngpt.io.exr.StackSource``), for what passes through it.
@@ -137,6 +139,10 @@ class GradientStack:
         return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path)
 
 
+# Where the largest variance is below this, float32 would lose digits of those that are 2^-40 of it.
+_DIM = 2.0**-86
+
+
 def _check_name(name: str, path: str) -> None:
     if name not in LAYERS:
         raise NgptError(f"{path}: no layer is called '{name}'; the layers are {', '.join(LAYERS)}")
@@ -157,6 +163,10 @@ def _as_layer(name: str, array: ArrayLike, path: str) -> np.ndarray:
         raise NgptError(f"{path}: layer '{name}' is {given.shape[1]}x{given.shape[0]}; it has no pixels to work on")
     with np.errstate(over="ignore"):
         layer = np.ascontiguousarray(given, dtype=np.float32)
+    if name.endswith("_var") and given.dtype.itemsize > 4:
+        largest = np.abs(given[np.isfinite(given)]).max(initial=0)
+        if largest > np.finfo(np.float32).max or 0 < largest < _DIM:
+            return np.ascontiguousarray(given, dtype=np.float64)
     if given.dtype.itemsize > 4:
         lost = np.isfinite(given) & ~np.isfinite(layer)
         if lost.any():

@@ -234,6 +234,52 @@ class Render(Work):
         return [sys.executable, "-m", "ngpt", "render", *words]
 
 
+# Renders of several passes, each of its own kind: what it adds to the command line.
+RENDERS = {
+    "adaptive": ("--adaptive", "--spp", 64, "--sampler", "gpt"),
+    "error": ("--error", 0.06, "--for", "wcv", "--sampler", "gpt"),
+    "photons": ("--sampler", "gpm", "--spp", 16),
+    "time": ("--time", 3, "--sampler", "gpt"),
+}
+
+
+class RenderOf(Work):
+    """``ngpt render`` of one of ``RENDERS``."""
+
+    def __init__(self, inputs: Path, what: str):
+        super().__init__(inputs)
+        self.what, self.name = what, f"ngpt render, {what}"
+
+    def arguments(self, out, words=None):
+        out.mkdir(exist_ok=True)
+        words = RENDERS[self.what] if words is None else words
+        scene = ["diffuse", "-o", out / "s.exr", "--size", "96x64", "--memory", 512, "--force"]
+        return [sys.executable, "-m", "ngpt", "render", *scene, *words]
+
+    def results(self, out):
+        """Layers and header but for the time it took; of a timed render, whether its header gives its bits again."""
+        seen: dict[str, object] = {}
+        for path in visible(out):
+            stack = ngpt.read(path)
+            seen[path.name] = self._content(stack)
+            if self.what == "time":
+                spp, more = stack.attributes["ngpt:spp"], stack.attributes["ngpt:samplerOptions"]
+                again = self.inputs / "again"
+                options = [word for option in more.split(", ") for word in ("-O", option)]
+                run = complete(self.arguments(again, ["--spp", spp, "--sampler", "gpt", *options]))
+                assert run.returncode == 0, run.stderr
+                seen[path.name] = self._content(ngpt.read(again / "s.exr")) == seen[path.name]
+        return seen
+
+    @staticmethod
+    def _content(stack):
+        told = {name: str(value) for name, value in stack.attributes.items() if name != "ngpt:seconds"}
+        return {name: stack[name].tobytes() for name in stack.names} | told
+
+    def is_part(self, seen, whole):
+        return seen.items() <= whole.items()
+
+
 class Demo(Work):
     name = "ngpt demo"
 
@@ -283,6 +329,13 @@ def make_work(kind: str, folder: Path) -> Work:
         pytest.importorskip(NEEDS[kind])
     (folder / "inputs").mkdir()
     return COMMANDS[kind](folder / "inputs")
+
+
+def make_render(what: str, folder: Path) -> Work:
+    """One of ``RENDERS``; skips the test where Mitsuba is not installed."""
+    pytest.importorskip("mitsuba")
+    (folder / "inputs").mkdir()
+    return RenderOf(folder / "inputs", what)
 
 
 def half_written(folder: Path) -> list[Path]:

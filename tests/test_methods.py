@@ -106,7 +106,7 @@ def test_converged_input_is_returned_unharmed(rng):
         (lambda s: reconstruct(s, "primal", alpha=1), "method 'primal' has no option 'alpha'"),
         (lambda s: reconstruct(GradientStack.from_arrays(primal=s["primal"]), "l1"), "method 'l1' needs layers 'dx'"),
         (lambda s: reconstruct(s.replace(primal=s["primal"] * np.nan)), "no finite pixel among 408"),
-        (lambda s: reconstruct(s.replace(primal=s["primal"] * 3e37, dx=s["dx"] * 1e38), "l2"), "non-finite pixels"),
+        (lambda s: reconstruct(s.replace(primal=s["primal"] * 3e37, dx=0 * s["dx"] + 3e38), "l2"), "non-finite pixels"),
     ],
 )
 def test_errors_name_the_problem(noisy_stack, call, message):

@@ -19,7 +19,7 @@ ngpt.system ngpt.options
 ngpt.report.display ngpt.report.png
 ngpt.api.tensors ngpt.layers ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack
-ngpt.renderer ngpt.repair ngpt.io
+ngpt.renderer ngpt.repair ngpt.magnitude ngpt.io
 ngpt.merging
 ngpt.classical
 ngpt.denoisers ngpt.sequence.wcv_frames

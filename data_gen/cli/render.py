@@ -18,6 +18,9 @@ from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.interrupts import Interrupt
 
+# How many times its time a render takes whose user is told why, where it made no more than so many samples per pixel.
+_LATE, _FEW = 1.2, 16
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", help="a Mitsuba 3 scene file, or a built-in scene (see `ngpt info`)")
@@ -174,6 +177,11 @@ def image(args: argparse.Namespace, console: Console) -> int:
     if interrupted := stop() and done != wanted:
         console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
+    if args.time is not None and took > _LATE * args.time and done <= _FEW:
+        console.say(
+            f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
+            "on this machine now; a smaller --size is"
+        )
     if "ngpt:for" in stack.attributes:
         console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {plan.method}")
     if args.json:

@@ -102,7 +102,7 @@ class Stream:
 
     def _take(self, future: Future) -> None:
         path = Path(self._temporary.name) / future.result()
-        shard = Shard(path)
+        shard = Shard(path, keep_open=True)
         told = shard.record["crops"]
         with self._changed:
             self._crops.extend(
@@ -110,5 +110,5 @@ class Stream:
                 for i, crop in enumerate(told)
             )
             self._changed.notify_all()
-        # Mapped into memory, it lives on for as long as one of its crops does.
+        # Kept open, it lives on for as long as one of its crops does.
         path.unlink()

@@ -67,7 +67,7 @@ def denoised(
         method, options = choose(("primal", *features)), {}
     light = {name: np.asarray(group, np.float32) for name, group in groups.items()}
     rest = stack["primal"] - np.sum(list(light.values()), axis=0, dtype=np.float64)
-    if np.nansum(np.abs(rest)) > NEGLIGIBLE * np.nansum(np.abs(stack["primal"])):
+    if np.nansum(np.abs(rest)) > NEGLIGIBLE * np.nansum(np.abs(stack["primal"]), dtype=np.float64):
         light[""] = rest.astype(np.float32)
     parts = {
         name: reconstruct(GradientStack({"primal": group, **features}, path=f"{stack.path}, {name}"), method, **options)

@@ -19,6 +19,8 @@ from itertools import product
 import numpy as np
 from scipy.ndimage import median_filter, uniform_filter
 
+from ngpt.magnitude import bound
+
 RADIUS = 9  # of the neighbourhood, 19x19 pixels
 PATCH = 3  # radius of the patches that are compared
 BANDWIDTHS = (0.5, 1.0)
@@ -44,13 +46,18 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
     image = np.clip(np.ldexp(image, -power), -FAR, FAR)
     variance = np.minimum(np.ldexp(variance, -2 * power), np.float32(FAR**2))
     design = _design(features, image.shape[:2])
-    trust = _trust(image, variance)
+    # Squares of fireflies beyond all measure would be infinite, and patches are no more alike for their exact light.
+    most = bound(image)
+    seen = image if most == np.inf else np.clip(image, -most, most)
+    variance = np.minimum(variance, np.float32(most) ** 2)
+    trust = _trust(seen, variance)
     results, errors = [], []
     for bandwidth in BANDWIDTHS:
-        result, own = _filtered(image, variance, trust, design, bandwidth)
+        result, own = _filtered(image, seen, variance, trust, design, bandwidth)
         results.append(result)
         # Stein: E|F - truth|² = E[|F - I|² - σ² + 2 σ² dF/dI].
-        error = np.mean((result - image) ** 2 - variance + 2 * variance * own[..., None], axis=-1)
+        off = np.clip(result, -most, most) - seen
+        error = np.mean(off**2 - variance + 2 * variance * own[..., None], axis=-1)
         errors.append(uniform_filter(error, 2 * RADIUS + 1))
     better = (errors[1] < errors[0]).astype(np.float32)
     share = uniform_filter(better, 2 * PATCH + 1)[..., None]
@@ -105,15 +112,18 @@ def _design(features: list[np.ndarray], size: tuple[int, int]) -> np.ndarray:
 
 
 def _filtered(
-    image: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
+    image: np.ndarray, seen: np.ndarray, variance: np.ndarray, trust: np.ndarray, design: np.ndarray, bandwidth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The collaborative fits at one bandwidth, and how much of itself each pixel keeps, about dF/dI."""
+    """The collaborative fits at one bandwidth, and how much of itself each pixel keeps, about dF/dI.
+
+    ``seen`` is the image by which patches are compared.
+    """
     n = design.shape[-1]
     rows, columns = np.triu_indices(n)
     products = design[..., rows] * design[..., columns]
     targets = (design[..., :, None] * image[..., None, :]).reshape(*image.shape[:2], -1)
     moments = np.concatenate([products, targets], axis=-1).astype(np.float32)
-    sums = _gathered(moments * trust, image, variance, bandwidth)
+    sums = _gathered(moments * trust, seen, variance, bandwidth)
     gram = np.empty((*image.shape[:2], n, n))
     gram[..., rows, columns] = gram[..., columns, rows] = sums[..., : len(rows)]
     # Ridge on the slopes only, in proportion to the weights' sum, so that flat features cannot make the fit unstable.
@@ -126,7 +136,7 @@ def _filtered(
     leverage = np.einsum("...i,...i", design, np.linalg.solve(gram, design[..., None].astype(np.float64))[..., 0])
     spread = np.concatenate([fits.reshape(*image.shape[:2], -1), np.ones((*image.shape[:2], 1), np.float32)], axis=-1)
     del sums, gram, right
-    gathered = _gathered(spread * trust, image, variance, bandwidth)
+    gathered = _gathered(spread * trust, seen, variance, bandwidth)
     fits = gathered[..., :-1].reshape(*image.shape[:2], n, 3) / gathered[..., -1:, None]
     return np.einsum("...i,...ic->...c", design, fits), np.clip(leverage, 0, 1)
 

@@ -266,7 +266,9 @@ def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
 
 
 def _holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
-    """Whether the channels ``names`` are ``values`` (H, W, C) float32, bit for bit."""
+    """Whether the channels ``names`` are ``values`` (H, W, C), of those that are float32 bit for bit."""
+    if values.dtype != np.float32:
+        return False
     return values.shape[:2] == part.channels[names[0]].shape and all(
         np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
         for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
@@ -345,8 +347,10 @@ def _scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bo
     if half:
         peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
         half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
-    for index, name in enumerate(names):
-        part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)
+    # Variances in double precision may be beyond floats: they are infinite in files, which counts as not known.
+    with np.errstate(over="ignore"):
+        for index, name in enumerate(names):
+            part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)
 
 
 def _is_half(part: ExrPart, names: tuple[str, ...]) -> bool:

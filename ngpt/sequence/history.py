@@ -30,6 +30,7 @@ from typing import Literal
 
 import numpy as np
 
+from ngpt.magnitude import WIDE, enlarged, magnitude, scaled
 from ngpt.repair import repair
 from ngpt.sequence.evidence import agreement, weighed
 from ngpt.sequence.network import Blend, Corrections, shipped
@@ -79,8 +80,9 @@ class Temporal:
         is the last frame's result where it is not the one that was returned; also the one before a first frame, whose
         features are not known then.
         """
-        data = repair(stack, gradients=False)
-        now = np.asarray(image, np.float32) - data.direct
+        power = magnitude(stack)
+        data = repair(scaled(stack, power), gradients=False)
+        now = enlarged(np.asarray(image, np.float32), -power) - data.direct
         frame = stack.number("ngpt:frame")
         relative = np.ones(now.shape[:2], np.float32)
         features = data.features
@@ -92,27 +94,33 @@ class Temporal:
                 before = _History(given, np.zeros_like(given), np.ones(given.shape[:2], np.float32), {})
             before = replace(before, light=given - before.direct)
         if before is not None and _follows(stack, before):
+            light_before = enlarged(before.light, -power)
+            noisy = data.image
+            if max(float(np.abs(light).max()) for light in (now, light_before, noisy)) > WIDE:
+                now, light_before, noisy = (light.astype(np.float64) for light in (now, light_before, noisy))
             motion = stack["motion"]
-            history, found = warped(before.light, motion, sharp=True)
+            history, found = warped(light_before, motion, sharp=True)
             spread = warped(before.variance[..., None], motion)[0][..., 0]
             then = {name: warped(layer, motion)[0] for name, layer in before.features.items() if name in features}
             trust = found * agreement(features, then, found)
             speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
             spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
             first = 1 / (1 + spread)
-            evidence = weighed(now, history, data.image, data.noise, trust, first)
+            evidence = weighed(now, history, noisy, data.noise, trust, first)
             if self.corrections is None:
                 b = evidence.share
                 now = now + b[..., None] * (history - now)
             else:
-                self.blend = Blend(now, history, data.image, evidence, trust, first, speed, features)
+                self.blend = Blend(now, history, noisy, evidence, trust, first, speed, features)
                 now, b = self.blend.by(self.corrections(self.blend.inputs()))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
             # They have noise as well, and are blended as the light is, that they stay those of its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
-        self._history = _History(now, data.direct, relative, features, frame)
-        return (now + data.direct).astype(np.float32)
+        # In the units of the stack: the next one may be of another magnitude.
+        light, direct = enlarged(now, power), enlarged(data.direct, power)
+        self._history = _History(light, direct, relative, features, frame)
+        return enlarged((now + data.direct).astype(np.float32), power)
 
     def assume(self, variance: float) -> None:
         """Takes the last result for one of so much of a frame's own variance, as of 1 / ``variance`` frames."""

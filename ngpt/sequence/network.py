@@ -64,7 +64,7 @@ class Blend:
     @cached_property
     def bands(self) -> np.ndarray:
         """D_s, (BANDS, H, W, 3), finest first: coarse ones are of what is trusted around a pixel."""
-        lows = [(self.history - self.now).astype(np.float32)]
+        lows = [self.history - self.now]
         trusted = self.trust[..., None] * lows[0]
         for scale in SCALES:
             weight = gaussian_filter(self.trust, scale, mode="nearest", truncate=2.5)
@@ -88,7 +88,7 @@ class Blend:
         energy = np.square(self.bands).mean(axis=-1).transpose(1, 2, 0)
         energy = gaussian_filter(energy, (2, 2, 0), mode="nearest") + 1e-6 * energy.mean() + 1e-30
         b = (shares * energy).sum(axis=-1) / energy.sum(axis=-1)
-        return image.astype(np.float32), b.astype(np.float32)
+        return image, b.astype(np.float32)
 
     def inputs(self) -> np.ndarray:
         """What the network sees, (H, W, len(INPUTS)) float32; the same at any exposure."""

@@ -17,6 +17,7 @@ import numpy as np
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
+from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.methods import METHODS, Result
 from ngpt.repair import Repaired, repair
 from ngpt.sequence.wcv_frames import Frame, Link, wcv_frames
@@ -57,15 +58,15 @@ def _follows(stack: GradientStack, before: GradientStack) -> bool:
 
 
 class _Member:
-    """A frame of a run, and the sum of its results so far."""
+    """A frame of a run, and the sum of its results so far, in 2^power of the light's units."""
 
     def __init__(self, number: int, stack: GradientStack):
-        self.number, self.stack = number, stack
+        self.number, self.stack, self.power = number, stack, 0
         self.sum, self.weight, self.seconds = np.zeros(stack["primal"].shape), 0.0, 0.0
 
     @cached_property
     def frame(self) -> Frame:
-        data, stack = self.data, self.stack
+        data, stack = self.data, scaled(self.stack, self.power)
         light = CLASSICAL["wcv"](data)
         apart = np.zeros_like(light) if data.caustic is None else caustic.denoised(data)
         link = None
@@ -76,10 +77,10 @@ class _Member:
     @cached_property
     def data(self) -> Repaired:
         self.stack.require(*METHODS["wcv"].needs, why="method 'wcv'")
-        return repair(self.stack)
+        return repair(scaled(self.stack, self.power))
 
     def result(self) -> tuple[int, GradientStack, Result]:
-        image = (self.sum / self.weight + self.data.direct).astype(np.float32)
+        image = enlarged((self.sum / self.weight + self.data.direct).astype(np.float32), self.power)
         if not np.isfinite(image).all():
             raise NgptError(f"{self.stack.path}: method 'wcv' over time gave non-finite pixels; scale the stacks down")
         return self.number, self.stack, Result(image, "wcv", self.seconds, self.data.pixels, self.data.gradients)
@@ -92,6 +93,7 @@ class _Run:
         self.wanted = wanted
         self.members: list[_Member] = []
         self.solved = 0  # of members, that were in a window
+        self.power: int | None = None  # the frames' common one, see ngpt.magnitude
 
     def add(self, member: _Member) -> Iterator[tuple[int, GradientStack, Result]]:
         self.members.append(member)
@@ -109,6 +111,11 @@ class _Run:
         if not any(self.wanted(member.number) for member in self.members):
             return
         begun = time.perf_counter()
+        if self.power is None:
+            powers = [magnitude(member.stack) for member in self.members]
+            self.power = sorted(powers)[length // 2]
+        for member in self.members:
+            member.power = self.power
         frames = [member.frame for member in self.members]
         images = wcv_frames(frames)
         seconds = (time.perf_counter() - begun) / length

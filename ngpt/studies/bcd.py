@@ -133,7 +133,8 @@ def _estimated(x: np.ndarray, variance: np.ndarray, chosen: np.ndarray, correlat
     mean = (share * x).sum(axis=1, keepdims=True)
     deviation = np.sqrt((share * variance).sum(axis=1))
     noise = deviation[:, :, None] * deviation[:, None] * correlation
-    noise += (1e-12 * np.mean(deviation**2) + 1e-300) * np.eye(size)
+    # Without any noise, what rounding leaves of patches that are all the same could not be inverted.
+    noise += max(1e-12 * np.mean(deviation**2), 1e-28 * np.mean(mean**2), 1e-300) * np.eye(size)
 
     def covariance(values: np.ndarray, mean: np.ndarray) -> np.ndarray:
         apart = np.where(chosen[..., None], values - mean, 0)

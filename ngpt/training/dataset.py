@@ -114,8 +114,8 @@ class Crop:
 class Dataset:
     """The crops of a training set, in the order of its manifest.
 
-    Opens the manifest only; a shard is checked and mapped into memory when one of its crops is read, and anew in each
-    process that an instance is sent to. Raises NgptError with the file and what is wrong with it: shards that are
+    Opens the manifest only; a shard is checked when one of its crops is read, and anew in each process that an instance
+    is sent to. Raises NgptError with the file and what is wrong with it: shards that are
     missing, are not those that the manifest tells the checksum of, or hold other tensors.
     """
 

@@ -26,8 +26,10 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -51,6 +53,9 @@ MOTION = "motion"
 
 # Pixels of motion that stand for motion that is not known: both lead out of any image.
 FAR = 1e6
+
+# Types of numbers in safetensors
+_TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I32": np.int32, "I64": np.int64}
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -146,9 +151,13 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
 
 
 class Shard:
-    """A shard opened for reading; tensors are mapped into memory and read piece by piece."""
+    """A shard for reading, tensors piece by piece.
 
-    def __init__(self, path: Path):
+    Nothing of it is mapped into memory: a file that is cut while it is mapped ends the process without a word.
+    ``keep_open``  whether it is opened once, so that it may be removed while it is read, and not for each piece
+    """
+
+    def __init__(self, path: Path, keep_open: bool = False):
         try:
             from safetensors import SafetensorError, safe_open
         except ModuleNotFoundError as error:
@@ -157,33 +166,66 @@ class Shard:
         if not path.is_file():
             raise NgptError(f"{path}: no such shard; make it again: python -m data_gen")
         try:
-            self._file = safe_open(path, framework="np")
-        except (OSError, SafetensorError) as error:
+            # It checks the header; tensors are read without it.
+            with safe_open(path, framework="np") as checked:
+                metadata = checked.metadata() or {}
+                self.names = tuple(checked.keys())
+            with open(path, "rb") as file:
+                length = int.from_bytes(file.read(8), "little")
+                header = json.loads(file.read(length))
+            self._kept = open(path, "rb", buffering=0) if keep_open else None  # noqa: SIM115 (closed with the shard)
+        except (OSError, SafetensorError, ValueError) as error:
             raise NgptError(f"{path}: cannot be read as a shard: {error}; make it again or remove it") from error
-        metadata = self._file.metadata() or {}
+        self._one_reader = Lock()
+        self._tensors = {name: header[name] for name in self.names}
+        self._first = 8 + length
         if "ngpt" not in metadata:
             raise NgptError(f"{path}: is no shard of a training set (its header has no 'ngpt' record)")
         self.record: dict[str, Any] = parse_json(metadata["ngpt"], f"{path}: its record")
         check(self.record, dict, f"{path}: its record")
-        self.names = tuple(self._file.keys())
 
     def shape(self, name: str) -> tuple[int, ...]:
-        return tuple(self._file.get_slice(name).get_shape())
+        return tuple(self._tensors[name]["shape"])
 
     def type(self, name: str) -> str:
         """As safetensors calls it, "F16"."""
-        return self._file.get_slice(name).get_dtype()
+        return self._tensors[name]["dtype"]
 
     def tensor(self, name: str) -> np.ndarray:
-        return self._file.get_tensor(name)
+        return self._part(name)
 
     def crop(self, name: str, crop: int) -> np.ndarray:
         """Tensor ``name`` of one crop, float32 (integers as they are)."""
-        return _single(self._file.get_slice(name)[crop : crop + 1][0])
+        return _single(self._part(name, crop))
 
     def input(self, name: str, crop: int, k: int) -> np.ndarray:
         """Tensor ``name`` of one input of one crop, float32."""
-        return _single(self._file.get_slice(name)[crop : crop + 1, k : k + 1][0, 0])
+        return _single(self._part(name, crop, k))
+
+    def _part(self, name: str, *index: int) -> np.ndarray:
+        """What the first indices leave of a tensor; raises NgptError where the file does not hold it any more."""
+        shape = self.shape(name)
+        array = np.empty(shape[len(index) :], _TYPES[self.type(name)])
+        place = int(np.ravel_multi_index(index, shape[: len(index)])) if index else 0
+        begin = self._first + self._tensors[name]["data_offsets"][0] + place * array.nbytes
+        room = array.reshape(-1).view(np.uint8)
+        try:
+            with (
+                nullcontext(self._kept) if self._kept else open(self.path, "rb", buffering=0) as file,
+                self._one_reader,
+            ):
+                file.seek(begin)
+                done = 0
+                while done < len(room) and (read := file.readinto(room[done:].data)):
+                    done += read
+        except OSError as error:
+            raise NgptError(f"{self.path}: cannot be read any more: {error.strerror}; copy it again") from error
+        if done < len(room):
+            raise NgptError(
+                f"{self.path}: ends amid tensor '{name}', after {begin + done} bytes: it was cut while it was in use; "
+                "copy it again, or make it again: python -m data_gen"
+            )
+        return array
 
 
 def _single(array: np.ndarray) -> np.ndarray:

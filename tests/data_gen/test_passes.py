@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -65,6 +66,81 @@ def test_time_is_kept_and_its_samples_are_those_of_spp(renderer):
     same(stack, render_stack(scene, spp, 3, points="rounds", sampler="gpt"))
     assert render_stack(scene, 2, seconds=100).attributes["ngpt:spp"] == 2
     assert render_stack(scene, None, seconds=1e-6).attributes["ngpt:spp"] >= 1  # at least something
+
+
+class Fake:
+    """A sampler whose passes take a known time by a clock of its own; it notes the blocks that it is given."""
+
+    def __init__(self, mitsuba, monkeypatch, begin, each, compile_once=0.0):
+        from data_gen import passes
+
+        self.mitsuba, self.begin, self.each, self.compile_once = mitsuba, begin, each, compile_once
+        self.now, self.blocks = 0.0, []
+        monkeypatch.setattr(passes.time, "perf_counter", lambda: self.now)
+        monkeypatch.setattr(passes, "compilation", self.compilation)
+
+    @contextmanager
+    def compilation(self):
+        compiled = []
+        yield compiled
+        self.now += self.compile_once
+        compiled.append(self.compile_once)
+        self.compile_once = 0.0
+
+    def __call__(self, camera, film):
+        lanes = len(camera.pixel)
+        n = lanes // camera.pixels
+        self.now += self.begin + self.each * n
+        self.blocks += [camera.block] * (n // camera.block)
+        film.put("primal", self.mitsuba.Color3f(1) + self.mitsuba.Float(camera.sample))
+
+
+@pytest.mark.parametrize("begin", [0, 0.5])
+@pytest.mark.parametrize("each", [0.06, 0.4, 1.7])
+@pytest.mark.parametrize("compile_once", [0, 4])
+def test_time_is_kept_whatever_a_sample_takes(renderer, monkeypatch, begin, each, compile_once):
+    from data_gen.passes import render_passes
+
+    sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
+    fake = Fake(renderer, monkeypatch, begin, each, compile_once)
+    film = render_passes(fake, sensor, 0, None, seconds=10, points="rounds")
+    assert 8 <= fake.now <= 12
+    # What the header says gives the same blocks again.
+    again = Fake(renderer, monkeypatch, 0, 0)
+    render_passes(again, sensor, 0, film.samples, points="rounds")
+    assert again.blocks == fake.blocks and sum(fake.blocks) == film.samples
+
+
+def test_what_takes_longer_than_the_time_is_rendered_once(renderer, monkeypatch):
+    from data_gen.passes import render_passes
+
+    sensor = load(renderer, "diffuse", (128, 64)).sensors()[0]
+    fake = Fake(renderer, monkeypatch, 0, 20)
+    assert render_passes(fake, sensor, 0, None, seconds=10, points="rounds").samples == 1
+    fake = Fake(renderer, monkeypatch, 0, 3)
+    assert render_passes(fake, sensor, 0, None, seconds=10, batch=4).samples == 4
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("sampler", ["gpt", "primal", "bdpt", "ppm"])
+def test_time_is_kept_on_a_busy_machine(renderer, tmp_path, sampler):
+    """Beside two processes that never rest; the second time, since the first may compile kernels for longer."""
+    import ngpt
+
+    busy = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(2)]
+    try:
+        out, words = tmp_path / "s.exr", ["glossy", "--size", "160x90", "--time", "10", "--sampler", sampler, "--force"]
+        for _ in range(2):
+            run = subprocess.run(
+                [sys.executable, "-m", "ngpt", "render", *words, "-o", out], capture_output=True, text=True
+            )
+            assert run.returncode == 0, run.stderr
+    finally:
+        for process in busy:
+            process.kill()
+            process.wait()
+    stack = ngpt.read(out)
+    assert 8 <= stack.attributes["ngpt:seconds"] <= 12 or "it took longer than 10 s: kernels and a least" in run.stdout
 
 
 def test_stopping_keeps_the_samples_done(renderer):

@@ -8,18 +8,30 @@ import time
 
 import numpy as np
 import pytest
-from processes import ROOT, children, complete, ended, make_work, running, start, temporary_files, wait_for
+from processes import (
+    RENDERS,
+    ROOT,
+    children,
+    complete,
+    ended,
+    make_render,
+    make_work,
+    running,
+    start,
+    temporary_files,
+    wait_for,
+)
 from reliability import record
 
 from ngpt.system.files import exclusive
 
 
-def kill_campaign(kind, folder, kills):
+def kill_campaign(job, folder, kills):
     """Kills runs that continue each other, at moments spread over a whole run and, every other time, while they write.
 
     After ten kills, or when one is faster than its killer, what was made is compared, and the next starts from nothing.
     """
-    job, rng, clock = make_work(kind, folder), np.random.default_rng(1), time.monotonic()
+    rng, clock = np.random.default_rng(1), time.monotonic()
     whole = folder / "whole"
     undisturbed = complete(job.arguments(whole))
     assert undisturbed.returncode == 0, undisturbed.stderr
@@ -59,14 +71,22 @@ def kill_campaign(kind, folder, kills):
 
 @pytest.mark.parametrize(("kind", "kills"), [("denoise", 4), pytest.param("train", 2, marks=pytest.mark.slow)])
 def test_a_few_kills(tmp_path, kind, kills):
-    kill_campaign(kind, tmp_path, kills)
+    kill_campaign(make_work(kind, tmp_path), tmp_path, kills)
 
 
 @pytest.mark.slow
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("kind", ["denoise", "data_gen", "train"])
 def test_a_hundred_kills(tmp_path, kind):
-    kill_campaign(kind, tmp_path, 100)
+    kill_campaign(make_work(kind, tmp_path), tmp_path, 100)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("what", RENDERS)
+def test_kills_of_renders_of_several_passes(tmp_path, what):
+    """The same command again leaves the bits of one that was left alone, and nothing else."""
+    kill_campaign(make_render(what, tmp_path), tmp_path, 6)
 
 
 WORKERS = """

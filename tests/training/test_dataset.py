@@ -269,6 +269,27 @@ def test_shards_with_other_tensors_are_refused(folder):
         Shard(shard)
 
 
+def test_a_shard_that_is_cut_while_it_is_read_is_named(folder):
+    """Were it mapped into memory, the process would end without a word."""
+    path, _ = folder
+    shard = path / "shards" / "a-000.safetensors"
+    data = Dataset(path)
+    whole = data[0].stack(1)["primal"]
+    content = shard.read_bytes()
+    with open(shard, "r+b") as file:
+        file.truncate(len(content) // 3)
+    with pytest.raises(NgptError, match=r"a-000\.safetensors: ends amid tensor '\w+', after \d+ bytes: it was cut"):
+        for crop in (data[0], data[1]):
+            crop.stack(0), crop.stack(1), crop.reference
+    shard.write_bytes(content)
+    assert np.array_equal(data[0].stack(1)["primal"], whole)
+    kept, light = Shard(shard, keep_open=True), data[0].reference_direct
+    shard.unlink()
+    assert np.array_equal(kept.crop("reference_direct", 0), light)
+    with pytest.raises(NgptError, match=r"a-000\.safetensors: cannot be read any more: No such file"):
+        data[0].stack(0)
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -1,0 +1,89 @@
+"""Light of any exposure, brought to where single precision holds its squares, and back.
+
+Methods square light, weigh by variances and add small numbers to what they divide by. All of that is done in single
+precision, which ends at 2^±127: squares of light above 2^63 are infinite, and those below 2^-63 are nothing. So a stack
+whose typical light is beyond 2^±``ORDINARY`` is multiplied by a power of two before a method sees it, and the result is
+multiplied back. Both are exact. Any other stack stays as it is, bit for bit.
+
+Variances may have left single precision before: those of light of 1e-30 are 1e-60. ``GradientStack`` keeps what it is
+given in double precision. In files, and in arrays of single precision, they are 0 or infinite. Infinite ones count as
+not known, as everywhere. Those of 0 do so where light is so dim that a variance of its own size could be 0.
+"""
+
+import math
+
+import numpy as np
+
+from ngpt.layers import LAYERS, RGB
+from ngpt.stack import GradientStack
+
+# Binary digits between typical light and 1 that methods are made for: a millionth to a million.
+ORDINARY = 20
+# The largest light has at most so many binary digits before the point: its square is a float.
+_LARGEST = 62
+# Typical light below 2^-_DIM has variances whose zeros say nothing: a millionth of its square is below 2^-148.
+_DIM = 64
+# Numbers that are looked at for what is typical; no multiple of 3 apart, so that they are of all colours.
+_LOOKED_AT = 1 << 16
+
+# Sums of squares of light beyond this leave single precision.
+WIDE = 2.0**60
+
+LIGHT = tuple(name for name, layer in LAYERS.items() if layer.channels == RGB and name != "albedo")
+VARIANCES = tuple(name for name in LIGHT if name.endswith("_var"))
+
+
+def magnitude(stack: GradientStack) -> int:
+    """The power of two of the typical light of a stack; 0 where that is ordinary, and where there is no light.
+
+    Typical is the median of the primal's finite values but 0. Where the largest are so far beyond it that their squares
+    would not be finite, it is larger.
+    """
+    primal = stack["primal"]
+    flat = primal.reshape(-1)
+    step = max(flat.size // _LOOKED_AT, 1)
+    typical = _median(flat[:: step + (step % 3 == 0)])
+    typical = typical or _median(flat)
+    if not typical:
+        return 0
+    power = math.frexp(typical)[1] - 1
+    if power < -ORDINARY:
+        layers = (stack[name] for name in ("primal", "dx", "dy") if name in stack)
+        largest = max(float(np.abs(layer[np.isfinite(layer)]).max(initial=0)) for layer in layers)
+        power = max(power, math.frexp(largest)[1] - _LARGEST)
+    return power if abs(power) > ORDINARY else 0
+
+
+def bound(image: np.ndarray) -> float:
+    """What light in an image is beyond all measure: infinity for ordinary images, and where some of it is above
+    ``WIDE``, single fireflies of typical images, 2^``ORDINARY`` times what is typical."""
+    if np.abs(image).max(initial=0) <= WIDE:
+        return math.inf
+    return min(max(_median(image.reshape(-1)), 2.0**-_LARGEST) * 2.0**ORDINARY, WIDE)
+
+
+def _median(values: np.ndarray) -> float:
+    """Of the absolute values that are finite and not 0; 0 for none."""
+    sizes = np.abs(values[np.isfinite(values) & (values != 0)])
+    return float(np.median(sizes)) if sizes.size else 0.0
+
+
+def scaled(stack: GradientStack, power: int) -> GradientStack:
+    """The stack with 2^-power times its light, all layers in single precision; itself where nothing changes."""
+    changed = {}
+    for name in stack.names:
+        layer = stack[name]
+        if name in VARIANCES and (power or layer.dtype != np.float32):
+            with np.errstate(over="ignore", under="ignore"):
+                variance = np.ldexp(layer, -2 * power).astype(np.float32)
+            lost = power < -_DIM and layer.dtype == np.float32
+            changed[name] = np.where(layer == 0, np.float32(np.nan), variance) if lost else variance
+        elif name in LIGHT and power:
+            changed[name] = enlarged(layer, -power)
+    return stack.replace(**changed) if changed else stack
+
+
+def enlarged(light: np.ndarray, power: int) -> np.ndarray:
+    """2^power times the light, of its type; infinite where that cannot hold it."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.ldexp(light, power) if power else light
