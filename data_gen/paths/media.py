@@ -197,3 +197,22 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
     after = si.spawn_ray(ray.d)
     after.maxt = ray.maxt - hit.t
     return after, dr.select(si.is_medium_transition(), si.target_medium(ray.d), medium)
+
+
+def onward(ray, hit, medium, reach: mi.Float, target: mi.Point3f | None) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Float]:
+    """``beyond()``, and what is left of ``reach``; toward the ``target``, where there is one and it is finite.
+
+    Behind a boundary a ray is displaced along the normal. One that grazes a surface then misses the target there by
+    more than it is shortened, and would be blocked by the target's own surface.
+    """
+    after, there = beyond(ray, hit, medium)
+    left = reach - hit.t
+    if target is None:
+        return after, there, left
+    aims = dr.isfinite(target.x)
+    si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal)
+    return (
+        dr.select(aims, si.spawn_ray_to(target), after),
+        there,
+        dr.select(aims, dr.norm(target - after.o), left),
+    )
