@@ -143,7 +143,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 
 
 @dr.syntax
-def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, active, target=None):
+def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
     """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
 
     Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.

@@ -133,8 +133,8 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
     # Ratio tracking: at each collision of the majorant what is null goes on.
-    every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "active": active}
-    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every)
+    every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "target": None}
+    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every, active=active)
     return dr.exp(-τ) * N, hit, ray
 
 
@@ -147,8 +147,8 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
-    none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "active": active}
-    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none)
+    none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "target": None}
+    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none, active=active)
     return dr.select(M > 0, 0, dr.exp(-τ)), hit, ray
 
 
