@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.media import beyond, pick
+from data_gen.paths.media import beyond, onward, pick
 
 
 @dataclass
@@ -143,7 +143,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
 
 
 @dr.syntax
-def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, active):
+def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, target, active):
     """As ``segments.cross()``, where there are grids, with ``most`` collisions at most, their steps ``scale`` long.
 
     Returns the same, τ being that of homogeneous media, and M and ∏ σn / μ_c.
@@ -177,19 +177,20 @@ def cross(passes, trace, ray, medium, reach, *, channel, key, scale, most, activ
         # Nothing comes through what is opaque to the majorant.
         crossing &= dr.max(N) > 0
         if crossing & fresh:
-            reach -= hit.t
-            ray, medium = beyond(ray, hit, medium)
+            ray, medium, reach = onward(ray, hit, medium, reach, target)
     return τ, hit, ray, medium, M, N
 
 
-def rescale(passes, trace, ray, medium, reach, base: Collisions, *, channel, active, to_surface: bool = False) -> tuple:
+def rescale(
+    passes, trace, ray, medium, reach, base: Collisions, *, channel, active, target=None, to_surface: bool = False
+) -> tuple:
     """The null collisions of a ``base`` segment on another way, to its end or ``to_surface``: m_i' = m_i M' / M.
 
     Returns τ of homogeneous media, what is met, the last piece of the ray, the medium there, the integrand of the list
     with its Jacobian over the density of that of the base path, and of that the colour c, which is the ratio of the
     densities.
     """
-    way = {"channel": channel, "key": base.key}
+    way = {"channel": channel, "key": base.key, "target": target}
     # First without collisions, for M'
     none, one = mi.UInt32(0), mi.Float(1)
     τ, hit, last, end, M, N = cross(passes, trace, ray, medium, reach, **way, scale=one, most=none, active=active)

@@ -197,3 +197,19 @@ def beyond(ray: mi.Ray3f, hit: mi.PreliminaryIntersection3f, medium: mi.MediumPt
     after = si.spawn_ray(ray.d)
     after.maxt = ray.maxt - hit.t
     return after, dr.select(si.is_medium_transition(), si.target_medium(ray.d), medium)
+
+
+def onward(ray, hit, medium, reach: mi.Float, target: mi.Point3f | None) -> tuple[mi.Ray3f, mi.MediumPtr, mi.Float]:
+    """``beyond()``, and what is left of ``reach``; aimed at the ``target`` anew, where there is one and it is finite.
+
+    Behind a boundary a ray is displaced along the normal. If it grazes the surface of its target it would meet that
+    before the target, by more than rays to a point are shortened, and seem to be blocked.
+    """
+    after, there = beyond(ray, hit, medium)
+    left = reach - hit.t
+    if target is None:
+        return after, there, left
+    aims, to = dr.isfinite(target.x), target - after.o
+    length = dr.norm(to)
+    aimed = mi.Ray3f(after.o, to / length, length * (1 - mi.math.ShadowEpsilon), ray.time, ray.wavelengths)
+    return dr.select(aims, aimed, after), there, dr.select(aims, length, left)

@@ -26,7 +26,7 @@ import mitsuba as mi
 
 from data_gen.paths import collisions
 from data_gen.paths.collisions import Collisions
-from data_gen.paths.media import Media, Place, beyond, depth, extinction, pick, shortened
+from data_gen.paths.media import Media, Place, beyond, depth, extinction, onward, pick, shortened
 
 
 @dataclass
@@ -104,10 +104,11 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
 
 
 @dr.syntax
-def cross(passes, trace, ray, medium, reach, active):
+def cross(passes, trace, ray, medium, reach, active, target=None):
     """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
 
-    Returns τ, the surface, the last piece of the ray, and the medium there.
+    With a ``target``, where that is finite, each piece aims at it anew: see ``media.onward()``. Returns τ, the surface,
+    the last piece of the ray, and the medium there.
     """
     ray, medium, reach = mi.Ray3f(ray), mi.MediumPtr(medium), mi.Float(reach)
     τ = dr.zeros(mi.Spectrum, dr.width(ray.o))
@@ -119,8 +120,7 @@ def cross(passes, trace, ray, medium, reach, active):
         τ += depth(extinction(medium, ray), dr.select(hit.is_valid(), hit.t, reach))
         crossing &= hit.is_valid() & passes(hit.shape)
         if crossing:
-            reach -= hit.t
-            ray, medium = beyond(ray, hit, medium)
+            ray, medium, reach = onward(ray, hit, medium, reach, target)
     return τ, hit, ray, medium
 
 
@@ -133,8 +133,8 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
     # Ratio tracking: at each collision of the majorant what is null goes on.
-    every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "active": active}
-    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every)
+    every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "target": None}
+    τ, hit, ray, _, _, N = collisions.cross(media.passes, trace, ray, medium, reach, **every, active=active)
     return dr.exp(-τ) * N, hit, ray
 
 
@@ -147,8 +147,8 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray
-    none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "active": active}
-    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none)
+    none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "target": None}
+    τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none, active=active)
     return dr.select(M > 0, 0, dr.exp(-τ)), hit, ray
 
 
@@ -171,13 +171,13 @@ def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, c
     is blocked. The Jacobian of x1 itself is not in them.
     """
     reach, medium = dr.select(x1.is_valid(), dr.norm(x1.p - ray.o), dr.inf), place.toward(y, ray.d)
-    trace = next_surface(scene)
+    trace, target = next_surface(scene), dr.select(x1.is_valid(), x1.p, dr.inf)
     if media.grids:
         τ, hit, _, medium, N, N_c = collisions.rescale(
-            media.passes, trace, ray, medium, reach, base.nulls, channel=channel, active=active
+            media.passes, trace, ray, medium, reach, base.nulls, channel=channel, active=active, target=target
         )
     else:
-        τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active)
+        τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active, target)
         N, N_c = 1, 1
     # In what is around x1 both paths must have come: a boundary may have holes.
     blocked = hit.is_valid() | (medium != base.place.medium)

@@ -94,7 +94,7 @@ class Filled(Space):
         return Drawn(channel, segments.draw(random, self.media), random.next_key() if self.grids else None)
 
     def first(self, view, ray, within, drawn: Drawn) -> Segment:
-        trace = partial(view.first_surface, self.scene)
+        trace = partial(view.first_surface, self.scene, self.media)
         return segments.fly(self.media, trace, ray, within, drawn.channel, drawn.numbers, active=mi.Bool(True))
 
     def fly(self, x, place: Place, ray, drawn: Drawn, active) -> Segment:

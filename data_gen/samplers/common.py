@@ -99,21 +99,24 @@ class GradientIntegrator(mi.SamplingIntegrator):
         lines = "".join(f"  {name} = {written(value)},\n" for name, value in (limits | self.options).items())
         return f"{type(self).__name__}[\n{lines}]"
 
-    def first_hit(self, scene, ray, active=True) -> mi.PreliminaryIntersection3f:
+    def first_hit(self, scene, ray, active=True, *, coherent=True) -> mi.PreliminaryIntersection3f:
         """Where a camera ray leads, through lamps that hide from the camera."""
         ray = mi.Ray3f(ray)
-        hit = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+        hit = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
         if self.hide_emitters:
             lamp = hit.is_valid() & (hit.shape.emitter() != None)  # noqa: E711 - a comparison of arrays of pointers
             si = hit.compute_surface_interaction(ray, mi.RayFlags.Minimal, lamp)
             hit = dr.select(lamp, self.skip_area_emitters(scene, si.spawn_ray(ray.d), True, lamp), hit)
         return hit
 
-    def first_surface(self, scene, ray, medium, active) -> mi.PreliminaryIntersection3f:
+    def first_surface(self, scene, media: Media, ray, medium, active) -> mi.PreliminaryIntersection3f:
         """The same of a piece of such a ray; as in ``volpath``, lamps in a medium are dark there, but seen."""
-        hit = self.first_hit(scene, ray, active)
+        # Where a boundary lies in a surface, coherent rays meet the boundary half as often as others; those of
+        # ``volpath`` are never coherent.
+        coherent = not media.boundaries
+        hit = self.first_hit(scene, ray, active, coherent=coherent)
         if self.hide_emitters:
-            found = scene.ray_intersect_preliminary(ray, coherent=True, active=active)
+            found = scene.ray_intersect_preliminary(ray, coherent=coherent, active=active)
             hit = dr.select(medium == None, hit, found)  # noqa: E711 - a comparison of arrays of pointers
         return hit
 
@@ -131,7 +134,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
         """The layer ``direct``: lamps and the environment as seen through homogeneous media, the expectation."""
         if not self.limits.shows:
             return mi.Spectrum(0)
-        trace = partial(self.first_surface, scene)
+        trace = partial(self.first_surface, scene, media)
         T, hit, ray = segments.clear_view(media, trace, ray, within, channel, mi.Bool(True))
         si = hit.compute_surface_interaction(ray)
         return T * si.emitter(scene).eval(si, hit.is_valid() if media.grids else mi.Bool(True))

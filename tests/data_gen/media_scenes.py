@@ -78,6 +78,34 @@ def nested():
     }
 
 
+def hovering():
+    """A wide box of fog a little above the floor: light goes to and fro between them at grazing angles."""
+    return above_the_floor(0.05)
+
+
+def standing():
+    """A box of fog whose lower face lies in the floor, before a sky."""
+    return above_the_floor(0.0) | {"sky": {"type": "constant", "radiance": _rgb(1, 1, 1)}}
+
+
+def above_the_floor(gap):
+    import mitsuba as mi
+
+    box = mi.ScalarTransform4f().translate([0, gap - 0.6, 0]).scale([0.8, 0.4, 0.8])
+    scene = room({"sigma_t": 0.1}) | {
+        "box": {
+            "type": "cube",
+            "to_world": box,
+            "bsdf": {"type": "null"},
+            "interior": {"type": "homogeneous", "albedo": 0.8, "sigma_t": 1.2},
+        }
+    }
+    for name in ("air", "wall", "back", "ball", "lamp") if not gap else ("air", "ball"):
+        del scene[name]
+    del scene["sensor"]["medium"]
+    return scene
+
+
 def smoke():
     """A cloud whose density varies, in a box that is larger, between a ball, the floor and a lamp."""
     return cloudy(grid(1))

@@ -249,16 +249,18 @@ def reconnect(scene, plan: Plan, step: Step, own: Own, move: Move) -> Move:
     # An escape is a vertex at infinity: all directions to it are the same one.
     x1, y = step.x1, own.y
     reaches = x1.is_valid()
-    direction = dr.select(reaches, dr.normalize(x1.p - y.p), step.x.to_world(step.wo))
+    ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(step.x.to_world(step.wo)))
+    direction = ray.d
 
     # ---------------------- Its throughput -----------------------
     # In the measure of areas J would be 1 (survey, section 3.3); all densities here are in solid angle.
     in_medium = media.scatters(step.segment.place)
-    J = dr.select(reaches, shift.reconnection_jacobian(step.x.p, y.p, x1.p, x1.n, in_medium), 1)
+    # Rays begin a little above their surface, which in a scene of millimetres, or a kilometre away, is not little.
+    origin = step.x.spawn_ray_to(x1.p).o
+    J = dr.select(reaches, shift.reconnection_jacobian(origin, ray.o, x1.p, x1.n, in_medium), 1)
     f, p = media.evaluate_vertex(own.bsdf, y, own.place, y.to_local(direction))
     # Rejected if occluded, unlike a shadow ray: nobody samples a path through an obstacle, so none is shifted back.
     # Where p = 0 that is so already.
-    ray = dr.select(reaches, y.spawn_ray_to(x1.p), y.spawn_ray(direction))
     T, T_c, occluded = plan.space.reconnect(y, own.place, ray, x1, step.segment, step.drawn, active=p > 0)
 
     # ---------------------- Emission at x1 -----------------------

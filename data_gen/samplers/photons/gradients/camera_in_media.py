@@ -53,7 +53,7 @@ class PathsByPieces(CameraPaths):
         pieces, fog = [], self.world.fog
         for path in (self.first(*ray) for ray in rays):
             medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, dr.width(path.ray)))
-            path.hit = self.integrator.first_surface(self.world.scene, path.ray, medium, mi.Bool(True))
+            path.hit = self.integrator.first_surface(self.world.scene, fog.media, path.ray, medium, mi.Bool(True))
             pieces.append(Piece(**vars(path), medium=medium, σ=media.extinction(medium, path.ray)))
         return replace(start, paths=pieces)
 
@@ -88,7 +88,7 @@ class PathsByPieces(CameraPaths):
             if not self.limits.hide_emitters:
                 hit = scene.ray_intersect_preliminary(ray, active=alive)
             else:
-                seen = self.integrator.first_surface(scene, ray, medium, alive & (depth == 1))
+                seen = self.integrator.first_surface(scene, self.world.fog.media, ray, medium, alive & (depth == 1))
                 hit = dr.select(depth == 1, seen, scene.ray_intersect_preliminary(ray, active=alive & (depth > 1)))
             pieces.append(replace(piece, hit=hit, medium=medium, σ=media.extinction(medium, ray)))
         return self.of_lanes(level, pieces, random.at(lanes), lanes)

@@ -51,7 +51,7 @@ class PathsBySegments(CameraPaths):
     def begun(self, start: Level, random, rays: list) -> Level:
         random, flights, behind, fog = random.clone(), [], [], self.world.fog
         channel, numbers = media.choose_channel(random.next_1d()), segments.draw(random, fog.media)
-        trace = partial(self.integrator.first_surface, self.world.scene)
+        trace = partial(self.integrator.first_surface, self.world.scene, fog.media)
         for path in (self.first(*ray) for ray in rays):
             medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, dr.width(path.ray)))
             segment = segments.fly(fog.media, trace, path.ray, medium, channel, numbers, active=path.alive)

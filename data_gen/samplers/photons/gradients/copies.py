@@ -95,7 +95,7 @@ def copy(
     if world.fog is None:
         hit, Φ = world.scene.ray_intersect(way.ray, good), way.Φ * J
     else:
-        passage = let_through(world, way, mi.Float(dr.inf), good, to_surface=True)
+        passage = let_through(world, way, good)
         hit = passage.met.compute_surface_interaction(passage.ray, active=good)
         Φ, r = way.Φ * (J * passage.T), r * passage.T_c
     moved = Photon(hit.p, hit.n, way.ray.d, Φ)
@@ -112,7 +112,7 @@ def copy_in_medium(
     J = shift.jacobian_in_medium(way.base_length2, way.length2)
     r = way.ratio * J
     good = active & way.leads(target, r)
-    passage = let_through(world, way, dr.norm(target - way.ray.o), good)
+    passage = let_through(world, way, good, target)
     good &= ~passage.met.is_valid() & (passage.medium == photon.medium)
 
     # -------------- What is scattered there, over the density of the place --------------
@@ -132,8 +132,9 @@ def copy_in_medium(
     return Photon(target, photon.n, way.ray.d, mi.Spectrum(Φ)), r * (σ_c / base_σ_c), good
 
 
-def let_through(world: World, way: Way, reach: mi.Float, active, to_surface: bool = False) -> Passage:
-    """What comes through on the way, over the distance ``reach`` or up to a surface."""
+def let_through(world: World, way: Way, active, target: mi.Point3f | None = None) -> Passage:
+    """What comes through on the way, to the ``target`` or up to a surface."""
+    reach = mi.Float(dr.inf) if target is None else dr.norm(target - way.ray.o)
     fog, ray, through = world.fog, media.shortened(way.ray, reach), way.through
     trace = segments.next_surface(world.scene)
     if through.nulls is not None:
@@ -146,10 +147,11 @@ def let_through(world: World, way: Way, reach: mi.Float, active, to_surface: boo
             through.nulls,
             channel=through.channel,
             active=active,
-            to_surface=to_surface,
+            target=target,
+            to_surface=target is None,
         )
     else:
-        τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active)
+        τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active, target)
         N, N_c = 1, 1
     T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
     return Passage(T, T_c, met, ray, medium)
@@ -227,8 +229,8 @@ def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
     if fog.media.grids:
         # Of the way back the majorant's optical depth M alone: with no collision to place
         back, none = media.shortened(back, reach), mi.UInt32(0)
-        steps = {"channel": photon.channel, "key": none, "scale": mi.Float(1), "most": none, "active": mi.Bool(True)}
-        τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, **steps)
+        steps = {"channel": photon.channel, "key": none, "scale": mi.Float(1), "most": none, "target": None}
+        τ, _, _, medium, M, _ = collisions.cross(fog.media.passes, trace, back, medium, reach, **steps, active=True)
         key, n, N_c = (dr.gather(type(v), v, photon.place) for v in (photons.key, photons.nulls, photons.N_c))
         nulls = Collisions(key, n, M, N_c)
     elif not fog.media.boundaries:

@@ -177,7 +177,7 @@ def _by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, e
         # ------------------ A piece of a segment ------------------
         first = depth == 1
         if dr.hint(limits.hide_emitters, mode="scalar"):
-            hit = integrator.first_surface(scene, ray, medium, active & first)
+            hit = integrator.first_surface(scene, fog.media, ray, medium, active & first)
             later = scene.ray_intersect_preliminary(ray, active=active & ~first)
             hit = dr.select(first, hit, later)
         else:

@@ -140,7 +140,7 @@ def by_vertices(integrator: PhotonIntegrator, world: World, start: Start, near, 
     depth = mi.UInt32(1)  # edges up to the vertex si
     # ------------------------- The first vertex --------------------------
     if dr.hint(fog is not None, mode="scalar"):
-        channel, first = media.choose_channel(random.next_1d()), partial(integrator.first_surface, scene)
+        channel, first = media.choose_channel(random.next_1d()), partial(integrator.first_surface, scene, fog.media)
         segment, si = fog.fly(first, ray, fog.within, channel, random, mi.Bool(True))
         place, Le = segment.place, importance * integrator.lamps_in_fog(scene, fog.media, ray, fog.within, channel)
         β *= fog.brought(segment, channel)
