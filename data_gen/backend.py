@@ -3,6 +3,7 @@
 from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
 from ngpt.errors import NgptError, stop_if_interrupted
+from ngpt.system.install import install_command
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -16,9 +17,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         import mitsuba as mi
     except ModuleNotFoundError as error:
-        raise NgptError(
-            "rendering needs Mitsuba 3, which is not installed; `pip install 'ngpt-recon[render]'`"
-        ) from error
+        raise NgptError(f"rendering needs Mitsuba 3, which is not installed; `{install_command('render')}`") from error
     except (ImportError, NameError) as error:
         # Dr.Jit fails with a NameError of its own when a system library is missing; the cause is one below it.
         cause = error.__context__ or error

@@ -14,7 +14,8 @@ from typing import NamedTuple, NoReturn
 
 from ngpt.errors import NgptError
 from ngpt.system.console import Console, run_command
-from ngpt.system.parts import NO_RENDERER, brought
+from ngpt.system.install import install_command
+from ngpt.system.parts import brought, no_renderer
 from ngpt.version import __version__
 
 
@@ -93,7 +94,7 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     """Of all ``verbs``, with the arguments of the one that is called."""
     if called and called not in verbs and verbs.keys() == VERBS.keys():
-        raise NgptError(f"there is no verb '{called}' here; {NO_RENDERER}")
+        raise NgptError(f"there is no verb '{called}' here; {no_renderer()}")
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
@@ -121,6 +122,4 @@ def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[s
     except ModuleNotFoundError as error:
         if not verb.extra:
             raise
-        raise NgptError(
-            f"{args.verb} needs the package '{error.name}'; `pip install 'ngpt-recon[{verb.extra}]'`"
-        ) from error
+        raise NgptError(f"{args.verb} needs the package '{error.name}'; `{install_command(verb.extra)}`") from error

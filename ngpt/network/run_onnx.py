@@ -16,6 +16,7 @@ from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network import tiles
 from ngpt.network.exposure import statistics
+from ngpt.system.install import package_command
 from ngpt.system.limits import free_address_space, processors
 
 # MiB that the network may use beside the image's own layers: 1280x720 in one tile, where two take a quarter longer.
@@ -201,7 +202,7 @@ def session(path: str, _modified: int, device: str, threads: int):
     try:
         import onnxruntime
     except ModuleNotFoundError as error:
-        raise NgptError("ONNX Runtime is not installed: pip install onnxruntime") from error
+        raise NgptError(f"ONNX Runtime is not installed: {package_command('onnxruntime')}") from error
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
     # Off already where ngpt was imported before it

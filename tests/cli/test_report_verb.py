@@ -11,6 +11,7 @@ from ngpt.io.exr import write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
+from ngpt.system.install import install_command
 
 
 @pytest.fixture
@@ -95,7 +96,7 @@ def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkey
     words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
     assert main(["report", *words]) == 0
     output, messages = capfd.readouterr()
-    assert "FLIP needs flip-evaluator: pip install 'ngpt-recon[peers]'" in messages and "FLIP" not in output
+    assert f"FLIP needs flip-evaluator: {install_command('peers')}" in messages and "FLIP" not in output
     assert "a.exr: 2.0 stops brighter than" in messages
     assert facts(tmp_path / "page.html")["maps"] == []
 
