@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -196,17 +197,23 @@ class Network:
         return session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
 
 
-@lru_cache(maxsize=8)
-def session(path: str, _modified: int, device: str, threads: int):
-    """The session of a file; made again when the file has changed."""
+def runtime() -> Any:
+    """The module of ONNX Runtime, which sends nothing. Raises NgptError where it is not installed."""
     try:
         import onnxruntime
     except ModuleNotFoundError as error:
         raise NgptError(f"ONNX Runtime is not installed: {package_command('onnxruntime')}") from error
+    # Off already (ngpt/__init__.py), unless a program had loaded it before us.
+    onnxruntime.disable_telemetry_events()
+    return onnxruntime
+
+
+@lru_cache(maxsize=8)
+def session(path: str, _modified: int, device: str, threads: int):
+    """The session of a file; made again when the file has changed."""
+    onnxruntime = runtime()
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
-    # Off already where ngpt was imported before it
-    onnxruntime.disable_telemetry_events()
     provider, available = DEVICES[device], onnxruntime.get_available_providers()
     if provider not in available:
         have = [name for name, provider in DEVICES.items() if provider in available]

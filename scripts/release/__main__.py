@@ -34,7 +34,7 @@ TRIALS: dict[str, tuple[str, list[str]]] = {
 NOISY = """
 import numpy as np, ngpt
 rng = np.random.default_rng(0)
-layers = {name: rng.gamma(1.0, 1.0, (24, 32, 3)) for name in ("primal", "dx", "dy", "albedo", "normal")}
+layers = {name: rng.gamma(1.0, 1.0, (24, 32, 3)) for name in ("primal", "primal_var", "dx", "dy", "albedo", "normal")}
 stack = ngpt.GradientStack.from_arrays(**layers, depth=np.ones((24, 32)))
 ngpt.write("noisy.exr", stack)
 """
