@@ -1,9 +1,13 @@
 """The Mitsuba variant: which one is used, and what has to be in place before it starts."""
 
+import logging
+
 from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.system.install import install_command
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -38,6 +42,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     except (ImportError, RuntimeError) as error:
         stop_if_interrupted(error)
         raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
+    _LOG.info("Mitsuba %s, variant %s", mi.__version__, name)
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)
     import drjit as dr

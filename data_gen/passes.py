@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -16,6 +17,8 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.streams import ROUND, first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 Progress = Callable[[int, int], None]
 # What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
@@ -96,6 +99,8 @@ def render_passes(
             film.end_pass(min(n, block))
         dr.sync_thread()
         now = time.perf_counter()
+        first = ", kernels compiled or loaded" if film.samples == n else ""
+        _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
         time_left = float("inf") if seconds is None else seconds - (now - start)
         each = (now - begin) / n * block
         finished = film.samples >= total or stop() or time_left < each

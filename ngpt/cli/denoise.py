@@ -27,6 +27,7 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
+from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, read_image, write
 from ngpt.measure.metrics import compare
@@ -37,18 +38,21 @@ from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
+from ngpt.system.files import check_output, make_folder
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns")
+    parser.add_argument(
+        "stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns; -: standard input"
+    )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OUT",
-        help=f"file for one stack, folder for several (default: STACK{RESULT_SUFFIX}.exr beside each)",
+        help=f"file for one stack, folder for several; folders are made (default: STACK{RESULT_SUFFIX}.exr beside "
+        "each); -: standard output",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -112,6 +116,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    if args.json and args.output == STREAM:
+        raise NgptError("-o - and --json both want standard output; leave one out")
+    with as_files(args.stacks, args.output) as (args.stacks, args.output):
+        return denoise(args, console)
+
+
+def denoise(args: argparse.Namespace, console: Console) -> int:
     files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
@@ -287,11 +298,12 @@ def describe(report: dict) -> str:
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Where the result of each source goes; makes the output folder if there is to be one."""
+    """Where the result of each source goes; makes the output folder where there is none."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
     elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
         targets = [Path(output)]
+        make_folder(targets[0].parent)
     else:
         folder = Path(output)
         named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
@@ -302,8 +314,5 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
         if repeated:
             raise NgptError(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
+        make_folder(folder)
     return list(zip(sources, targets, strict=True))

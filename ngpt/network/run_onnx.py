@@ -5,6 +5,7 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
@@ -19,6 +20,8 @@ from ngpt.network import tiles
 from ngpt.network.exposure import statistics
 from ngpt.system.install import package_command
 from ngpt.system.limits import free_address_space, processors
+
+_LOG = logging.getLogger(__name__)
 
 # MiB that the network may use beside the image's own layers: 1280x720 in one tile, where two take a quarter longer.
 MEMORY = 3072
@@ -148,6 +151,7 @@ class Network:
             raise NgptError(f"network {self.path} needs layers {', '.join(missing)}, which are not given")
         height, width = layers["primal"].shape[:2]
         pieces, (rows, columns) = self.plan(height, width, memory, batch)
+        _LOG.debug("%s: %d tiles of %dx%d", self.path, len(pieces), columns, rows)
         shared = statistics(layers)
         image = np.empty((height, width, 3), np.float32)
         progress(0, len(pieces))
@@ -231,6 +235,7 @@ def session(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"{path}: ONNX Runtime cannot load it: {one_line(error)}") from error
     if session.get_providers()[0] != provider:
         raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
+    _LOG.info("%s: ONNX Runtime %s, %s", path, onnxruntime.__version__, provider)
     return session
 
 

@@ -4,6 +4,7 @@ Everything goes to standard error; standard output is kept for results (JSON, ta
 """
 
 import io
+import logging
 import os
 import signal
 import sys
@@ -142,6 +143,31 @@ def _own_stderr() -> Iterator[None]:
             yield
         finally:
             sys.stderr = stream
+
+
+class _Handler(logging.Handler):
+    """Log records as messages, each to where standard error leads then: above a bar, where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_line(self.format(record), sys.stderr)
+
+
+@contextmanager
+def logged(wanted: bool) -> Iterator[None]:
+    """Shows what the logger "ngpt" is told, down to the details, where that is ``wanted``."""
+    if not wanted:
+        yield
+        return
+    logger, handler = logging.getLogger("ngpt"), _Handler()
+    handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
 
 
 class Console:

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from traces import spoken_to, traced, written
 
 import ngpt
-from traces import spoken_to, traced, written
 
 pytest.importorskip("onnxruntime")
 
