@@ -23,6 +23,10 @@ from ngpt.system.limits import address_space
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
 
+# Columns that a bar takes beside its label: with all of its parts, with a rate too, and with numbers and time left
+# alone. The first has to leave so many for the label.
+WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
+
 # MiB of address space.
 FEWEST_MIB = 512
 
@@ -221,7 +225,7 @@ class _Pace:
         pace = (done - before) / (self.elapsed - then) if self.elapsed > then else 0.0
         if self.elapsed > 1.01 * self.past[-1][0]:
             self.past.append((self.elapsed, done))
-        words = [f"{pace:.3g} {self.unit}/s"] if self.rate and pace else []
+        words = [f"{pace:{'.0f' if pace >= 100 else '.3g'}} {self.unit}/s"] if self.rate and pace else []
         if pace and done < total:
             words.append(f"about {_span((total - done) / pace)} left")
         return words
@@ -239,21 +243,43 @@ def _span(seconds: float) -> str:
 def _bar(label: str, unit: str, rate: bool) -> Iterator[Callable[[int, int], None]]:
     # Imported only here: a pipeline without a terminal does not pay for it.
     from rich.console import Console as Terminal
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
 
-    columns = (
+    terminal = Terminal(stderr=True)
+    columns: list[ProgressColumn] = [
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TextColumn(unit),
         TimeElapsedColumn(),
         TextColumn("{task.fields[pace]}"),
-    )
-    pace = _Pace(unit, rate)
+    ]
+    pace, tell, taken = _Pace(unit, rate), ", ".join, WIDE + (RATE if rate else 0)
+    if terminal.width < taken + LABEL:
+        # What counts is how far it is and how long it takes.
+        columns, tell, taken = [columns[0], columns[2], columns[5]], _last, NARROW
+    label = _shortened(label, terminal.width - taken)
     # Lines on standard output go above the bar, unless they go into a file.
-    with Progress(*columns, console=Terminal(stderr=True), redirect_stdout=sys.stdout.isatty()) as progress:
+    with Progress(*columns, console=terminal, redirect_stdout=sys.stdout.isatty()) as progress:
         task = progress.add_task(label, total=None, pace="")
-        yield lambda done, total: progress.update(task, completed=done, total=total, pace=", ".join(pace(done, total)))
+        yield lambda done, total: progress.update(task, completed=done, total=total, pace=tell(pace(done, total)))
+
+
+def _shortened(text: str, most: int) -> str:
+    """Its end, where names differ, in ``most`` letters at most."""
+    return text if len(text) <= most else f"…{text[len(text) - most + 1 :]}" if most > 1 else ""
+
+
+def _last(words: list[str]) -> str:
+    """Of the pace, the time that is left."""
+    return words[-1].removeprefix("about ") if words else ""
 
 
 class _Lines:
