@@ -41,7 +41,10 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         make_classes()
     except (ImportError, RuntimeError) as error:
         stop_if_interrupted(error)
-        raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
+        told = " ".join(str(error).split())
+        if name.startswith("cuda") and "hasn't been initialized" in told:
+            told = f"no NVIDIA driver was found; use {DEFAULT_VARIANT}, which runs on the CPU"
+        raise NgptError(f"variant '{name}' cannot start: {told}") from error
     _LOG.info("Mitsuba %s, variant %s", mi.__version__, name)
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)

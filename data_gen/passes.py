@@ -17,6 +17,7 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.streams import ROUND, first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
+from ngpt.system.limits import memory as machine_memory
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
@@ -194,8 +195,11 @@ def lanes_within(
         width = 1 << (lanes - 1).bit_length()
         needed = -(-(film.bytes + lane_bytes * width) // 2**20)
         other = instead((memory * 2**20 - film.bytes) // width)
+        there = machine_memory() // 2**20
+        remedy = "render a smaller image" if needed > there else f"pass --memory {needed}, or render a smaller image"
+        limit = f"this machine has {there} MiB" if needed > there else f"{memory} MiB are allowed"
         raise NgptError(
-            f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {memory} MiB are "
-            f"allowed; pass --memory {needed}, or render a smaller image{other}"
+            f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {limit}; "
+            f"{remedy}{other}"
         )
     return most

@@ -38,7 +38,7 @@ from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import check_output, make_folder
+from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
 
@@ -301,9 +301,8 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
     """Where the result of each source goes; makes the output folder where there is none."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
-    elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
+    elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
         targets = [Path(output)]
-        make_folder(targets[0].parent)
     else:
         folder = Path(output)
         named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
@@ -314,5 +313,8 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
         if repeated:
             raise NgptError(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
-        make_folder(folder)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
     return list(zip(sources, targets, strict=True))

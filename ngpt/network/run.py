@@ -44,7 +44,7 @@ class Shipped:
         if find_spec("onnxruntime") is None:
             return f"ONNX Runtime is not installed: {package_command('onnxruntime')}"
         if not self.path.is_file():
-            return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
+            return "no network is shipped for it: pass --weights FILE (weights=FILE), .onnx or .safetensors"
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:

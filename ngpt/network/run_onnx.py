@@ -68,7 +68,7 @@ class Network:
             self.bytes = int(metadata["ngpt.bytes per pixel"])
         except (KeyError, ValueError) as error:
             raise NgptError(
-                f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
+                f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
         # Direct emission is taken out, and pixels are repaired, before layers come here: the graph, which does so for
         # other hosts, is told that there is none. Graphs of earlier versions do not ask.
@@ -197,7 +197,7 @@ class Network:
 
     def _session(self, path: Path):
         if not path.is_file():
-            raise NgptError(f"{path}: no such file; `python -m export` writes it")
+            raise NgptError(f"{path}: no such file; `ngpt export` writes it")
         return session(str(path), path.stat().st_mtime_ns, self.device, self.threads)
 
 

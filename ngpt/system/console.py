@@ -231,6 +231,11 @@ class _Pace:
         return words
 
 
+def brief(value: float) -> str:
+    """A positive number with two digits, or all that are before the point: 0.35, 4.2, 126."""
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
+
+
 def _span(seconds: float) -> str:
     """A duration, roughly."""
     for unit, size in (("s", 1), ("min", 60)):

@@ -40,14 +40,6 @@ def check_output(path: str | os.PathLike, overwrite: bool = False) -> Path:
     return path
 
 
-def make_folder(folder: Path) -> None:
-    """Makes a folder for results, and those above it, where they are not there. Raises NgptError where it cannot."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
-
-
 @contextmanager
 def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Path]:
     """Yields a temporary path beside ``path`` and renames it to ``path`` when the block succeeds.

@@ -156,7 +156,7 @@ class Shard:
             raise NgptError(f"training sets need safetensors; `{install_command('train')}`") from error
         self.path = path
         if not path.is_file():
-            raise NgptError(f"{path}: no such shard; make it again: python -m data_gen")
+            raise NgptError(f"{path}: no such shard; make it again: ngpt dataset")
         try:
             self._file = safe_open(path, framework="np")
         except (OSError, SafetensorError) as error:

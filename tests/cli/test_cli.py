@@ -243,7 +243,7 @@ def test_render_errors(renderer, tmp_path, capfd, monkeypatch):
         (["render", "t.xml"], "t.xml: no such file"),
         (["render", "diffuse", "--variant", "scalar_rgb"], "'scalar_rgb' is not one"),
         (["render", "diffuse", "--sampler", "best"], "unknown sampler 'best'"),
-        (["render", "diffuse", "--size", "30000x30000"], "pass --memory"),
+        (["render", "diffuse", "--size", "30000x30000"], "; render a smaller image"),
         (["render", "t.xml", "--spp", "9999999999"], "9999999999 samples per pixel"),
         (["render", "diffuse", "-o", "no/s.exr"], "the folder no does not exist"),
         (["info", "moving.xml"], "animated transforms"),

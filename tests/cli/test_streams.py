@@ -32,8 +32,8 @@ def test_one_end_may_be_a_file(noisy, tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO((tmp_path / noisy).read_bytes())))
     assert main(["denoise", "-", "-o", "from/here/", "-m", "l1"]) == 0
     assert (tmp_path / "from" / "here" / "standard-input.exr").is_file()
-    assert main(["denoise", noisy, "-o", "new/folder/of.exr", "-m", "l1"]) == 0
-    assert (tmp_path / "new" / "folder" / "of.exr").is_file()
+    assert main(["denoise", noisy, "-o", "new/folder", "-m", "l1"]) == 0
+    assert (tmp_path / "new" / "folder" / noisy).is_file()
 
 
 @pytest.mark.parametrize(
