@@ -53,7 +53,8 @@ def check_scene(scene: object) -> mi.Scene:
         raise NgptError(f"'{scene}' is a scene's name; load it: data_gen.load_scene('{scene}')")
     if kind == "Scene":
         raise NgptError(f"the scene is of another variant than the current one, '{mi.variant()}'; load it again")
-    raise NgptError(f"a {kind} is given where a scene is wanted; give an mi.Scene")
+    article = "an" if kind[0] in "aeiou" else "a"
+    raise NgptError(f"{article} {kind} is given where a scene is wanted; give an mi.Scene")
 
 
 def complaint(error: Exception) -> str:

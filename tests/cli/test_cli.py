@@ -121,6 +121,20 @@ def test_diff_says_whether_images_agree(tmp_path, rng, capsys):
     assert main(["diff", c, a]) == 1  # where they can be compared they are equal, but they do not agree
 
 
+def test_diff_tells_what_the_eye_sees_where_the_packages_are(tmp_path, rng, capsys, monkeypatch):
+    pytest.importorskip("skimage")
+    pytest.importorskip("flip_evaluator")
+    image = rng.random((16, 15, 3)).astype(np.float32)
+    a, b = str(ngpt.write(tmp_path / "a.exr", image)), str(ngpt.write(tmp_path / "b.exr", image + 0.1))
+    assert main(["diff", a, b, "--json"]) == 1
+    metrics = json.loads(capsys.readouterr().out)["metrics"]
+    assert 0 < metrics["SSIM"] < 1 and 0 < metrics["FLIP"] < 1
+    monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda name: None)
+    assert main(["diff", a, b]) == 1
+    output, errors = capsys.readouterr()
+    assert "SSIM" not in output and "SSIM needs scikit-image" in errors and "FLIP needs flip-evaluator" in errors
+
+
 def test_diff_judges_the_result_of_a_result_file(tmp_path, stack_file):
     source, target = stack_file(), tmp_path / "out.exr"
     main(["denoise", source, "-o", str(target), "-q"])

@@ -87,6 +87,8 @@ def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, image, capfd):
     page.touch()
     assert main(["report", a, "-o", str(page)]) == 2
     assert "exists already" in capfd.readouterr().err and page.read_text() == ""
+    assert main(["report", a, "-o", str(page.with_suffix(""))]) == 2
+    assert "let it end in .html" in capfd.readouterr().err and not page.with_suffix("").exists()
 
 
 def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
