@@ -26,8 +26,7 @@ def takes_files(action: argparse.Action) -> bool:
 
 
 _ZSH = """\
-#compdef ngpt
-autoload -U +X compinit && compinit
+(( $+functions[compdef] )) || { autoload -U +X compinit && compinit }
 autoload -U +X bashcompinit && bashcompinit
 """
 

@@ -53,8 +53,8 @@ def test_words_are_completed(name, words, expected, capfd, tmp_path):
     if name == "fish":
         source = f"{script}\ncomplete -C 'ngpt {' '.join(words)}'\n"
     elif name == "zsh":
-        # Without a line editor there is nobody to ask compinit for; as bashcompinit does, with arrays from 0.
-        script = "compdef() { :; }\n" + script.replace("&& compinit", "")
+        # Without a line editor nobody completes, so compinit is left out. With arrays from 0, as bashcompinit has it.
+        script = "compdef() { :; }\n" + script
         source = f"{script}\nemulate sh" + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
     else:
         source = script + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
