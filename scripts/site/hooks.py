@@ -1,5 +1,4 @@
-"""What the site adds to docs/: a menu, a reference of Python and one of commands, and the files outside docs/ that pages
-link to.
+"""What the site adds to docs/: a menu, references of Python and commands, and what pages link to outside docs/.
 
 The pages are written for the forge, where a link leads to any file of the repository. The site gets a copy of each such
 file under ``repository/``, Markdown as a page, so that one link works in both places.
