@@ -2,7 +2,7 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow reliability check docs bench setup-demo setup-dev setup-quick setup-docs
+.PHONY: demo quick test test-slow reliability check docs wheel release bench setup-demo setup-dev setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
@@ -36,6 +36,14 @@ check: setup-dev docs
 # leads nowhere fails.
 docs: setup-docs
 	NO_MKDOCS_2_WARNING=1 $(PY) -m mkdocs build --strict --config-file scripts/site/mkdocs.yml
+
+# A file that pip installs elsewhere: dist/ngpt_recon-VERSION-py3-none-any.whl.
+wheel: setup-dev
+	$(PY) -m hatchling build -t wheel -d dist
+
+# The files of a release, each extra tried in a fresh environment (some 10 minutes).
+release: setup-dev
+	$(PY) -m scripts.release -o dist
 
 bench: setup-dev
 	$(PY) -m bench.sampler -o bench/results/sampler.json

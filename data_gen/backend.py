@@ -1,8 +1,13 @@
 """The Mitsuba variant: which one is used, and what has to be in place before it starts."""
 
+import logging
+
 from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
+from ngpt.system.install import install_command
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 DEFAULT_VARIANT = "llvm_ad_rgb"
 
@@ -16,9 +21,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     try:
         import mitsuba as mi
     except ModuleNotFoundError as error:
-        raise NgptError(
-            "rendering needs Mitsuba 3, which is not installed; `pip install 'ngpt-recon[render]'`"
-        ) from error
+        raise NgptError(f"rendering needs Mitsuba 3, which is not installed; `{install_command('render')}`") from error
     except (ImportError, NameError) as error:
         # Dr.Jit fails with a NameError of its own when a system library is missing; the cause is one below it.
         cause = error.__context__ or error
@@ -38,7 +41,11 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
         make_classes()
     except (ImportError, RuntimeError) as error:
         stop_if_interrupted(error)
-        raise NgptError(f"variant '{name}' cannot start: {' '.join(str(error).split())}") from error
+        told = " ".join(str(error).split())
+        if name.startswith("cuda") and "hasn't been initialized" in told:
+            told = f"no NVIDIA driver was found; use {DEFAULT_VARIANT}, which runs on the CPU"
+        raise NgptError(f"variant '{name}' cannot start: {told}") from error
+    _LOG.info("Mitsuba %s, variant %s", mi.__version__, name)
     # Without this, every scene loaded prints its timings.
     mi.set_log_level(mi.LogLevel.Error)
     import drjit as dr

@@ -73,10 +73,11 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
     """What materials, lights and media mean for a stack, whoever renders it, a line for each thing that matters."""
-    lines = []
+    refusals: dict[str, list[str]] = {}
     for name, sampler in by_standing("use").items():
         if reason := sampler.refuses(facts):
-            lines.append(f"`--sampler {name}` refuses: {reason}")
+            refusals.setdefault(reason.replace(f"'{name}'", "the sampler"), []).append(name)
+    lines = [f"refused by {', '.join(names)}: {reason}" for reason, names in refusals.items()]
     if facts.media and not facts.integrator.startswith("vol"):
         lines.append(
             f"media are in the scene, but '{facts.integrator}' does not render them: use -D integrator=volpath or alike"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import logging
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +18,9 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.streams import ROUND, first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
+from ngpt.system.limits import memory as machine_memory
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 Progress = Callable[[int, int], None]
 # What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
@@ -122,6 +126,8 @@ def render_passes(
             film.end_pass(min(n, size))
             dr.sync_thread()
         now = time.perf_counter()
+        first = ", kernels compiled or loaded" if not done else ""
+        _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
         done.append((n, max(now - begin - sum(compiled), 1e-6)))
         if n % size or film.samples >= total or stop():
             break
@@ -248,8 +254,11 @@ def lanes_within(
         width = 1 << (lanes - 1).bit_length()
         needed = -(-(film.bytes + lane_bytes * width) // 2**20)
         other = instead((memory * 2**20 - film.bytes) // width)
+        there = machine_memory() // 2**20
+        remedy = "render a smaller image" if needed > there else f"pass --memory {needed}, or render a smaller image"
+        limit = f"this machine has {there} MiB" if needed > there else f"{memory} MiB are allowed"
         raise NgptError(
-            f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {memory} MiB are "
-            f"allowed; pass --memory {needed}, or render a smaller image{other}"
+            f"{film.width}x{film.height} pixels need {needed} MiB of memory beside the scene, and {limit}; "
+            f"{remedy}{other}"
         )
     return most

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from typing import Any
@@ -15,10 +16,13 @@ from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
+from data_gen.scenes.load import check_scene
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import with_channels
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 
 def render_stack(
@@ -55,7 +59,7 @@ def render_stack(
     Raises NgptError for options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
     check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
-    facts = scene_facts(scene)
+    facts = scene_facts(check_scene(scene))
     if sampler == "auto":
         sampler, _ = choose(facts)
     entry = find(sampler, facts)
@@ -67,6 +71,7 @@ def render_stack(
     settings = entry.settings(options)
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
+    _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
     start = time.perf_counter()
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}

@@ -7,6 +7,7 @@ for frame, stack in data_gen.render_frames("shot.xml", range(120), spp=16, camer
 
 from __future__ import annotations
 
+import logging
 import sys
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
     from data_gen.adaptive import Adaptive
     from data_gen.choosing.plans import Plan
     from data_gen.frames.camera_path import CameraPath
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 DEFAULT_SPP = 32
 
@@ -97,6 +100,7 @@ def render_scene(
     plan = None
     if pilot:
         plan = _plan(scene, spp, seconds, method, memory, said, stop)
+        _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
         sharing = _adaptive(None, "auto") if plan.shared else None
@@ -163,6 +167,11 @@ def render_frames(
     def describe(frame: int) -> tuple[str, dict[str, str]]:
         return filled(scene, frame), {name: filled(text, frame) for name, text in parameters.items()}
 
+    if not isinstance(scene, str):
+        raise NgptError(
+            f"a shot is of a scene file or a built-in scene, and a {type(scene).__name__} is given; give its name, or "
+            "make a data_gen.frames.shot.Shot of what changes"
+        )
     describe(frames[0])
     _start(variant)
     from data_gen.frames.camera_path import read_camera_path
@@ -203,10 +212,11 @@ def _start(variant: str | None) -> None:
 
 
 def _loaded(scene: mi.Scene | str | Path, size: tuple[int, int] | None, parameters: Mapping[str, str] | None):
-    from data_gen.scenes.load import load_scene
+    from data_gen.scenes.load import check_scene, load_scene
 
     if isinstance(scene, str | Path):
         return load_scene(str(scene), size, dict(parameters or {}))
+    check_scene(scene)
     if size is not None or parameters:
         raise NgptError("a scene that is loaded has its size and parameters; load it with them: data_gen.load_scene")
     return scene

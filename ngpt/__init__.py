@@ -8,9 +8,11 @@ image = ngpt.denoise(noisy, albedo=albedo, normal=normal)       # arrays, tensor
 denoiser = ngpt.Denoiser(size, albedo=True, normals=True)       # called as mi.OptixDenoiser is
 temporal = ngpt.Temporal()                                      # frames of a shot: image = temporal.next(stack, image)
 
-help(ngpt.denoise) lists the methods, what they need, and their options.
+help(ngpt.denoise) lists the methods, what they need, and their options. The logger "ngpt" says what is read, chosen and
+run.
 """
 
+import logging
 import os
 from importlib import import_module
 from typing import TYPE_CHECKING
@@ -30,6 +32,9 @@ if TYPE_CHECKING:
 # Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this once, as it is loaded, and
 # who loads it first may not be us: exporters of PyTorch do, too.
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
+
+# Quiet, unless a program asks: logging.getLogger("ngpt").setLevel("INFO"), with a handler of its own.
+logging.getLogger("ngpt").addHandler(logging.NullHandler())
 
 __all__ = [
     "METHODS",

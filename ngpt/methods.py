@@ -3,6 +3,7 @@
 A new method is one more entry in ``METHODS``; the command line, the reports and the tables find it there.
 """
 
+import logging
 import time
 from collections.abc import Callable, Container
 from dataclasses import dataclass, field, replace
@@ -21,6 +22,8 @@ from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 from ngpt.studies import bcd, guided, norms, patches
+
+_LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -276,6 +279,9 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
             image += caustic.denoised(data, by_oidn="denoised" in reads)
     image = enlarged(image, power)
     seconds = time.perf_counter() - start
+    _LOG.info("%s: method %s, %.3g s, options %s", stack.path, name, seconds, values or "none")
+    if data.pixels or data.gradients:
+        _LOG.info("%s: %d pixels repaired, %d differences left out", stack.path, data.pixels, data.gradients)
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
     if lost:

@@ -23,6 +23,7 @@ from data_gen.passes import DEFAULT_MEMORY, film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
 from ngpt.errors import NgptError
+from ngpt.system.console import brief
 
 # Of the time that there is, what trials of samplers may take together, and those and the methods: of an image, and
 # of a render, where no method is measured but the quickest
@@ -226,7 +227,7 @@ def judge(default: str, times: dict[str, float]) -> tuple[str, str]:
     best = min(times, key=lambda name: times[name])
     if times[best] * _MARGIN > times[default]:
         best = default
-    others = [f"{times[name] / times[best]:.2g} times as long by '{name}'" for name in times if name != best]
+    others = [f"{brief(times[name] / times[best])} times as long by '{name}'" for name in times if name != best]
     found = f"to a given error it takes {', '.join(others)}" if others else "there was time for no other"
     return best, f"chosen by a pilot: {found}"
 
@@ -240,7 +241,7 @@ def _why(ranked: Sequence[Pipeline], seconds: float) -> str:
     errors: dict[str, tuple[float, Pipeline]] = {}
     for p in ranked:
         errors.setdefault(p.sampler, (p.expected(p.samples(seconds)), p))
-    (least, first), *others = errors.values()
-    what = f"expected to leave an error of {math.sqrt(least):.2g} by '{first.method}'"
-    rivals = [f"{math.sqrt(e):.2g} by '{p.sampler}' and '{p.method}'" for e, p in others]
-    return ", ".join([what, *rivals])
+    (least, _), *others = errors.values()
+    what = f"expected to leave an error of {brief(math.sqrt(least))}"
+    rivals = [f"{brief(math.sqrt(e))} by sampler '{p.sampler}' and method '{p.method}'" for e, p in others]
+    return f"{what}, and {', '.join(rivals)}" if rivals else what

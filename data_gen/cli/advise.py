@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ngpt.cli.arguments import add_json, assignment, duration, print_json, size
 from ngpt.errors import NgptError
-from ngpt.system.console import Console, tell
+from ngpt.system.console import Console, brief, tell
 
 if TYPE_CHECKING:
     from data_gen.choosing.pipelines import Pipeline
@@ -89,7 +89,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
             found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp)))
     if not found and seconds is not None:
         least = min(p.takes(max(p.least, 2)) for p in pipelines)
-        raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {least:.2g} s")
+        raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {brief(least)} s")
     if not found:
         raise NgptError(f"no method reaches an error of {error:g} with fewer than {LARGEST_SPP} samples; ask for more")
     found.sort(key=lambda row: row.error if seconds is not None else row.seconds)

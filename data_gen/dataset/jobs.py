@@ -15,6 +15,7 @@ from data_gen.dataset.config import Config, Job, as_json
 from data_gen.dataset.crops import make_shard
 from ngpt.errors import NgptError
 from ngpt.system.files import exclusive
+from ngpt.system.install import install_command
 from ngpt.system.workers import end_with_parent
 from ngpt.system.writing import write_json
 from ngpt.training.dataset import FORMAT, MANIFEST, VERSION, checksum, read_manifest
@@ -59,7 +60,7 @@ def cluster(address: str) -> Iterator[Executor]:
     try:
         from distributed import Client
     except ModuleNotFoundError as error:
-        raise NgptError("a Dask cluster needs distributed; `pip install 'ngpt-recon[cluster]'`") from error
+        raise NgptError(f"a Dask cluster needs distributed; `{install_command('cluster')}`") from error
     try:
         client = Client(address, timeout="20s")
     except OSError as error:

@@ -192,7 +192,8 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     if name not in SAMPLERS:
         near = get_close_matches(name, [*SAMPLERS, *FRAME_SAMPLERS], 1)
         meant = f"did you mean '{near[0]}'? " if near else ""
-        raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}")
+        shots = f"; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
+        raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}{shots}")
     sampler = SAMPLERS[name]
     if facts is not None and (reason := sampler.refuses(facts)):
         able = [other for other in SAMPLERS.values() if not other.refuses(facts)]

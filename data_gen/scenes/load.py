@@ -42,6 +42,21 @@ def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[
     return scene
 
 
+def check_scene(scene: object) -> mi.Scene:
+    """The scene, where it is one of the current variant. Raises NgptError for what has to be loaded first."""
+    if isinstance(scene, mi.Scene):
+        return scene
+    kind = type(scene).__name__
+    if isinstance(scene, dict):
+        raise NgptError("a dictionary describes a scene and is none; load it: mi.load_dict(scene)")
+    if isinstance(scene, str | Path):
+        raise NgptError(f"'{scene}' is a scene's name; load it: data_gen.load_scene('{scene}')")
+    if kind == "Scene":
+        raise NgptError(f"the scene is of another variant than the current one, '{mi.variant()}'; load it again")
+    article = "an" if kind[0] in "aeiou" else "a"
+    raise NgptError(f"{article} {kind} is given where a scene is wanted; give an mi.Scene")
+
+
 def complaint(error: Exception) -> str:
     """What Mitsuba says is wrong with a scene, in one line, and in our words where its own do not help."""
     text = " ".join(str(error).split())

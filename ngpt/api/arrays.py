@@ -7,15 +7,16 @@ clean = denoiser(noisy, albedo, normals, sensor.world_transform().inverse())
 
 import inspect
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar, overload
 
 import numpy as np
 
-from ngpt.api.tensors import is_bitmap, layer, like, to_numpy
+from ngpt.api.tensors import Bitmap, Image, Kind, Tensor, Transform, is_bitmap, layer, like, to_numpy
 from ngpt.errors import NgptError
 from ngpt.io.aliases import resolve
 from ngpt.methods import METHODS, by_standing, reconstruct
+from ngpt.options import Value
 from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
 
@@ -48,23 +49,48 @@ def _with_methods(thing: T) -> T:
     return thing
 
 
-@_with_methods
+@overload
+def denoise(image: GradientStack, method: str = "auto", **layers_and_options: Image | Value | None) -> np.ndarray: ...
+
+
+@overload
 def denoise(
-    image: Any,
+    image: Kind,
     method: str = "auto",
     *,
-    albedo: Any = None,
-    normal: Any = None,
-    depth: Any = None,
-    dx: Any = None,
-    dy: Any = None,
-    direct: Any = None,
-    caustic: Any = None,
-    primal_var: Any = None,
-    dx_var: Any = None,
-    dy_var: Any = None,
-    caustic_var: Any = None,
-    **options: Any,
+    albedo: Image | None = None,
+    normal: Image | None = None,
+    depth: Image | None = None,
+    dx: Image | None = None,
+    dy: Image | None = None,
+    direct: Image | None = None,
+    caustic: Image | None = None,
+    primal_var: Image | None = None,
+    dx_var: Image | None = None,
+    dy_var: Image | None = None,
+    caustic_var: Image | None = None,
+    **options: Value,
+) -> Kind: ...
+
+
+# In the first form the layers of ``layers_and_options`` are those that stand here by name.
+@_with_methods  # type: ignore[misc]
+def denoise(
+    image: Image | GradientStack,
+    method: str = "auto",
+    *,
+    albedo: Image | None = None,
+    normal: Image | None = None,
+    depth: Image | None = None,
+    dx: Image | None = None,
+    dy: Image | None = None,
+    direct: Image | None = None,
+    caustic: Image | None = None,
+    primal_var: Image | None = None,
+    dx_var: Image | None = None,
+    dy_var: Image | None = None,
+    caustic_var: Image | None = None,
+    **options: Value,
 ) -> Any:
     """The reconstruction of an image or a stack, scene-linear.
 
@@ -121,14 +147,14 @@ class Denoiser:
 
     def __init__(
         self,
-        input_size: Any,
+        input_size: Sequence[int] | Tensor,
         albedo: bool = False,
         normals: bool = False,
         temporal: bool = False,
         denoise_alpha: bool = False,
         *,
         method: str = "auto",
-        **options: Any,
+        **options: Value,
     ):
         try:
             self.width, self.height = (int(n) for n in np.ravel(to_numpy(input_size)))
@@ -144,27 +170,27 @@ class Denoiser:
     @overload
     def __call__(
         self,
-        noisy: Any,
-        albedo: Any = None,
-        normals: Any = None,
-        to_sensor: Any = None,
-        flow: Any = None,
-        previous_denoised: Any = None,
-        **layers: Any,
-    ) -> Any: ...
+        noisy: Kind,
+        albedo: Image | None = None,
+        normals: Image | None = None,
+        to_sensor: Tensor | Transform | None = None,
+        flow: Image | None = None,
+        previous_denoised: Image | None = None,
+        **layers: Image,
+    ) -> Kind: ...
 
     @overload
     def __call__(
         self,
-        noisy: Any,
+        noisy: Bitmap,
         albedo_ch: str = "",
         normals_ch: str = "",
-        to_sensor: Any = None,
+        to_sensor: Tensor | Transform | None = None,
         flow_ch: str = "",
         previous_denoised_ch: str = "",
         noisy_ch: str = "<root>",
-        **layers: Any,
-    ) -> Any: ...
+        **layers: Image,
+    ) -> Bitmap: ...
 
     # In the second form the names of channels stand where arrays do.
     def __call__(  # type: ignore[misc]

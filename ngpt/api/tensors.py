@@ -4,11 +4,40 @@ No library is imported here: arrays are known by what they can do.
 """
 
 from collections.abc import Collection
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
 from ngpt.errors import NgptError
+
+# Channels of colour, albedo and normal: with so many, a tensor may be what an integrator with AOVs rendered.
+_OF_A_STACK = 9
+
+
+class Tensor(Protocol):
+    """An array (height, width, channels) of any library: NumPy, PyTorch, Dr.Jit, JAX."""
+
+    @property
+    def shape(self) -> tuple[int, ...]: ...
+
+
+class Bitmap(Protocol):
+    """An ``mi.Bitmap``."""
+
+    def pixel_format(self) -> Any: ...
+
+    def component_format(self) -> Any: ...
+
+
+class Transform(Protocol):
+    """A transform of Mitsuba."""
+
+    @property
+    def matrix(self) -> Any: ...
+
+
+Image = Tensor | Bitmap
+Kind = TypeVar("Kind", bound=Image)  # the kind that went in is the kind that comes out
 
 
 def is_bitmap(value: Any) -> bool:
@@ -101,6 +130,12 @@ def _remedy(name: str, value: Any, shape: tuple[int, ...], channels: Collection[
         return f"; channels come first there: pass {name}.{turn}(1, 2, 0)"
     if len(shape) == 4:
         return f"; pass the images of a batch one by one: {name}[0]"
+    if len(shape) == 3 and shape[2] >= _OF_A_STACK and name in ("image", "noisy"):
+        return (
+            f"; if it has the layers of one of our integrators, pass "
+            f"ngpt.GradientStack.from_aovs({name}, scene.integrator().aov_names()), and for its colour alone "
+            f"{name}[..., :3]"
+        )
     if len(shape) == 3 and shape[2] > max(channels):
         return f"; pass {name}[..., :{max(channels)}]"
     if 3 in channels and (len(shape) == 2 or shape[2:] == (1,)):

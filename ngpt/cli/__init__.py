@@ -10,11 +10,12 @@ import argparse
 import shlex
 import sys
 from importlib import import_module
-from typing import NamedTuple, NoReturn
+from typing import Any, NamedTuple, NoReturn
 
 from ngpt.errors import NgptError, WrongUse
-from ngpt.system.console import Console, run_command
-from ngpt.system.parts import NO_RENDERER, brought
+from ngpt.system.console import Console, logged, run_command
+from ngpt.system.install import install_command
+from ngpt.system.parts import brought, no_renderer
 from ngpt.version import __version__
 
 
@@ -67,11 +68,30 @@ class _Parser(argparse.ArgumentParser):
         sys.exit(2)
 
 
+class _Print(argparse.Action):
+    """Prints what a function makes of all parsers, "module.function", and ends. Its value, if any, goes there too."""
+
+    def __init__(self, *args: Any, prints: str, **options: Any):
+        super().__init__(*args, **options)
+        self.prints = prints
+
+    def __call__(self, parser: argparse.ArgumentParser, namespace: Any, values: Any, option: str | None = None) -> None:
+        module, _, function = self.prints.rpartition(".")
+        given = [values] if isinstance(values, str) else []
+        print(getattr(import_module(module), function)(*given, parser, parsers()), end="")
+        parser.exit()
+
+
+def parsers() -> dict[str, argparse.ArgumentParser]:
+    """The parser of each verb."""
+    return {name: _filled(_Parser(prog=f"ngpt {name}"), name, verb) for name, verb in all_verbs().items()}
+
+
 def main(arguments: list[str] | None = None) -> int:
     """Runs a command line and returns its exit status."""
     words = sys.argv[1:] if arguments is None else arguments
-    # The options of ngpt itself have no values: the first word that is none of them is the verb.
-    called = next((word for word in words if not word.startswith("-")), "")
+    # Of the options of ngpt itself one has a value, and ends the command. The first other word is the verb.
+    called = "" if words[:1] == ["--completion"] else next((word for word in words if not word.startswith("-")), "")
     # To look for those of others takes time.
     verbs = VERBS if called in VERBS else all_verbs()
     interrupted = verbs[called].interrupted if called in verbs else "interrupted"
@@ -93,10 +113,25 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     """Of all ``verbs``, with the arguments of the one that is called."""
     if called and called not in verbs and verbs.keys() == VERBS.keys():
-        raise WrongUse(f"there is no verb '{called}' here; {NO_RENDERER}")
+        raise WrongUse(f"there is no verb '{called}' here; {no_renderer()}")
     parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
+    parser.add_argument(
+        "--completion",
+        action=_Print,
+        prints="ngpt.cli.completion.script",
+        choices=("bash", "zsh", "fish"),
+        metavar="SHELL",
+        help="print what makes a shell complete the words of ngpt: bash, zsh or fish",
+    )
+    parser.add_argument(
+        "--manual",
+        action=_Print,
+        prints="ngpt.cli.manual.page",
+        nargs=0,
+        help="print the manual page: pipe into man -l -",
+    )
     subparsers = parser.add_subparsers(required=True, metavar="VERB", parser_class=_Parser)
     for name, verb in verbs.items():
         subparser = subparsers.add_parser(name, help=verb.summary)
@@ -109,7 +144,9 @@ def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.
     """The parser, with what its verb is and the arguments of it."""
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
     parser.set_defaults(verb=name)
-    parser.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
+    loud = parser.add_mutually_exclusive_group()
+    loud.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
+    loud.add_argument("-v", "--verbose", action="store_true", help="say what is read, chosen and run")
     import_module(f"{verb.room}.{name}").add_arguments(parser)
     return parser
 
@@ -118,10 +155,9 @@ def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[s
     args = parser.parse_args(words)
     args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
-        return import_module(f"{verb.room}.{args.verb}").run(args, Console(args.quiet))
+        with logged(args.verbose):
+            return import_module(f"{verb.room}.{args.verb}").run(args, Console(args.quiet))
     except ModuleNotFoundError as error:
         if not verb.extra:
             raise
-        raise NgptError(
-            f"{args.verb} needs the package '{error.name}'; `pip install 'ngpt-recon[{verb.extra}]'`"
-        ) from error
+        raise NgptError(f"{args.verb} needs the package '{error.name}'; `{install_command(verb.extra)}`") from error

@@ -27,6 +27,7 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
+from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
 from ngpt.io.whole import finished
@@ -44,12 +45,15 @@ from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns")
+    parser.add_argument(
+        "stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns; -: standard input"
+    )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OUT",
-        help=f"file for one stack, folder for several (default: STACK{RESULT_SUFFIX}.exr beside each)",
+        help=f"file for one stack, folder for several; folders are made (default: STACK{RESULT_SUFFIX}.exr beside "
+        "each); -: standard output",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -113,6 +117,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
+    if args.json and args.output == STREAM:
+        raise NgptError("-o - and --json both want standard output; leave one out")
+    with as_files(args.stacks, args.output) as (args.stacks, args.output):
+        return denoise(args, console)
+
+
+def denoise(args: argparse.Namespace, console: Console) -> int:
     files = given_files(args)
     pairs = output_paths(stack_files(args.stacks), args.output)
     if files and len(pairs) > 1:
@@ -298,10 +309,10 @@ def describe(report: dict) -> str:
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Where the result of each source goes; makes the output folder if there is to be one."""
+    """Where the result of each source goes; makes the output folder where there is none."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
-    elif len(sources) == 1 and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
+    elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
         targets = [Path(output)]
     else:
         folder = Path(output)

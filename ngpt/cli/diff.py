@@ -5,6 +5,7 @@ import argparse
 from ngpt.cli.arguments import add_json, print_json
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import compare
+from ngpt.measure.shown import available, judge
 from ngpt.system.console import Console
 
 
@@ -22,7 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    metrics = compare(read_image(args.image), read_image(args.reference))
+    image, reference = read_image(args.image), read_image(args.reference)
+    metrics = compare(image, reference)
+    usable, lacks = available(*image.shape[:2])
+    for lack in lacks:
+        console.say(lack)
+    metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]
     agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
     if args.json:
         print_json({"agree": agree, "tolerance": args.tolerance, "metrics": metrics})

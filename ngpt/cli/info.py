@@ -1,6 +1,9 @@
 """``ngpt info``: what a file holds, what a scene requires, which names are known."""
 
 import argparse
+import shutil
+import sys
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -184,13 +187,30 @@ def show(report: dict, as_json: bool) -> None:
                 text = (
                     "  ".join(f"{k} {_number(v)}" for k, v in item.items()) if isinstance(item, dict) else _number(item)
                 )
-                tell(f"  {key:16} {text}")
+                _fitted(f"  {key:16} {text}", indent=4)
         elif isinstance(value, list) and value and isinstance(value[0], str) and max(map(len, value)) > 30:
             tell(f"{name}:")
             for item in value:
-                tell(f"  {item}")
+                _fitted(f"  {item}", indent=4)
         else:
-            tell(f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}")
+            _fitted(
+                f"{name}: {', '.join(map(str, value)) if isinstance(value, list | tuple) else _number(value)}", indent=2
+            )
+
+
+def _fitted(line: str, indent: int) -> None:
+    """Prints a line: on a terminal broken between words, and indented where it goes on; elsewhere as it is."""
+    if sys.stdout.isatty():
+        width, start = shutil.get_terminal_size().columns, len(line) - len(line.lstrip())
+        line = textwrap.fill(
+            line.lstrip(),
+            width,
+            initial_indent=" " * start,
+            subsequent_indent=" " * indent,
+            break_long_words=False,
+            break_on_hyphens=False,
+        )
+    tell(line)
 
 
 def _number(value: object) -> str:

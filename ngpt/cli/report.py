@@ -49,6 +49,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
+    if target.suffix.lower() not in (".html", ".htm"):
+        raise NgptError(f"{target}: browsers know a page by its name; let it end in .html")
     names = labels(args.images)
     if any(os.path.isdir(path) for path in args.images):
         return run_shots(args, names, target, console)
@@ -112,6 +114,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             size = f"{first.shape[1]}x{first.shape[0]}"
             scenes.append(Scene(Path(frame).stem, f"{frame}, {size}", reference, entries, rising=rising))
+        progress(len(frames), len(frames))
     tables = {}
     for place in range(len(names)):
         add_maps(scenes, place, "change", change_maps([scene.entries[place].image for scene in scenes], motions))

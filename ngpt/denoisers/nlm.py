@@ -6,6 +6,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.repair import Repaired
+from ngpt.system.install import install_command
 
 # The bandwidth of nlm in standard deviations of the noise, and the weights of features against it: the noisier the
 # image, the more they count. About the best of 20 choices on four scenes at 4, 16 and 64 spp.
@@ -14,7 +15,7 @@ _NLM_FEATURES = {"albedo": 16.0, "normal": 8.0}
 
 
 def missing() -> str:
-    return "" if find_spec("skimage") else "scikit-image is not installed: pip install 'ngpt-recon[peers]'"
+    return "" if find_spec("skimage") else f"scikit-image is not installed: {install_command('peers')}"
 
 
 def nlm(data: Repaired) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.options import Option
 from ngpt.repair import Repaired
+from ngpt.system.install import package_command
 
 AUXILIARY = ("prefiltered", "clean", "noisy", "none")
 QUALITIES = {"high": "High", "balanced": "Balanced", "fast": "Fast"}
@@ -21,7 +22,7 @@ OPTIONS = {
 
 
 def missing() -> str:
-    return "" if find_spec("mitsuba_oidn") else "OIDN is not installed: pip install mitsuba-oidn"
+    return "" if find_spec("mitsuba_oidn") else f"OIDN is not installed: {package_command('mitsuba-oidn')}"
 
 
 def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:

@@ -1,12 +1,13 @@
 """A small stack and what a model makes of it, in files that any language reads: for those who write a host."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 
 from ngpt.io.rawlayers import write_layers
+from ngpt.network.run_onnx import runtime
 
 SIZE = 29, 23  # width and height: odd, and no multiple of any alignment
 
@@ -15,14 +16,14 @@ def write_vector(model: onnx.ModelProto, folder: Path, overwrite: bool = False) 
     """Writes the inputs of a model into a folder, and what it makes of them as ``image``; see ``ngpt.io.rawlayers``."""
     names = {item.key: item.value for item in model.metadata_props}["ngpt.inputs"].split(", ")
     arrays = {name: layer for name, layer in example_layers().items() if name in names}
-    session = onnxruntime.InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])
+    session = runtime().InferenceSession(model.SerializeToString(), quiet(), providers=["CPUExecutionProvider"])
     arrays["image"] = session.run(["image"], arrays)[0]
     write_layers(folder, arrays, overwrite)
 
 
-def quiet() -> onnxruntime.SessionOptions:
+def quiet() -> Any:
     """Options that keep the runtime from warning that inputs have defaults."""
-    options = onnxruntime.SessionOptions()
+    options = runtime().SessionOptions()
     options.log_severity_level = 3
     return options
 

@@ -4,6 +4,7 @@ Layers go by their names, those of the contract or of other renderers (``ngpt.io
 holds, layers the toolkit does not know included, passes through as ``ngpt.io.openexr`` describes.
 """
 
+import logging
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -24,6 +25,8 @@ from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
+
+_LOG = logging.getLogger(__name__)
 
 __all__ = [
     "MADE_BY",
@@ -108,6 +111,8 @@ def read(
                 "render them with one data window"
             )
     alone = {name: _read_alone(file, name, stack, main, isolated) for name, file in (files or {}).items()}
+    told = ", ".join(f"{name} ({' '.join(found.channels)})" for name, found in resolution.items())
+    _LOG.info("%s: %dx%d, %s", path, stack.width, stack.height, told)
     return stack.replace(**alone) if alone else stack
 
 

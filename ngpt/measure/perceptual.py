@@ -11,6 +11,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.measure.images import check_size, reinhard
+from ngpt.system.install import install_command
 
 # Of the random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
 _DRAWS = 16
@@ -18,7 +19,7 @@ _DRAWS = 16
 
 def lack(name: str, module: str, package: str, extra: str = "peers") -> str:
     """Why metric ``name``, which imports ``module`` of ``package``, cannot be computed here; "" if it can."""
-    return "" if find_spec(module) else f"{name} needs {package}: pip install 'ngpt-recon[{extra}]'"
+    return "" if find_spec(module) else f"{name} needs {package}: {install_command(extra)}"
 
 
 def ssim(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:

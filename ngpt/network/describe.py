@@ -10,6 +10,7 @@ from typing import Any
 from ngpt.errors import NgptError
 from ngpt.network import inputs, run_onnx
 from ngpt.network.identity import identify
+from ngpt.system.install import install_command
 from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
@@ -59,7 +60,7 @@ def _onnx(path: Path) -> dict[str, Any]:
 
 def _safetensors(path: Path) -> dict[str, Any]:
     if find_spec("torch") is None or find_spec("safetensors") is None:
-        raise NgptError(f"{path}: to read it needs PyTorch: pip install 'ngpt-recon[train]'")
+        raise NgptError(f"{path}: to read it needs PyTorch: {install_command('train')}")
     # torch takes seconds to come in.
     from ngpt.network.weights import load_weights
 

@@ -13,6 +13,7 @@ from ngpt.errors import NgptError
 from ngpt.network import inputs, run_onnx
 from ngpt.options import Option
 from ngpt.repair import Repaired
+from ngpt.system.install import install_command, package_command
 
 WEIGHTS = Path(__file__).parents[1] / "weights"
 
@@ -41,9 +42,9 @@ class Shipped:
     def missing(self) -> str:
         """Why it cannot be used here, "" if it can."""
         if find_spec("onnxruntime") is None:
-            return "ONNX Runtime is not installed: pip install onnxruntime"
+            return f"ONNX Runtime is not installed: {package_command('onnxruntime')}"
         if not self.path.is_file():
-            return "no network is shipped for it: pass weights=FILE, .onnx or .safetensors"
+            return "no network is shipped for it: pass --weights FILE (weights=FILE), .onnx or .safetensors"
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
@@ -75,7 +76,7 @@ class Shipped:
     def _torch(self, path: Path) -> Any:
         """``ngpt.network.run_torch``: torch takes seconds to come in."""
         if find_spec("torch") is None or find_spec("safetensors") is None:
-            raise NgptError(f"weights {path}: to run them needs PyTorch: pip install 'ngpt-recon[train]'")
+            raise NgptError(f"weights {path}: to run them needs PyTorch: {install_command('train')}")
         from ngpt.network import run_torch
 
         return run_torch

@@ -5,10 +5,12 @@ export/CONTRACT.md tells what the files expect; this is the host that comes with
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Mapping
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +18,10 @@ from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network import tiles
 from ngpt.network.exposure import statistics
+from ngpt.system.install import package_command
 from ngpt.system.limits import free_address_space, processors
+
+_LOG = logging.getLogger(__name__)
 
 # MiB that the network may use beside the image's own layers: 1280x720 in one tile, where two take a quarter longer.
 MEMORY = 3072
@@ -45,7 +50,7 @@ class _OutOfMemory(NgptError):
 class Network:
     """A network's file, loaded; thread-safe.
 
-    ``path``     model.onnx, as ``python -m export`` writes it
+    ``path``     model.onnx, as ``ngpt export`` writes it
     ``device``   one of ``DEVICES``; "auto" is "cpu"
     ``threads``  of the CPU, 0 for as many as it has cores
 
@@ -65,7 +70,7 @@ class Network:
             self.bytes = int(metadata["ngpt.bytes per pixel"])
         except (KeyError, ValueError) as error:
             raise NgptError(
-                f"{path}: lacks the metadata {error} of an ngpt network; write it anew: python -m export"
+                f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
         # Direct emission is taken out, and pixels are repaired, before layers come here: the graph, which does so for
         # other hosts, is told that there is none. Graphs of earlier versions do not ask.
@@ -149,6 +154,7 @@ class Network:
             raise NgptError(f"network {self.path} needs layers {', '.join(missing)}, which are not given")
         height, width = layers["primal"].shape[:2]
         pieces, (rows, columns) = self.plan(height, width, memory, batch)
+        _LOG.debug("%s: %d tiles of %dx%d", self.path, len(pieces), columns, rows)
         shared = statistics(layers)
         image = np.empty((height, width, 3), np.float32)
         progress(0, len(pieces))
@@ -215,20 +221,26 @@ def session(path: Path, device: str, threads: int):
     """The session of a file; made again when the file has changed. Raises NgptError where ONNX Runtime cannot."""
     # Neither a pipe nor a device, which it would read without an end.
     if not path.is_file():
-        raise NgptError(f"{path}: no such file; `python -m export` writes it")
+        raise NgptError(f"{path}: no such file; `ngpt export` writes it")
     return _made(str(path), path.stat().st_mtime_ns, device, threads)
+
+
+def runtime() -> Any:
+    """The module of ONNX Runtime, which sends nothing. Raises NgptError where it is not installed."""
+    try:
+        import onnxruntime
+    except ModuleNotFoundError as error:
+        raise NgptError(f"ONNX Runtime is not installed: {package_command('onnxruntime')}") from error
+    # Off already (ngpt/__init__.py), unless a program had loaded it before us.
+    onnxruntime.disable_telemetry_events()
+    return onnxruntime
 
 
 @lru_cache(maxsize=8)
 def _made(path: str, _modified: int, device: str, threads: int):
-    try:
-        import onnxruntime
-    except ModuleNotFoundError as error:
-        raise NgptError("ONNX Runtime is not installed: pip install onnxruntime") from error
+    onnxruntime = runtime()
     if device not in DEVICES:
         raise NgptError(f"device '{device}' is unknown; those of ONNX Runtime are: {', '.join(DEVICES)}")
-    # Off already where ngpt was imported before it
-    onnxruntime.disable_telemetry_events()
     provider, available = DEVICES[device], onnxruntime.get_available_providers()
     if provider not in available:
         have = [name for name, provider in DEVICES.items() if provider in available]
@@ -246,6 +258,7 @@ def _made(path: str, _modified: int, device: str, threads: int):
         raise NgptError(f"{path}: ONNX Runtime cannot load it: {one_line(error)}") from error
     if session.get_providers()[0] != provider:
         raise NgptError(f"device '{device}': ONNX Runtime cannot use it here (drivers?); use device 'cpu'")
+    _LOG.info("%s: ONNX Runtime %s, %s", path, onnxruntime.__version__, provider)
     return session
 
 

@@ -4,6 +4,7 @@ Everything goes to standard error; standard output is kept for results (JSON, ta
 """
 
 import io
+import logging
 import os
 import sys
 import time
@@ -20,6 +21,10 @@ from ngpt.system.limits import address_space
 # many that it took: a log should show life, not fill up.
 SECONDS_BETWEEN_LINES = 5.0
 LINES = 50
+
+# Columns that a bar takes beside its label: with all of its parts, with a rate too, and with numbers and time left
+# alone. The first has to leave so many for the label.
+WIDE, RATE, NARROW, LABEL = 58, 14, 22, 12
 
 # MiB of address space.
 FEWEST_MIB = 512
@@ -135,6 +140,31 @@ def _own_stderr() -> Iterator[None]:
             sys.stderr = stream
 
 
+class _Handler(logging.Handler):
+    """Log records as messages, each to where standard error leads then: above a bar, where there is one."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        print_line(self.format(record), sys.stderr)
+
+
+@contextmanager
+def logged(wanted: bool) -> Iterator[None]:
+    """Shows what the logger "ngpt" is told, down to the details, where that is ``wanted``."""
+    if not wanted:
+        yield
+        return
+    logger, handler = logging.getLogger("ngpt"), _Handler()
+    handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s"))
+    before = logger.level
+    logger.addHandler(handler)
+    logger.setLevel(logging.DEBUG)
+    try:
+        yield
+    finally:
+        logger.setLevel(before)
+        logger.removeHandler(handler)
+
+
 class Console:
     """Messages and progress for one command. ``quiet`` leaves only errors; ``name`` is what those begin with."""
 
@@ -186,10 +216,15 @@ class _Pace:
         pace = (done - before) / (self.elapsed - then) if self.elapsed > then else 0.0
         if self.elapsed > 1.01 * self.past[-1][0]:
             self.past.append((self.elapsed, done))
-        words = [f"{pace:.3g} {self.unit}/s"] if self.rate and pace else []
+        words = [f"{pace:{'.0f' if pace >= 100 else '.3g'}} {self.unit}/s"] if self.rate and pace else []
         if pace and done < total:
             words.append(f"about {_span((total - done) / pace)} left")
         return words
+
+
+def brief(value: float) -> str:
+    """A positive number with two digits, or all that are before the point: 0.35, 4.2, 126."""
+    return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
 def _span(seconds: float) -> str:
@@ -204,21 +239,44 @@ def _span(seconds: float) -> str:
 def _bar(label: str, unit: str, rate: bool) -> Iterator[Callable[[int, int], None]]:
     # Imported only here: a pipeline without a terminal does not pay for it.
     from rich.console import Console as Terminal
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        ProgressColumn,
+        TextColumn,
+        TimeElapsedColumn,
+    )
 
-    columns = (
+    terminal = Terminal(stderr=True)
+    columns: list[ProgressColumn] = [
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=20),
         MofNCompleteColumn(),
         TextColumn(unit),
         TimeElapsedColumn(),
         TextColumn("{task.fields[pace]}"),
-    )
-    pace = _Pace(unit, rate)
+    ]
+    phrase: Callable[[list[str]], str] = ", ".join
+    pace, taken = _Pace(unit, rate), WIDE + (RATE if rate else 0)
+    if terminal.width < taken + LABEL:
+        # What counts is how far it is and how long it takes.
+        columns, phrase, taken = [columns[0], columns[2], columns[5]], _last, NARROW
+    label = _shortened(label, terminal.width - taken)
     # Lines on standard output go above the bar, unless they go into a file.
-    with Progress(*columns, console=Terminal(stderr=True), redirect_stdout=sys.stdout.isatty()) as progress:
+    with Progress(*columns, console=terminal, redirect_stdout=sys.stdout.isatty()) as progress:
         task = progress.add_task(label, total=None, pace="")
-        yield lambda done, total: progress.update(task, completed=done, total=total, pace=", ".join(pace(done, total)))
+        yield lambda done, total: progress.update(task, completed=done, total=total, pace=phrase(pace(done, total)))
+
+
+def _shortened(text: str, most: int) -> str:
+    """Its end, where names differ, in ``most`` letters at most."""
+    return text if len(text) <= most else f"…{text[len(text) - most + 1 :]}" if most > 1 else ""
+
+
+def _last(words: list[str]) -> str:
+    """Of the pace, the time that is left."""
+    return words[-1].removeprefix("about ") if words else ""
 
 
 class _Lines:

@@ -4,8 +4,12 @@ from collections.abc import Iterator
 from typing import Any
 
 from ngpt.errors import NgptError
+from ngpt.system.install import install_command
 
-NO_RENDERER = "rendering needs the package data_gen, which is not installed; `pip install 'ngpt-recon[render]'`"
+
+def no_renderer() -> str:
+    """What is missing where nothing renders, and what installs it."""
+    return f"rendering needs the package data_gen, which is not installed; `{install_command('render')}`"
 
 
 def brought(group: str) -> Iterator[Any]:
@@ -23,4 +27,4 @@ def find_renderer() -> Any:
     """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed."""
     for renderer in brought("ngpt.renderers"):
         return renderer
-    raise NgptError(NO_RENDERER)
+    raise NgptError(no_renderer())

@@ -168,7 +168,7 @@ def read_manifest(folder: Path) -> dict[str, Any]:
     """The manifest of the training set in ``folder``; raises NgptError where there is none of this version."""
     path = folder / MANIFEST
     if not path.is_file():
-        raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by python -m data_gen")
+        raise NgptError(f"{folder}: no training set there ({MANIFEST} is missing); make one by `ngpt dataset`")
     manifest = read_json(path)
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise NgptError(f"{path}: is not the manifest of a training set")
@@ -207,9 +207,7 @@ def problems(folder: Path) -> list[str]:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
     listed = {entry["file"] for entry in manifest["shards"]}
     on_disk = {path.relative_to(folder).as_posix() for path in (folder / "shards").glob("[!.]*.safetensors")}
-    found += [
-        f"{folder / name}: is not in the manifest; run python -m data_gen again" for name in sorted(on_disk - listed)
-    ]
+    found += [f"{folder / name}: is not in the manifest; run `ngpt dataset` again" for name in sorted(on_disk - listed)]
     return found
 
 
@@ -217,7 +215,7 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     """The shard of a manifest's entry; raises NgptError unless it is that one, and has the tensors that crops need."""
     # Not Path.is_file, which raises where a name is longer than names may be.
     if not os.path.isfile(path):
-        raise NgptError(f"{path}: is missing; remove it from the manifest by running python -m data_gen again")
+        raise NgptError(f"{path}: is missing; remove it from the manifest by running `ngpt dataset` again")
     if (digest := checksum(path)) != entry["sha256"]:
         told = entry["sha256"][:12]
         raise NgptError(

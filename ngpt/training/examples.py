@@ -141,9 +141,7 @@ def open_crops(folder: str | Path) -> Iterable[Any]:
     """The crops of a dataset (it has a manifest) or of a folder of stacks."""
     path = Path(folder)
     if not path.is_dir():
-        raise NgptError(
-            f"{folder}: no such folder; make a dataset with: python -m data_gen --config ... --out {folder}"
-        )
+        raise NgptError(f"{folder}: no such folder; make a training set: ngpt dataset --config ... --out {folder}")
     if (path / "manifest.json").is_file():
         from ngpt.training.dataset import Dataset
 

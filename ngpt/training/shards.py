@@ -37,6 +37,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.system.files import atomic_output
+from ngpt.system.install import install_command
 from ngpt.system.records import check, parse_json
 
 # Tensors of the inputs and their channels.
@@ -161,10 +162,10 @@ class Shard:
         try:
             from safetensors import SafetensorError, safe_open
         except ModuleNotFoundError as error:
-            raise NgptError("training sets need safetensors; `pip install 'ngpt-recon[train]'`") from error
+            raise NgptError(f"training sets need safetensors; `{install_command('train')}`") from error
         self.path = path
         if not path.is_file():
-            raise NgptError(f"{path}: no such shard; make it again: python -m data_gen")
+            raise NgptError(f"{path}: no such shard; make it again: ngpt dataset")
         try:
             # It checks the header; tensors are read without it.
             with safe_open(path, framework="np") as checked:

@@ -144,15 +144,13 @@ def networks(recipe: Recipe) -> dict[str, Any]:
 
 def onnx(recipe: Recipe) -> dict[str, Any]:
     """The shipped networks in ONNX Runtime, by its provider for the device and by that for processors."""
-    import onnxruntime
-
     from ngpt.network import run
     from ngpt.network.inputs import gather
-    from ngpt.network.run_onnx import DEVICES, Network
+    from ngpt.network.run_onnx import DEVICES, Network, runtime
     from ngpt.repair import repair
 
-    if DEVICES[recipe.device] not in onnxruntime.get_available_providers():
-        have = ", ".join(onnxruntime.get_available_providers())
+    if DEVICES[recipe.device] not in runtime().get_available_providers():
+        have = ", ".join(runtime().get_available_providers())
         raise Unavailable(f"this build of ONNX Runtime has only {have}: onnxruntime-gpu has the other")
     stack, told = made_stack(64, seed=3), {}
     for name in ("ngpt-fast",):

@@ -1,4 +1,4 @@
-"""What the site adds to docs/: a menu, a reference made of docstrings, and the files outside docs/ that pages link to.
+"""What the site adds to docs/: a menu, references of Python and commands, and what pages link to outside docs/.
 
 The pages are written for the forge, where a link leads to any file of the repository. The site gets a copy of each such
 file under ``repository/``, Markdown as a page, so that one link works in both places.
@@ -7,9 +7,14 @@ file under ``repository/``, Markdown as a page, so that one link works in both p
 import ast
 import posixpath
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 from mkdocs.structure.files import File
+
+from ngpt.cli import parsers
+from ngpt.cli.manual import markdown
 
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
@@ -70,6 +75,9 @@ def on_files(files, config):
         files.append(File.generated(config, address(file), abs_src_path=str(file)))
     for name, text in reference().items():
         files.append(File.generated(config, f"api/{name}.md", content=text))
+    files.append(File.generated(config, "use/commands.md", content=markdown(parsers())))
+    manual = subprocess.check_output([sys.executable, "-m", "ngpt", "--manual"], text=True)
+    files.append(File.generated(config, "ngpt.1", content=manual))
     files.append(File.generated(config, "site.css", content=CSS))
     config.nav = menu([file.src_uri for file in files.documentation_pages()])
     return files

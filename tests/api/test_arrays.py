@@ -180,6 +180,7 @@ def test_shapes_are_refused_with_a_remedy(layers):
         (image[..., 0], "an image of one channel is image[..., None].repeat(3, axis=-1)"),
         (image[..., :1], "an image of one channel is image.repeat(3, axis=-1)"),
         (image[..., [0, 1, 2, 0, 1]], "pass image[..., :4]"),
+        (np.tile(image, 9), "pass ngpt.GradientStack.from_aovs(image, scene.integrator().aov_names()), and for its"),
         (image[:0], "image is 26x0; it has no pixels"),
         (image[..., :2], "(18, 26, 2); it must be"),
         (None, "image has shape ()"),

@@ -121,6 +121,20 @@ def test_diff_says_whether_images_agree(tmp_path, rng, capsys):
     assert main(["diff", c, a]) == 1  # where they can be compared they are equal, but they do not agree
 
 
+def test_diff_tells_what_the_eye_sees_where_the_packages_are(tmp_path, rng, capsys, monkeypatch):
+    pytest.importorskip("skimage")
+    pytest.importorskip("flip_evaluator")
+    image = rng.random((16, 15, 3)).astype(np.float32)
+    a, b = str(ngpt.write(tmp_path / "a.exr", image)), str(ngpt.write(tmp_path / "b.exr", image + 0.1))
+    assert main(["diff", a, b, "--json"]) == 1
+    metrics = json.loads(capsys.readouterr().out)["metrics"]
+    assert 0 < metrics["SSIM"] < 1 and 0 < metrics["FLIP"] < 1
+    monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda name: None)
+    assert main(["diff", a, b]) == 1
+    output, errors = capsys.readouterr()
+    assert "SSIM" not in output and "SSIM needs scikit-image" in errors and "FLIP needs flip-evaluator" in errors
+
+
 def test_diff_judges_the_result_of_a_result_file(tmp_path, stack_file):
     source, target = stack_file(), tmp_path / "out.exr"
     main(["denoise", source, "-o", str(target), "-q"])
@@ -243,7 +257,7 @@ def test_render_errors(renderer, tmp_path, capfd, monkeypatch):
         (1, ["render", "t.xml"], "t.xml: no such file"),
         (2, ["render", "diffuse", "--variant", "scalar_rgb"], "'scalar_rgb' is not one"),
         (2, ["render", "diffuse", "--sampler", "best"], "unknown sampler 'best'"),
-        (1, ["render", "diffuse", "--size", "30000x30000"], "pass --memory"),
+        (1, ["render", "diffuse", "--size", "30000x30000"], "; render a smaller image"),
         (2, ["render", "t.xml", "--spp", "9999999999"], "9999999999 samples per pixel"),
         (1, ["render", "diffuse", "-o", "no/s.exr"], "the folder no does not exist"),
         (1, ["info", "moving.xml"], "animated transforms"),

@@ -11,6 +11,7 @@ from ngpt.io.exr import write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
+from ngpt.system.install import install_command
 
 
 @pytest.fixture
@@ -86,6 +87,8 @@ def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, image, capfd):
     page.touch()
     assert main(["report", a, "-o", str(page)]) == 1
     assert "exists already" in capfd.readouterr().err and page.read_text() == ""
+    assert main(["report", a, "-o", str(page.with_suffix(""))]) == 2
+    assert "let it end in .html" in capfd.readouterr().err and not page.with_suffix("").exists()
 
 
 def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
@@ -95,7 +98,7 @@ def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkey
     words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
     assert main(["report", *words]) == 0
     output, messages = capfd.readouterr()
-    assert "FLIP needs flip-evaluator: pip install 'ngpt-recon[peers]'" in messages and "FLIP" not in output
+    assert f"FLIP needs flip-evaluator: {install_command('peers')}" in messages and "FLIP" not in output
     assert "a.exr: 2.0 stops brighter than" in messages
     assert facts(tmp_path / "page.html")["maps"] == []
 

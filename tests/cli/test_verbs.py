@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from ngpt.cli import all_verbs, main
+from ngpt.system.install import install_command
 
 VERBS = all_verbs()
 
@@ -107,7 +108,7 @@ def test_results_name_the_command_that_made_them(monkeypatch):
 def test_a_package_that_is_not_installed_is_named_with_its_extra(lacking, arguments, extra, tmp_path):
     code = f"import sys; sys.modules['{lacking}'] = None; from ngpt.cli import main; sys.exit(main(sys.argv[1:]))"
     run = run_python(code, *(a.format(out=tmp_path / "x.onnx") for a in arguments))
-    told = f"ngpt: error: {arguments[0]} needs the package '{lacking}'; `pip install 'ngpt-recon[{extra}]'`\n"
+    told = f"ngpt: error: {arguments[0]} needs the package '{lacking}'; `{install_command(extra)}`\n"
     assert (run.returncode, run.stderr) == (1, told)
 
 
@@ -129,6 +130,6 @@ def test_without_the_renderer_it_is_told_what_is_missing(status, arguments, tmp_
     run = run_python(code, *arguments, *out)
     assert run.returncode == status and run.stderr.count("\n") == 1
     assert run.stderr.endswith(
-        "rendering needs the package data_gen, which is not installed; `pip install 'ngpt-recon[render]'`\n"
+        f"rendering needs the package data_gen, which is not installed; `{install_command('render')}`\n"
     )
     assert run_python(code, "--help").returncode == 0

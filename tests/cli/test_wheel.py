@@ -134,6 +134,6 @@ def test_it_makes_data_trains_evaluates_and_exports(renderer, wheel, tmp_path):
     assert results["command"] == "ngpt evaluate --config eval-tiny --out shipped"
     # What compares with others is in an extra of its own, and its absence is told.
     absent = {cell["method"]: cell["absent"] for cell in results["cells"] if cell["absent"]}
-    assert "nlm" in absent and "oidn" not in absent and all("ngpt-recon[peers]" in why for why in absent.values())
+    assert "nlm" in absent and "oidn" not in absent and all("scikit-image" in why for why in absent.values())
     told = run(programs / "python", "-c", "import ngpt, data_gen; print(ngpt.__file__, data_gen.__file__)")
     assert str(ROOT) not in told

@@ -152,13 +152,19 @@ def test_stopping_keeps_the_samples_done(renderer):
     same(stack, render_stack(scene, stack.attributes["ngpt:spp"], 3, "primal", points="rounds"))
 
 
-def test_sizes_that_memory_cannot_hold(renderer):
+def test_sizes_that_memory_cannot_hold(renderer, monkeypatch):
+    from data_gen import passes
     from data_gen.render import render_stack
     from data_gen.scenes.load import set_film_size
 
     scene = load(renderer, "diffuse", (4, 4))
     set_film_size(scene, (20000, 10000))
-    with pytest.raises(NgptError, match=r"20000x10000 pixels need \d+ MiB .* pass --memory \d+"):
+    # More than a machine has is no advice.
+    monkeypatch.setattr(passes, "machine_memory", lambda: 2**34)
+    with pytest.raises(NgptError, match=r"need \d+ MiB .*, and this machine has 16384 MiB; render a smaller image$"):
+        render_stack(scene, 1)
+    monkeypatch.setattr(passes, "machine_memory", lambda: 2**44)
+    with pytest.raises(NgptError, match=r"20000x10000 pixels need \d+ MiB .*, and 6144 MiB .* pass --memory \d+"):
         render_stack(scene, 1)
     set_film_size(scene, (40, 30))
     with pytest.raises(NgptError, match=r"pass --memory (\d+)") as error:

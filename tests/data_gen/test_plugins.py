@@ -8,6 +8,7 @@ import pytest
 
 import ngpt
 from ngpt.errors import NgptError
+from ngpt.system.install import install_command
 
 USE = (
     "import numpy as np, ngpt\n"
@@ -51,7 +52,7 @@ def test_without_mitsuba_the_package_is_imported():
         "import sys; sys.modules['mitsuba'] = None\nimport data_gen\n"
         "try: data_gen.render_scene('diffuse')\nexcept data_gen.session.NgptError as error: print(error)\n"
     )
-    assert "pip install 'ngpt-recon[render]'" in told.stdout, told.stderr
+    assert install_command("render") in told.stdout, told.stderr
 
 
 def test_each_renders_what_its_sampler_does(renderer):

@@ -61,6 +61,8 @@ def test_names():
         register(Sampler("restir", "another"))
     with pytest.raises(NgptError, match=r"unknown sampler 'gtp'; did you mean 'gpt'\? choose one of: auto, gpt,"):
         find("gtp")
+    with pytest.raises(NgptError, match=r"; for shots \(--frames\): restir$"):
+        find("foo")
     with pytest.raises(NgptError, match="standing 'useful' is none of use, niche, study"):
         Sampler("new", "another", standing="useful")
 

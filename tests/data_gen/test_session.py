@@ -1,5 +1,6 @@
 """Rendering from Python: what `ngpt render` does, without its command line."""
 
+import re
 import subprocess
 import sys
 
@@ -68,3 +69,39 @@ def test_a_variant_is_chosen_by_a_render_alone():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
+
+
+def test_what_is_no_scene_is_said_with_its_remedy(renderer):
+    from data_gen.render import render_stack
+
+    box = renderer.cornell_box()
+    for given, said in ((box, "load it: mi.load_dict"), ("diffuse", "data_gen.load_scene"), (3, "an int is given")):
+        with pytest.raises(NgptError, match=said):
+            render_stack(given, 2)
+    with pytest.raises(NgptError, match=r"load it: mi\.load_dict"):
+        data_gen.render_scene(box)
+    with pytest.raises(NgptError, match="a shot is of a scene file or a built-in scene, and a dict is given"):
+        data_gen.render_frames(box, range(2))
+
+
+def test_the_tensor_of_an_integrator_is_told_how_it_becomes_a_stack(renderer):
+    import ngpt
+
+    box = renderer.cornell_box() | {"integrator": {"type": "gpt", "max_depth": 3}}
+    box["sensor"]["film"] |= {"width": 16, "height": 12}
+    scene = renderer.load_dict(box)
+    image = renderer.render(scene, spp=2)
+    with pytest.raises(NgptError) as error:
+        ngpt.denoise(image)
+    (remedy,) = re.findall(r"pass (ngpt\S+ \S+),", str(error.value))
+    assert ngpt.denoise(eval(remedy), "l1").shape == (12, 16, 3)
+
+
+def test_a_missing_driver_is_said_with_what_to_use(renderer):
+    if "cuda_ad_rgb" not in renderer.variants():
+        pytest.skip("this Mitsuba knows no CUDA")
+    code = "import data_gen; data_gen.use_variant('cuda_ad_rgb')"
+    told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    if told.returncode == 0:
+        pytest.skip("there is a driver")
+    assert "cannot start: no NVIDIA driver was found; use llvm_ad_rgb" in told.stderr

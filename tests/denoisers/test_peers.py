@@ -174,11 +174,11 @@ def test_oidn_is_given_what_is_best_for_it(room, monkeypatch):
         reconstruct(stack, "oidn", quality="best")
 
 
-@pytest.mark.parametrize(("name", "package"), [("oidn", "mitsuba-oidn"), ("nlm", r"'ngpt-recon\[peers\]'")])
+@pytest.mark.parametrize(("name", "package"), [("oidn", "mitsuba-oidn"), ("nlm", r"-e \S+\[peers\]")])
 def test_an_absent_peer_says_what_to_install(room, monkeypatch, name, package):
     for module in (oidn, nlm):
         monkeypatch.setattr(module, "find_spec", lambda name: None)
-    with pytest.raises(NgptError, match=f"method '{name}'.*not installed: pip install {package}"):
+    with pytest.raises(NgptError, match=f"method '{name}'.*not installed: .*pip install {package}"):
         reconstruct(room[0], name)
 
 

@@ -1,0 +1,47 @@
+"""The command that installs what an extra of ngpt-recon brings: all messages that name one take it from here."""
+
+import re
+import shlex
+import shutil
+import sys
+from pathlib import Path
+
+# Whether the package index has ngpt-recon. The first release makes this True, and README's table goes by the index then
+# (tests/system/test_install.py sees to it).
+PUBLISHED = False
+
+NAME = "ngpt-recon"
+CHECKOUT = Path(__file__).parents[2]
+
+
+def install_command(extra: str) -> str:
+    """What to type, as it stands: for the index, for this checkout, or else for the packages that the extra brings."""
+    if PUBLISHED:
+        return f"{_pip()} install '{NAME}[{extra}]'"
+    if (CHECKOUT / "pyproject.toml").is_file():
+        return f"{_pip()} install -e {shlex.quote(f'{CHECKOUT}[{extra}]')}"
+    # The wheel's own file may be gone by now.
+    return f"{_pip()} install {shlex.join(packages_of(extra))}"
+
+
+def package_command(package: str) -> str:
+    """What to type for a package of the index."""
+    return f"{_pip()} install {shlex.quote(package)}"
+
+
+def packages_of(extra: str) -> list[str]:
+    """The packages that an extra brings, with the versions they must have, as the installed metadata name them."""
+    from importlib.metadata import PackageNotFoundError, requires  # takes 50 ms
+
+    try:
+        lines = requires(NAME) or []
+    except PackageNotFoundError:
+        return [f"{NAME}[{extra}]"]
+    return [line.partition(";")[0].strip() for line in lines if re.search(rf"extra == ['\"]{extra}['\"]", line)]
+
+
+def _pip() -> str:
+    """The one that installs for this Python: that of the shell may be another's."""
+    found = shutil.which("pip")
+    beside = found is not None and Path(found).parent == Path(sys.executable).parent
+    return "pip" if beside else f"{shlex.quote(sys.executable)} -m pip"

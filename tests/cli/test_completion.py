@@ -1,0 +1,89 @@
+"""Shell completion and the manual page: made of the parsers, taken by the shells and by man."""
+
+import shutil
+import subprocess
+
+import pytest
+
+from ngpt.cli import all_verbs, main, parsers
+from ngpt.cli.completion import options
+
+
+@pytest.fixture(scope="module")
+def verbs():
+    return parsers()
+
+
+def printed(capfd, *arguments):
+    with pytest.raises(SystemExit) as left:
+        main([*arguments])
+    output, errors = capfd.readouterr()
+    assert (left.value.code or 0, errors) == (0, "")
+    return output
+
+
+def shell(name):
+    """The program, or a skip where it is not installed."""
+    if shutil.which(name) is None:
+        pytest.skip(f"{name} is not installed")
+    return name
+
+
+# What bash and zsh hand to a completion function, and what it gave.
+ASK = '\nCOMP_WORDS=({words}); COMP_CWORD={last}; _ngpt; echo "${{COMPREPLY[@]}}"\n'
+
+
+@pytest.mark.parametrize("name", ["bash", "zsh", "fish"])
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["den"], {"denoise"}),
+        (["--comp"], {"--completion"}),
+        (["--completion", "b"], {"bash"}),
+        (["denoise", "-m", "wc"], {"wcv"}),
+        (["denoise", "x.exr", "--skip"], {"--skip-existing"}),
+        (["render", "sc", "--ad"], {"--adaptive"}),
+        (["denoise", "-o", "fil"], {"file.exr"}),
+        (["denoise", "fil"], {"file.exr"}),
+    ],
+)
+def test_words_are_completed(name, words, expected, capfd, tmp_path):
+    script = printed(capfd, "--completion", name)
+    (tmp_path / "file.exr").touch()
+    if name == "fish":
+        source = f"{script}\ncomplete -C 'ngpt {' '.join(words)}'\n"
+    elif name == "zsh":
+        # Without a line editor nobody completes, so compinit is left out. With arrays from 0, as bashcompinit has it.
+        script = "compdef() { :; }\n" + script
+        source = f"{script}\nemulate sh" + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
+    else:
+        source = script + ASK.format(words=" ".join(["ngpt", *words]), last=len(words))
+    options = ["--no-config"] if name == "fish" else ["-f"] if name == "zsh" else ["--norc"]
+    done = subprocess.run([shell(name), *options], input=source, capture_output=True, text=True, cwd=tmp_path)
+    # zsh leaves it to its line editor to take those that begin so.
+    offered = {line.split("\t")[0] for line in done.stdout.replace(" ", "\n").split("\n")}
+    assert {one for one in offered if one and one.startswith(words[-1])} == expected, done.stderr
+
+
+def test_completion_and_manual_know_every_option(verbs, capfd):
+    scripts = {name: printed(capfd, "--completion", name) for name in ("bash", "zsh", "fish")}
+    manual = printed(capfd, "--manual").replace("\\-", "-")
+    assert verbs.keys() == all_verbs().keys()
+    for verb, parser in verbs.items():
+        assert f".SS ngpt {verb}" in manual
+        for action in options(parser):
+            long = action.option_strings[-1]
+            assert long in scripts["bash"] and long in scripts["zsh"] and long in manual
+            assert f"-{'l' if long.startswith('--') else 's'} {long.lstrip('-')}" in scripts["fish"]
+
+
+def test_man_takes_the_manual_without_a_warning(capfd):
+    page = printed(capfd, "--manual")
+    told = subprocess.run([shell("groff"), "-man", "-Tutf8", "-ww"], input=page, capture_output=True, text=True)
+    assert told.returncode == 0 and told.stderr == ""
+
+
+def test_an_unknown_shell_is_told(capfd):
+    with pytest.raises(SystemExit):
+        main(["--completion", "tcsh"])
+    assert "invalid choice: 'tcsh'" in capfd.readouterr().err

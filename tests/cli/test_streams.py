@@ -1,0 +1,52 @@
+"""``ngpt denoise - -o -``: an image goes through, and nothing else does."""
+
+import io
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+import ngpt
+from ngpt.cli import main
+
+
+@pytest.fixture
+def noisy(noisy_stack, tmp_path, monkeypatch):
+    """The name of a file, in the current folder."""
+    monkeypatch.chdir(tmp_path)
+    ngpt.write("noisy.exr", noisy_stack[0])
+    return "noisy.exr"
+
+
+def test_an_image_goes_through(noisy, tmp_path):
+    command = [sys.executable, "-m", "ngpt", "denoise", "-", "-o", "-", "-m", "l1"]
+    done = subprocess.run(command, input=(tmp_path / noisy).read_bytes(), capture_output=True, check=True)
+    (tmp_path / "through.exr").write_bytes(done.stdout)
+    assert main(["denoise", noisy, "-o", "file.exr", "-m", "l1"]) == 0
+    assert np.array_equal(ngpt.read_image("through.exr"), ngpt.read_image("file.exr"))
+    assert done.stderr.count(b"\n") == 1 and b"l1" in done.stderr
+
+
+def test_one_end_may_be_a_file(noisy, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO((tmp_path / noisy).read_bytes())))
+    assert main(["denoise", "-", "-o", "from/here/", "-m", "l1"]) == 0
+    assert (tmp_path / "from" / "here" / "standard-input.exr").is_file()
+    assert main(["denoise", noisy, "-o", "new/folder", "-m", "l1"]) == 0
+    assert (tmp_path / "new" / "folder" / noisy).is_file()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "complaint"),
+    [
+        (["-"], "standard input has no name to go by"),
+        (["-", "noisy.exr", "-o", "x/"], "'-' is one stack, and 2 are given"),
+        (["noisy.exr", "-o", "-", "--json"], "both want standard output"),
+        (["-", "-o", "-"], "standard-input.exr: is empty"),
+    ],
+)
+def test_what_makes_no_sense_is_said_and_nothing_is_written(noisy, arguments, complaint, monkeypatch, capfd):
+    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
+    assert main(["denoise", *arguments]) != 0
+    output, errors = capfd.readouterr()
+    assert complaint in errors and output == ""

@@ -1,0 +1,92 @@
+"""Progress on terminals of all widths: one line, with how far it is and how long it takes; and what --verbose shows."""
+
+import io
+import logging
+import re
+import sys
+
+import pytest
+
+import ngpt
+from ngpt.cli import main
+from ngpt.cli.info import show
+from ngpt.system import console
+from ngpt.system.console import Console, logged
+
+
+class Terminal(io.StringIO):
+    def isatty(self):
+        return True
+
+
+@pytest.fixture
+def shown(monkeypatch):
+    """What a bar looks like at the end of work, by columns of the terminal and whether it tells a rate."""
+
+    def look(columns, rate=False, label="render scenes/a-long-name-of-a-folder/scene.xml"):
+        screen = Terminal()
+        monkeypatch.setattr(sys, "stderr", screen)
+        for name, value in {"COLUMNS": str(columns), "LINES": "24", "TERM": "xterm"}.items():
+            monkeypatch.setenv(name, value)
+        clock = iter(range(1000))
+        monkeypatch.setattr(console.time, "monotonic", lambda: float(next(clock)))
+        with Console().progress(label, "spp", rate) as update:
+            for done in range(0, 3001, 1000):
+                update(done, 4000)
+        plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", screen.getvalue())
+        return [line.rstrip() for line in plain.replace("\r", "\n").split("\n") if line.strip()]
+
+    return look
+
+
+@pytest.mark.parametrize("columns", [40, 50, 60, 70, 80, 100, 160])
+@pytest.mark.parametrize("rate", [False, True])
+def test_it_fits_and_says_how_far_it_is_and_how_long_it_takes(shown, columns, rate):
+    last = shown(columns, rate)[-1]
+    assert len(last) <= columns and "3000/4000" in last and "s left" in last
+    assert ("…" in last) == ("render scenes" not in last)
+
+
+def test_a_wide_terminal_has_all_of_it(shown):
+    (last,) = shown(160, rate=True)[-1:]
+    assert "render scenes/a-long-name" in last and "spp/s" in last and "━" in last and "about 1 s left" in last
+
+
+def test_info_breaks_lines_between_words_on_a_terminal_alone(monkeypatch):
+    told = {"layers": {"primal": {"channels": "R G B", "part": 0, "type": "float32"}}, "missing": ["dx", "dy_var"] * 9}
+    screens = Terminal(), io.StringIO()
+    for screen in screens:
+        monkeypatch.setattr(sys, "stdout", screen)
+        monkeypatch.setenv("COLUMNS", "40")
+        show(told, as_json=False)
+    narrow, plain = (screen.getvalue().splitlines() for screen in screens)
+    assert max(map(len, narrow)) <= 40 and max(map(len, plain)) > 100
+    assert " ".join(narrow).split() == " ".join(plain).split()
+
+
+def test_verbose_shows_what_the_logger_is_told(noisy_stack, tmp_path, capfd):
+    ngpt.write(tmp_path / "noisy.exr", noisy_stack[0])
+    command = ["denoise", str(tmp_path / "noisy.exr"), "-m", "l1", "--force"]
+    assert main(command) == 0
+    assert "ms  ngpt." not in capfd.readouterr().err
+    assert main([*command, "--verbose"]) == 0
+    output, errors = capfd.readouterr()
+    assert "ngpt.io.exr: " in errors and "dx (dx.R dx.G dx.B)" in errors and "method l1" in errors and output == ""
+    assert logging.getLogger("ngpt").level == logging.NOTSET
+
+
+def test_a_program_hears_it_only_if_it_asks(noisy_stack, caplog):
+    with caplog.at_level(logging.INFO, logger="ngpt"):
+        ngpt.denoise(noisy_stack[0], "l1")
+    assert "method l1" in caplog.text
+    assert isinstance(logging.getLogger("ngpt").handlers[0], logging.NullHandler)
+
+
+def test_log_lines_go_where_standard_error_leads_then(monkeypatch):
+    first, second = io.StringIO(), io.StringIO()
+    monkeypatch.setattr(sys, "stderr", first)
+    with logged(True):
+        monkeypatch.setattr(sys, "stderr", second)
+        logging.getLogger("ngpt.test").info("heard")
+    logging.getLogger("ngpt.test").info("unheard")
+    assert first.getvalue() == "" and "ngpt.test: heard" in second.getvalue() and "unheard" not in second.getvalue()
