@@ -212,6 +212,13 @@ def test_emission_that_is_met_has_the_density_of_the_vertex(renderer):
     assert np.array_equal(np.array(dr.max(Le1) > 0), lit)
 
 
+def test_the_plugin_takes_it_too(renderer):
+    scene = load(renderer, lambda: gallery(low=True), (8, 8))
+    plugin = renderer.load_dict({"type": "gpt", "max_depth": 2})
+    assert np.isfinite(np.array(renderer.render(scene, integrator=plugin, spp=1))).all()
+    assert plugin.places
+
+
 SCENES = {
     "flat": lambda: gallery(),
     "balls and points": lambda: gallery(flat=False, sky=False),
