@@ -83,6 +83,7 @@ def test_a_sampler_that_never_joins_falls_through_the_floor(renderer, monkeypatc
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(3600)
 @pytest.mark.parametrize("name", NAMES)
 def test_ten_stress_scenes(renderer, name):
     clock, found, wrong, outcomes = time.monotonic(), {}, [], {}
