@@ -113,7 +113,7 @@ class BDPT(GradientIntegrator):
         film.put_all(values)
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
-        """Whether something is between ``si`` and the camera; lamps are not, if they are hidden."""
+        """Whether something is between ``si`` and the camera's near plane; lamps are not, if they are hidden."""
         if not self.hide_emitters:
             return scene.ray_test(si.spawn_ray_to(camera.p), active)
         on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.features import features
+from data_gen.paths.features import before_near_plane, features
 
 ALPHA = 2 / 3
 
@@ -30,14 +30,14 @@ def shrunk(i: int, dimension: int = 2) -> float:
 def pixel_width(scene: mi.Scene) -> float:
     """How wide a pixel is where the camera sees something, in world units: the median over the image.
 
-    Where it sees nothing, a thousandth of the scene's diagonal.
+    Where it sees nothing, or has no pixels side by side, a thousandth of the scene's diagonal.
     """
     camera = CameraSamples(scene.sensors()[0], 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
-    aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * depth)
+    aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * (depth - before_near_plane(camera.sensor, ray)))
     dr.eval(depth, aside)
-    seen = np.array(depth) > 0
+    seen = (np.array(depth) > 0) & ray.has_differentials
     box = scene.bbox()
     wide = np.median(np.array(aside)[seen]) if seen.any() else 1e-3 * np.linalg.norm(np.array(box.extents()))
     return float(wide)
