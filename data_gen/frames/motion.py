@@ -57,7 +57,8 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     pixels = np.diag([*(float(n) for n in film.crop_size()), 1, 1])
     for axis, name in enumerate(("principal_point_offset_x", "principal_point_offset_y")):
         if name in params:
-            pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * pixels[axis, axis]
+            # Of the whole film, whatever its crop window
+            pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * film.size()[axis]
     return pixels @ matrix(projection) @ np.linalg.inv(matrix(params["to_world"]))
 
 

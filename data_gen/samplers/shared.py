@@ -35,6 +35,21 @@ def surfaces_alone(name: str) -> Refusal:
     return refuses
 
 
+def surfaces_from_both_ends(name: str) -> Refusal:
+    """Of a sampler whose light paths end at the camera."""
+    alone = surfaces_alone(name)
+
+    def refuses(facts: Facts) -> str:
+        return alone(facts) or refused_by_light_paths(facts.camera)
+
+    return refuses
+
+
+def refused_by_light_paths(camera: str) -> str:
+    reached = camera in ("perspective", "thinlens")
+    return "" if reached else f"light paths cannot reach a camera '{camera}', but 'perspective' and 'thinlens'"
+
+
 def media_alone(name: str, grids: bool = True) -> Refusal:
     """Of a sampler for scenes with media; ``grids``: also ones whose density varies."""
 

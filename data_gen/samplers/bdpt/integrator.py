@@ -38,9 +38,9 @@ from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.shared import refused_by_light_paths
+from data_gen.scenes.cameras import camera_name
 from ngpt.errors import NgptError
-
-_CAMERAS = ("PerspectiveCamera", "ThinLensCamera")
 
 
 @dataclass
@@ -133,12 +133,8 @@ def refuse(scene, sampler: str) -> None:
             f"sampler '{sampler}' does not follow polarised light (variant '{mi.variant()}'); "
             f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
         )
-    camera = scene.sensors()[0]
-    if camera.class_name() not in _CAMERAS:
-        raise NgptError(
-            f"sampler '{sampler}' cannot render this scene: light paths cannot reach a camera of type "
-            f"{camera.class_name()}, but perspective and thin lens; use --sampler gpt, or primal"
-        )
+    if reason := refused_by_light_paths(camera_name(scene.sensors()[0])):
+        raise NgptError(f"sampler '{sampler}' cannot render this scene: {reason}; use --sampler gpt, or primal")
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:
