@@ -48,7 +48,7 @@ class Eye:
         return self.sensor.sample_ray(self.time, self.wavelength, uv / mi.Vector2f(self.size), lens)[0]
 
     def toward(self, si: mi.Interaction3f, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
-        """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's importance W / distance².
+        """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
 
         ``uv`` of it is the place on the film, in pixels; ``p`` is where the ray from there begins, on the near plane;
         ``pdf`` is 0 where the camera does not see ``si``, whatever is in between: off the film, before the near plane
@@ -92,6 +92,7 @@ class Sight:
 def film_area(sensor: mi.Sensor) -> float:
     """The area of the film's crop window at distance 1, of a perspective camera or a thin lens."""
     film = sensor.film()
-    (width, height), window = film.size(), film.crop_size()
-    across = 2 * np.tan(np.radians(float(np.ravel(mi.traverse(sensor)["x_fov"])[0])) / 2) / width
-    return float(across**2 * window[0] * window[1])
+    fov = float(np.ravel(mi.traverse(sensor)["x_fov"])[0])
+    # Pixels are squares.
+    pixel = 2 * np.tan(np.radians(fov) / 2) / film.size()[0]
+    return float(pixel**2 * np.prod(film.crop_size()))

@@ -58,7 +58,7 @@ def axes(sensor) -> list[mi.Vector3f]:
 
 
 def before_near_plane(sensor, ray) -> mi.Float:
-    """How far from a camera, or from the plane of an orthographic one, its ``ray`` begins, which is on the near plane."""
+    """How far from a camera, or from the plane of an orthographic one, its ``ray`` begins: on its near plane."""
     if not isinstance(sensor, mi.ProjectiveCamera):
         return mi.Float(0)
     # For an orthographic camera near_clip counts in units of to_world, which may be scaled.

@@ -43,9 +43,7 @@ def scene_facts(scene: mi.Scene) -> Facts:
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
-    return Facts(
-        integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera)
-    )
+    return Facts(integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera))
 
 
 def integrator_name(scene: mi.Scene) -> str:

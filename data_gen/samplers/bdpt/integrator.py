@@ -93,8 +93,8 @@ class BDPT(GradientIntegrator):
             **more,
         )
 
-    def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        refuse(sensor or scene.sensors()[0], self.name)
         plan = self.plan(World(scene, LightEnds(scene, self.name)))
         return lambda camera, film: self.sample_pass(plan, camera, film)
 
@@ -126,14 +126,14 @@ class BDPT(GradientIntegrator):
         return on_lamp | blocked
 
 
-def refuse(scene, sampler: str) -> None:
+def refuse(sensor: mi.Sensor, sampler: str) -> None:
     """Raises NgptError, in the name of the ``sampler``, for a variant or a camera that light paths cannot reach."""
     if mi.is_polarized:
         raise NgptError(
             f"sampler '{sampler}' does not follow polarised light (variant '{mi.variant()}'); "
             f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
         )
-    if reason := refused_by_light_paths(camera_name(scene.sensors()[0])):
+    if reason := refused_by_light_paths(camera_name(sensor)):
         raise NgptError(f"sampler '{sampler}' cannot render this scene: {reason}; use --sampler gpt, or primal")
 
 

@@ -60,7 +60,9 @@ def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool
     return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
 
 
-def to_camera(eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+def to_camera(
+    eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, occluded
+) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
     """t = 1; and the place on the film, in pixels. ``occluded`` is asked for (si, toward the camera, active)."""
     camera, importance = eye.toward(y.si, lens, active)
     active = active & (camera.pdf > 0)

@@ -13,20 +13,19 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The media of a scene, one of which may be around its camera: ``within``.
+    """The media of a scene, one of which may be around the camera ``sensor``: ``within``.
 
     Raises NgptError, in the name of the ``sampler``, for media whose density varies unless it renders ``grids``, and
     where light from infinitely far away comes through a medium without end.
     """
 
-    def __init__(self, scene: mi.Scene, lights: LightEnds, sampler: str, grids: bool = False):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str, grids: bool = False):
         self.media = Media(scene)
         if self.media.grids and not grids:
             raise NgptError(
                 f"sampler '{sampler}' cannot render this scene: there are media whose density varies; "
                 "use --sampler gpt, or gvpm, vpm, bre or beams for photons"
             )
-        sensor = scene.sensors()[0]
         self.within = mi.MediumPtr(sensor.get_medium())
         self.eye = mi.Point3f(sensor.world_transform().translation())
         corner = mi.Point3f(scene.bbox().max) + float(np.linalg.norm(np.array(scene.bbox().extents())))

@@ -27,12 +27,12 @@ def shrunk(i: int, dimension: int = 2) -> float:
     return math.exp(log_ratio / dimension)
 
 
-def pixel_width(scene: mi.Scene) -> float:
-    """How wide a pixel is where the camera sees something, in world units: the median over the image.
+def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
+    """How wide a pixel of ``sensor`` is where that sees something, in world units: the median over the image.
 
     Where it sees nothing, or has no pixels side by side, a thousandth of the scene's diagonal.
     """
-    camera = CameraSamples(scene.sensors()[0], 0, 1)
+    camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
     aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * (depth - before_near_plane(camera.sensor, ray)))
