@@ -20,15 +20,17 @@ class Eye:
     lens: mi.Point2f  # place on the lens, in [0, 1]²
     time: mi.Float | float
     wavelength: mi.Float  # a random number
-    near: mi.Float  # along its axis, where what it sees begins
+    near: mi.Float  # along its axis, where what it sees begins,
+    far: mi.Float  # and ends
     area: mi.Float  # of the film, at distance 1
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Eye:
         """That of these camera samples, of a perspective camera or a thin lens."""
         sensor = camera.sensor
-        near, area = (dr.opaque(mi.Float, number) for number in (sensor.near_clip(), film_area(sensor)))
-        return cls(sensor, camera.lens, camera.time, camera.wavelength, near, area)
+        numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
+        planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
+        return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area)
 
     @property
     def size(self) -> mi.ScalarVector2u:
@@ -52,14 +54,17 @@ class Eye:
 
         ``uv`` of it is the place on the film, in pixels; ``p`` is where the ray from there begins, on the near plane;
         ``pdf`` is 0 where the camera does not see ``si``, whatever is in between: off the film, before the near plane
-        or beyond the far one. W = 1 / (A cos³), with A the film's area at distance 1: Mitsuba's own is 0 in the part of
-        the film that an offset of the principal point adds.
+        or beyond the far one; else 1. W = 1 / (A cos³), with A the film's area at distance 1.
+
+        Of Mitsuba 3.9 are the direction and the place alone. Its importance is 0 in the part of the film that an offset
+        of the principal point adds, and a thin lens sees what is before its near plane.
         """
         to, _ = self.sensor.sample_direction(si, lens, active)
         cos = -dr.dot(to.n, to.d)
-        importance = dr.rcp(self.area * cos * dr.square(cos * to.dist))
+        deep = cos * to.dist
+        importance = dr.rcp(self.area * cos * dr.square(deep))
         to.p -= to.d * (self.near / cos)
-        to.pdf = dr.select(self.shows(to.uv), to.pdf, 0)
+        to.pdf = dr.select(self.shows(to.uv) & (deep >= self.near) & (deep <= self.far), mi.Float(1), 0)
         return to, importance
 
     def shows(self, uv: mi.Point2f) -> mi.Bool:

@@ -42,11 +42,11 @@ def orthographic(scale, **parameters):
 
 
 def card():
-    """Between the camera and a near plane at 1.6, before the middle of the picture."""
+    """Between the camera and a near plane at 1.6, before the middle of the picture; the side that is seen is lit."""
     from data_gen.scenes.builtin import _diffuse, _wall
 
     grey = {"type": "twosided", "bsdf": _diffuse(0.5, 0.5, 0.5)}
-    return {"card": _wall([0.2, 0.6, 2.3], [0, 0, 1], (0.35, 0.3), grey)}
+    return {"card": _wall([0.2, 0.45, 2.3], [0, 0.95, 0.3], (0.4, 0.5), grey)}
 
 
 def meter(kind):

@@ -15,7 +15,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.camera import CameraSamples
-from data_gen.paths.features import before_near_plane, features
+from data_gen.paths.features import features
 
 ALPHA = 2 / 3
 
@@ -35,7 +35,9 @@ def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
     camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
-    aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * (depth - before_near_plane(camera.sensor, ray)))
+    # Of a perspective camera Mitsuba 3.9 begins the neighbour's ray where this one begins, on the near plane.
+    fans = dr.squared_norm(ray.d_x - ray.d) > 0
+    aside = dr.select(fans, dr.norm(ray.d_x - ray.d) * depth, dr.norm(ray.o_x - ray.o))
     dr.eval(depth, aside)
     seen = (np.array(depth) > 0) & ray.has_differentials
     box = scene.bbox()
