@@ -80,8 +80,10 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
 
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
-    """What materials, lights and media mean for a stack, whoever renders it, a line for each thing that matters."""
+    """What camera, materials, lights and media mean for a stack, whoever renders it, a line for each that matters."""
     lines = []
+    if facts.camera == "batch":
+        lines.append("camera 'batch': no sampler renders it; take its cameras out of it, and render each on its own")
     for name, sampler in by_standing("use").items():
         if reason := sampler.refuses(facts):
             lines.append(f"`--sampler {name}` refuses: {reason}")

@@ -20,6 +20,7 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.features import first_nonspecular_vertex
+from data_gen.scenes.cameras import camera_name
 from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
 from ngpt.errors import NgptError
 
@@ -50,7 +51,10 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     """The projection of a camera onto its film, in pixels of the crop window."""
     params, film = mi.traverse(sensor), sensor.film()
     if "x_fov" not in params:
-        raise NgptError(f"sensor '{sensor.class_name()}': motion vectors need a perspective or thinlens camera")
+        raise NgptError(
+            f"camera '{camera_name(sensor)}': motion vectors need a perspective or thinlens camera; "
+            "render single images, without --frames"
+        )
     near, far = sensor.near_clip(), sensor.far_clip()
     fov = float(np.array(params["x_fov"]).ravel()[0])
     projection = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, near, far)

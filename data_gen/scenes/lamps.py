@@ -63,7 +63,8 @@ def lamp_weights(scene: mi.Scene) -> np.ndarray:
     def pair() -> mi.Point2f:
         return mi.Point2f(random.next_float32(), random.next_float32())
 
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), random.next_float32(), pair(), pair())
+    # Meters on shapes have no other way to sample a ray.
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), pair(), pair())
     ray, active, found = mi.Ray3f(ray), dr.full(mi.Bool, True, _PATHS), []
     emitters = scene.emitters_dr()
     for vertex in range(_VERTICES):

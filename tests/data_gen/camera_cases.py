@@ -183,6 +183,9 @@ def stacks_of(scene, sampler, batches, spp):
     if "photons" in SAMPLERS[sampler].options:
         # For a meter, whose pixel has no known width, they are as many as in an image, gathered from as far.
         options = {"photons": 4096, "radius": 8} if meter else {"photons": 8, "radius": 0.6}
+        # Beams and planes are all tried for each camera ray: fewer do.
+        if sampler.endswith(("beams", "planes")):
+            options["photons"] = 128 if meter else 1
     elif meter:
         spp *= 128
     return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]

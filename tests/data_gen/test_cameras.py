@@ -179,6 +179,35 @@ def test_photons_are_gathered_in_pixels_wherever_the_near_plane_is(renderer):
     assert width(camera("radiancemeter", film=film(1, 1))) == pytest.approx(1e-3 * 40 * 2**0.5, rel=1e-3)
 
 
+@pytest.mark.parametrize("view", ["perspective", "irradiancemeter"])
+def test_lamps_are_weighed_by_what_any_camera_sees(renderer, view):
+    """Mitsuba's meters on shapes have rays with differentials alone."""
+    from data_gen.scenes.lamps import lamp_weights
+
+    dim = {"type": "sphere", "center": [0.5, 0.2, 0.5], "radius": 0.1, "emitter": {"type": "area"}}
+    weights = lamp_weights(renderer.load_dict(scene() | CAMERAS[view]() | {"zz": dim}, optimize=False))
+    assert len(weights) == 2 and 0.1 <= weights.min() < 0.4
+
+
+@pytest.mark.parametrize("kind", ["distant", "irradiancemeter"])
+def test_lamps_know_their_medium_wherever_the_camera_is(renderer, kind):
+    """It is looked for on the way to the camera: not to the middle of the world, where meters say they are."""
+    from data_gen.paths.light_ends import LightEnds
+    from data_gen.samplers.photons.map.fog import Fog
+
+    mi = renderer
+    meter = {"type": kind, "film": film(1, 1)}
+    if kind == "irradiancemeter":
+        meter = {"type": "sphere", "center": [0, 0, 5], "radius": 0.5, "meter": meter}
+    fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
+    lamp = {"type": "sphere", "radius": 0.1, "center": [0, 0.5, 0], "emitter": {"type": "area"}}
+    scene = mi.load_dict({"type": "scene", "meter": meter, "ball": ball, "lamp": lamp})
+    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
+    inside, outside = (ways.around(scene, mi.Point3f([0.0], [y], [0.0])) for y in (0.7, 1.3))
+    assert (inside != None)[0] and not (outside != None)[0]  # noqa: E711 - arrays of pointers
+
+
 @pytest.mark.parametrize("view", ["principal point", "principal point, crop", "crop", "mirrored", "near plane"])
 def test_a_still_camera_sees_nothing_move_and_knows_where_its_pixels_look(renderer, view):
     from data_gen.frames.motion import motion_vectors, seen, snapshot

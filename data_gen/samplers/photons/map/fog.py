@@ -27,7 +27,9 @@ class Fog:
                 "use --sampler gpt, or gvpm, vpm, bre or beams for photons"
             )
         self.within = mi.MediumPtr(sensor.get_medium())
-        self.eye = mi.Point3f(sensor.world_transform().translation())
+        # Where a ray begins: of a meter on a shape, or one infinitely far away, to_world says nothing of that.
+        middle = mi.Point2f(0.5)
+        self.eye = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)[0].o
         corner = mi.Point3f(scene.bbox().max) + float(np.linalg.norm(np.array(scene.bbox().extents())))
         outside = dr.reinterpret_array(mi.UInt32, self.around(scene, corner))[0]
         if outside and lights.emitters is not None and dr.any(lights.far(dr.arange(mi.UInt32, len(scene.emitters())))):
