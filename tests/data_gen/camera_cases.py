@@ -59,7 +59,7 @@ def irradiance():
     from data_gen.scenes.builtin import _diffuse, _wall
 
     shape = _wall([-0.5, 0.2, 0.9], [0.3, 1, 0.1], (0.4, 0.4), _diffuse(0.3, 0.3, 0.3))
-    return {"sensor": shape | {"sensor": {"type": "irradiancemeter", "film": film(2, 2)}}}
+    return {"sensor": shape | {"sensor": {"type": "irradiancemeter", "film": film(16, 16)}}}
 
 
 def distant():
@@ -168,6 +168,8 @@ def references_of(mi, name, media=False, batches=12, spp=256):
 
 def stacks_of(scene, sampler, batches, spp):
     """Layers of independent stacks by any sampler; those by photons with a radius that hardly blurs."""
+    import mitsuba as mi
+
     from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
     from data_gen.scenes.facts import scene_facts
     from ngpt.errors import NgptError
@@ -179,15 +181,16 @@ def stacks_of(scene, sampler, batches, spp):
     from data_gen.render import render_stack
 
     options = {}
-    meter = np.prod(scene.sensors()[0].film().crop_size()) <= 4
+    one = np.prod(scene.sensors()[0].film().crop_size()) == 1
     if "photons" in SAMPLERS[sampler].options:
-        # For a meter, whose pixel has no known width, they are as many as in an image, gathered from as far.
-        options = {"photons": 4096, "radius": 8} if meter else {"photons": 8, "radius": 0.6}
+        # The pixels of a meter have no known width; where there is but one, more is traced for it.
+        known = isinstance(scene.sensors()[0], mi.ProjectiveCamera)
+        options = {"photons": 1024 if one else 8, "radius": 0.6 if known else 8}
         # Beams and planes are all tried for each camera ray: fewer do.
         if sampler.endswith(("beams", "planes")):
-            options["photons"] = 128 if meter else 1
-    elif meter:
-        spp *= 128
+            options["photons"] //= 8
+    if one:
+        spp *= 4 if "photons" in options else 128
     return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]
 
 

@@ -37,7 +37,7 @@ def in_media(sampler):
 
 @cache
 def references(mi, view, media):
-    meter = view in ("radiancemeter", "irradiancemeter", "distant")
+    meter = view in ("radiancemeter", "distant")
     return references_of(mi, view, media, 16, 1024 if meter else 256)
 
 
