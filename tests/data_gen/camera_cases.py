@@ -168,8 +168,6 @@ def references_of(mi, name, media=False, batches=12, spp=256):
 
 def stacks_of(scene, sampler, batches, spp):
     """Layers of independent stacks by any sampler; those by photons with a radius that hardly blurs."""
-    import mitsuba as mi
-
     from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
     from data_gen.scenes.facts import scene_facts
     from ngpt.errors import NgptError
@@ -181,16 +179,11 @@ def stacks_of(scene, sampler, batches, spp):
     from data_gen.render import render_stack
 
     options = {}
-    one = np.prod(scene.sensors()[0].film().crop_size()) == 1
     if "photons" in SAMPLERS[sampler].options:
-        # The pixels of a meter have no known width; where there is but one, more is traced for it.
-        known = isinstance(scene.sensors()[0], mi.ProjectiveCamera)
-        options = {"photons": 1024 if one else 8, "radius": 0.6 if known else 8}
         # Beams and planes are all tried for each camera ray: fewer do.
-        if sampler.endswith(("beams", "planes")):
-            options["photons"] //= 8
-    if one:
-        spp *= 4 if "photons" in options else 128
+        options = {"photons": 1 if sampler.endswith(("beams", "planes")) else 8, "radius": 0.6}
+    if np.prod(scene.sensors()[0].film().crop_size()) == 1:
+        spp *= 128
     return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]
 
 

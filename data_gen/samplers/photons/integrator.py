@@ -22,6 +22,8 @@ from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, trace
 from data_gen.samplers.photons.passes import Passes, refuse_variants
+from data_gen.samplers.shared import refused_by_photons
+from data_gen.scenes.cameras import camera_name
 from data_gen.scenes.facts import media_of
 from ngpt.errors import NgptError
 
@@ -82,6 +84,8 @@ class PhotonIntegrator(GradientIntegrator):
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         sensor = sensor or scene.sensors()[0]
         refuse_variants(self.name)
+        if reason := refused_by_photons(camera_name(sensor)):
+            raise NgptError(f"sampler '{self.name}' cannot render this scene: {reason}; use --sampler gpt, or primal")
         lights = LightEnds(scene, self.name)
         _refuse_lamps_never_chosen(scene, self.name)
         fog = Fog(scene, sensor, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
