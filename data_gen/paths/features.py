@@ -132,7 +132,7 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
         depth += si.t
         if dr.hint(steps > 0, mode="scalar"):
             # Light that escapes has come from far, but not from so far that float32 has no number for it.
-            length = dr.minimum(si.t, 1e9)
+            length = dr.minimum(dr.minimum(si.t, ray.maxt), 1e9)
             passed, albedo = through_medium(medium, ray, length, sampler, steps)
             scattered = type(scattered)(scattered + tint * albedo)
             tint *= passed
