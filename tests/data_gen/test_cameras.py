@@ -41,8 +41,8 @@ def references(mi, view, media):
     return references_of(mi, view, media, 16, 1024 if meter else 256)
 
 
-def check(mi, sampler, view, batches, spp):
-    media = in_media(sampler)
+def check(mi, sampler, view, batches, spp, media=False):
+    media = media or in_media(sampler)
     scene = scene_with(mi, view, media)
     kind = CAMERAS[view]()["sensor"]["type"]
     kind = view if view == "irradiancemeter" else kind
@@ -71,6 +71,25 @@ def test_right(renderer, sampler, view):
 @pytest.mark.parametrize(("sampler", "view"), SLOW)
 def test_right_or_refused(renderer, sampler, view):
     check(renderer, sampler, view, batches=10, spp=8 if getattr(SAMPLERS.get(sampler), "batch", 0) == 1 else 16)
+
+
+@pytest.mark.parametrize("sampler", ["gpt", pytest.param("gpt-basic", marks=pytest.mark.slow)])
+def test_fog_ends_at_the_far_plane(renderer, sampler):
+    """Nothing scatters beyond it, and what does not scatter before it is gone."""
+    check(renderer, sampler, "far plane", batches=10, spp=32, media=True)
+
+
+def test_paths_and_their_copies_to_photons_end_at_the_far_plane(renderer):
+    """The cells of the matrix that show it are slow."""
+    from types import SimpleNamespace
+
+    from data_gen.paths.walk import Limits
+    from data_gen.samplers.photons.gradients.camera import CameraPaths
+
+    _, ray, _ = eye_of(renderer, camera(fov=40, near_clip=1.6, far_clip=4.0))
+    walk = CameraPaths(SimpleNamespace(limits=Limits(4, 100)), None)
+    assert np.array_equal(np.array(walk.first(ray, 1.0, True).ray.maxt), np.array(ray.maxt))
+    assert np.array(ray.maxt).max() < 4
 
 
 def eye_of(mi, sensor, samples=64):
