@@ -38,7 +38,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     except RuntimeError as error:
         raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
     plugins = {kind: Counter() for kind in _KINDS}
-    size, shutter, media = None, 0.0, []
+    size, shutter, media, cameras = None, 0.0, [], []
     for node in nodes:
         kind, props = node.type.name, node.props
         if kind in plugins:
@@ -46,13 +46,21 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         if kind == "Film" and "width" in props and "height" in props:
             size = (int(props["width"]), int(props["height"]))
         if kind == "Sensor":
+            cameras.append(props.plugin_name())
             shutter = float(props.get("shutter_close", 0.0)) - float(props.get("shutter_open", 0.0))
         if kind == "Medium":
             media.append(props.id() or props.plugin_name())
     integrator = next(iter(plugins["Integrator"]), "path")
     lens = "thinlens" in plugins["Sensor"]
     mirrors = any(name in plugins["BSDF"] for name in _MIRRORS)
-    facts = Facts(integrator, tuple(sorted(media)), polarised(), mirrors, "heterogeneous" in plugins["Medium"])
+    facts = Facts(
+        integrator,
+        tuple(sorted(media)),
+        polarised(),
+        mirrors,
+        grids="heterogeneous" in plugins["Medium"],
+        camera=cameras[0] if cameras else "perspective",
+    )
     sampler, reason = choose(facts)
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
@@ -72,12 +80,14 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
 
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:
-    """What materials, lights and media mean for a stack, whoever renders it, a line for each thing that matters."""
+    """What camera, materials, lights and media mean for a stack, whoever renders it, a line for each that matters."""
     refusals: dict[str, list[str]] = {}
     for name, sampler in by_standing("use").items():
         if reason := sampler.refuses(facts):
             refusals.setdefault(reason.replace(f"'{name}'", "the sampler"), []).append(name)
     lines = [f"refused by {', '.join(names)}: {reason}" for reason, names in refusals.items()]
+    if facts.camera == "batch":
+        lines.append("camera 'batch': no sampler renders it; take its cameras out of it, and render each on its own")
     if facts.media and not facts.integrator.startswith("vol"):
         lines.append(
             f"media are in the scene, but '{facts.integrator}' does not render them: use -D integrator=volpath or alike"

@@ -20,6 +20,7 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.features import first_nonspecular_vertex
+from data_gen.scenes.cameras import camera_name
 from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
 from ngpt.errors import NgptError
 
@@ -50,14 +51,18 @@ def _film(sensor: mi.Sensor) -> np.ndarray:
     """The projection of a camera onto its film, in pixels of the crop window."""
     params, film = mi.traverse(sensor), sensor.film()
     if "x_fov" not in params:
-        raise NgptError(f"sensor '{sensor.class_name()}': motion vectors need a perspective or thinlens camera")
+        raise NgptError(
+            f"camera '{camera_name(sensor)}': motion vectors need a perspective or thinlens camera; "
+            "render single images, without --frames"
+        )
     near, far = sensor.near_clip(), sensor.far_clip()
     fov = float(np.array(params["x_fov"]).ravel()[0])
     projection = mi.perspective_projection(film.size(), film.crop_size(), film.crop_offset(), fov, near, far)
     pixels = np.diag([*(float(n) for n in film.crop_size()), 1, 1])
     for axis, name in enumerate(("principal_point_offset_x", "principal_point_offset_y")):
         if name in params:
-            pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * pixels[axis, axis]
+            # Of the whole film, whatever its crop window
+            pixels[axis, 3] = -float(np.array(params[name]).ravel()[0]) * film.size()[axis]
     return pixels @ matrix(projection) @ np.linalg.inv(matrix(params["to_world"]))
 
 

@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.media import beyond, onward, pick
+from data_gen.paths.media import beyond, end_of, onward, pick
 
 
 @dataclass
@@ -113,7 +113,7 @@ def fly_on(passes, trace, ray, medium, *, channel, u, key, active):
             hit = trace(ray, medium, mi.Bool(True))
             μ, grid, t, far = extent(medium, ray)
         μ_c = pick(μ, channel)
-        end = dr.minimum(hit.t, far)
+        end = dr.minimum(dr.minimum(hit.t, far), end_of(ray))
         collision = dr.select(μ_c > 0, t + dr.select(grid, ahead, left) / μ_c, dr.inf)
         collides = collision < end
         stop = dr.select(collides, collision, end)

@@ -7,6 +7,7 @@ from typing import Any
 
 import drjit as dr
 import mitsuba as mi
+import numpy as np
 
 from data_gen.paths.camera import CameraSamples
 
@@ -19,11 +20,17 @@ class Eye:
     lens: mi.Point2f  # place on the lens, in [0, 1]²
     time: mi.Float | float
     wavelength: mi.Float  # a random number
+    near: mi.Float  # along its axis, where what it sees begins,
+    far: mi.Float  # and ends
+    area: mi.Float  # of the film, at distance 1
 
     @classmethod
     def of(cls, camera: CameraSamples) -> Eye:
-        """That of these camera samples."""
-        return cls(camera.sensor, camera.lens, camera.time, camera.wavelength)
+        """That of these camera samples, of a perspective camera or a thin lens."""
+        sensor = camera.sensor
+        numbers = (sensor.near_clip(), sensor.far_clip(), film_area(sensor))
+        planes_and_area = (dr.opaque(mi.Float, number) for number in numbers)
+        return cls(sensor, camera.lens, camera.time, camera.wavelength, *planes_and_area)
 
     @property
     def size(self) -> mi.ScalarVector2u:
@@ -41,6 +48,24 @@ class Eye:
     def ray(self, uv: mi.Point2f, lens: mi.Point2f) -> mi.Ray3f:
         """Through the place ``uv`` on the film, in pixels, and the place ``lens`` on the lens."""
         return self.sensor.sample_ray(self.time, self.wavelength, uv / mi.Vector2f(self.size), lens)[0]
+
+    def toward(self, si: mi.Interaction3f, lens: mi.Point2f, active: mi.Bool | bool = True) -> tuple:
+        """From ``si`` to the place ``lens`` on the lens: a DirectionSample3f, and the camera's W / distance².
+
+        ``uv`` of it is the place on the film, in pixels; ``p`` is where the ray from there begins, on the near plane;
+        ``pdf`` is 0 where the camera does not see ``si``, whatever is in between: off the film, before the near plane
+        or beyond the far one; else 1. W = 1 / (A cos³), with A the film's area at distance 1.
+
+        Of Mitsuba 3.9 are the direction and the place alone. Its importance is 0 in the part of the film that an offset
+        of the principal point adds, and a thin lens sees what is before its near plane.
+        """
+        to, _ = self.sensor.sample_direction(si, lens, active)
+        cos = -dr.dot(to.n, to.d)
+        deep = cos * to.dist
+        importance = dr.rcp(self.area * cos * dr.square(deep))
+        to.p -= to.d * (self.near / cos)
+        to.pdf = dr.select(self.shows(to.uv) & (deep >= self.near) & (deep <= self.far), mi.Float(1), 0)
+        return to, importance
 
     def shows(self, uv: mi.Point2f) -> mi.Bool:
         """Whether the place ``uv`` is on the film."""
@@ -67,3 +92,12 @@ class Sight:
         """That of these camera samples."""
         ray, importance, _ = camera.rays()
         return cls(Eye.of(camera), camera.random.clone(), ray, importance)
+
+
+def film_area(sensor: mi.Sensor) -> float:
+    """The area of the film's crop window at distance 1, of a perspective camera or a thin lens."""
+    film = sensor.film()
+    fov = float(np.ravel(mi.traverse(sensor)["x_fov"])[0])
+    # Pixels are squares.
+    pixel = 2 * np.tan(np.radians(fov) / 2) / film.size()[0]
+    return float(pixel**2 * np.prod(film.crop_size()))

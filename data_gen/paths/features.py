@@ -25,7 +25,7 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     ``albedo``  reflectance in [0, 1], tinted by the mirrors and the glass it is seen through; media dim it, and add
                 their own albedo by as much as they dim
     ``normal``  unit shading normal in camera space, +x right, +y up, +z toward the viewer, on the side seen
-    ``depth``   path length from the camera in world units
+    ``depth``   path length from the camera, not from its near plane, in world units
     All are zero where the path escapes, but for the albedo of media. Normal and depth are those of the surfaces behind
     media. Bump and normal maps count where they are a shape's outermost material; Mitsuba keeps those inside others
     (``twosided``, ``mask``) to itself.
@@ -41,14 +41,29 @@ def features(scene, sensor, sampler, ray: mi.RayDifferential3f) -> dict[str, mi.
     # The shading frame knows no side; the normal is meant on that of the incoming ray.
     normal = dr.mulsign(normal, si.wi.z)
     # A Mitsuba camera looks along its +z with +x to the left of the image.
-    local = dr.normalize(sensor.world_transform().inverse() @ mi.Normal3f(normal))
-    normal = mi.Color3f(-local.x, local.y, -local.z)
+    right, up, back = (sign * axis for sign, axis in zip((-1, 1, -1), axes(sensor), strict=True))
+    normal = mi.Color3f(dr.dot(normal, right), dr.dot(normal, up), dr.dot(normal, back))
     albedo = reflectance_to_rgb(dr.select(found, reflectance, 0) + scattered, ray.wavelengths)
     return {
         "albedo": albedo,
         "normal": dr.select(found, normal, 0),
-        "depth": dr.select(found, depth, 0),
+        "depth": dr.select(found, depth + before_near_plane(sensor, ray), 0),
     }
+
+
+def axes(sensor) -> list[mi.Vector3f]:
+    """x, y and z of a camera in the world, of length 1 whatever the scale of its ``to_world``."""
+    to_world = sensor.world_transform()
+    return [dr.normalize(to_world @ mi.Vector3f(*axis)) for axis in ((1, 0, 0), (0, 1, 0), (0, 0, 1))]
+
+
+def before_near_plane(sensor, ray) -> mi.Float:
+    """How far from a camera, or from the plane of an orthographic one, its ``ray`` begins: on its near plane."""
+    if not isinstance(sensor, mi.ProjectiveCamera):
+        return mi.Float(0)
+    # For an orthographic camera near_clip counts in units of to_world, which may be scaled.
+    along = dr.norm(sensor.world_transform() @ mi.Vector3f(0, 0, 1))
+    return sensor.near_clip() * along / dr.dot(ray.d, axes(sensor)[2])
 
 
 def in_media(scene, medium) -> tuple[mi.MediumPtr | None, int]:
@@ -117,7 +132,7 @@ def first_nonspecular_vertex(scene, sampler, ray, medium=None, steps=0):
         depth += si.t
         if dr.hint(steps > 0, mode="scalar"):
             # Light that escapes has come from far, but not from so far that float32 has no number for it.
-            length = dr.minimum(si.t, 1e9)
+            length = dr.minimum(dr.minimum(si.t, ray.maxt), 1e9)
             passed, albedo = through_medium(medium, ray, length, sampler, steps)
             scattered = type(scattered)(scattered + tint * albedo)
             tint *= passed

@@ -185,6 +185,11 @@ def depth(σ: mi.Spectrum, distance: mi.Float) -> mi.Spectrum:
     return mi.Spectrum(dr.select(σ > 0, σ * distance, 0))
 
 
+def end_of(ray: mi.Ray3f) -> mi.Float:
+    """How far a ray goes: that of a camera up to its far plane, others infinitely far, if nothing is in the way."""
+    return dr.select(ray.maxt < dr.largest(mi.Float), ray.maxt, dr.inf)
+
+
 def shortened(ray: mi.Ray3f, length: mi.Float) -> mi.Ray3f:
     short = mi.Ray3f(ray)
     short.maxt = dr.minimum(ray.maxt, length)

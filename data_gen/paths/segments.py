@@ -26,7 +26,7 @@ import mitsuba as mi
 
 from data_gen.paths import collisions
 from data_gen.paths.collisions import Collisions
-from data_gen.paths.media import Media, Place, beyond, depth, extinction, onward, pick, shortened
+from data_gen.paths.media import Media, Place, beyond, depth, end_of, extinction, onward, pick, shortened
 
 
 @dataclass
@@ -93,9 +93,10 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
         σ_c = pick(σ, channel)
         collision = dr.select(σ_c > 0, left / σ_c, dr.inf)
         hit = trace(shortened(ray, collision), medium, flying)
-        scatters = flying & ~hit.is_valid() & dr.isfinite(collision)
+        end = end_of(ray)
+        scatters = flying & ~hit.is_valid() & (collision < end)
         hit.t, hit.valid = dr.select(scatters, collision, hit.t), hit.valid | scatters
-        τ += depth(σ, hit.t)
+        τ += depth(σ, dr.minimum(hit.t, end))
         left = dr.maximum(left - dr.select(σ_c > 0, σ_c * hit.t, 0), 0)
         flying &= hit.is_valid() & ~scatters & passes(hit.shape)
         if flying:
@@ -143,7 +144,7 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
 
     Returns that, the surface, and the last piece of the ray.
     """
-    reach = mi.Float(dr.inf)
+    reach = end_of(ray)
     if not media.grids:
         τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
         return dr.exp(-τ), hit, ray

@@ -17,6 +17,7 @@ from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
+from data_gen.scenes.cameras import check_camera
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
 from data_gen.scenes.places import Places
@@ -67,12 +68,13 @@ class GradientIntegrator(mi.SamplingIntegrator):
         # By which lamps are chosen, where the sampler does so by place and there are many
         self.places: Places | None = None
 
-    def prepare(self, scene) -> SamplePass:
-        """What takes the samples of a pass."""
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        """What takes the samples of a pass of ``sensor``, or of the scene's first one."""
         raise NotImplementedError
 
     def render_film(self, scene, sensor, seed: int, spp: int) -> GradientFilm:
         """The film of ``spp`` samples per pixel."""
+        check_camera(sensor)
         entry = SAMPLERS[self.name]
         limits = {
             "lane_bytes": entry.lane_bytes,
@@ -80,7 +82,7 @@ class GradientIntegrator(mi.SamplingIntegrator):
             "points": self.options.get("points", "independent"),
         }
         with weighed(scene, self.options["lamps"], entry.by_place) as self.places:
-            return render_passes(self.prepare(scene), sensor, seed, spp, **limits)
+            return render_passes(self.prepare(scene, sensor), sensor, seed, spp, **limits)
 
     def render(self, scene, sensor=0, seed=0, spp=0, develop=True, evaluate=True):
         """Renders all layers: see ``mitsuba.Integrator.render()`` for the parameters."""

@@ -35,8 +35,39 @@ def surfaces_alone(name: str) -> Refusal:
     return refuses
 
 
-def media_alone(name: str, grids: bool = True) -> Refusal:
-    """Of a sampler for scenes with media; ``grids``: also ones whose density varies."""
+def surfaces_from_both_ends(name: str) -> Refusal:
+    """Of a sampler whose light paths end at the camera."""
+    alone = surfaces_alone(name)
+
+    def refuses(facts: Facts) -> str:
+        return alone(facts) or refused_by_light_paths(facts.camera)
+
+    return refuses
+
+
+def refused_by_light_paths(camera: str) -> str:
+    reached = camera in ("perspective", "thinlens")
+    return "" if reached else f"light paths cannot reach a camera '{camera}', but 'perspective' and 'thinlens'"
+
+
+def refused_by_photons(camera: str) -> str:
+    """Their radius is in pixels: meters have one for all that they see, or none side by side."""
+    meter = camera in ("radiancemeter", "irradiancemeter", "distant")
+    return f"photons are gathered over pixels, which a camera '{camera}' has not side by side" if meter else ""
+
+
+def photons_on_surfaces(name: str) -> Refusal:
+    """Of a sampler that gathers photons where there are no media."""
+    alone = surfaces_alone(name)
+
+    def refuses(facts: Facts) -> str:
+        return alone(facts) or refused_by_photons(facts.camera)
+
+    return refuses
+
+
+def photons_in_media(name: str, grids: bool = True) -> Refusal:
+    """Of a sampler that gathers photons in scenes with media; ``grids``: also ones whose density varies."""
 
     def refuses(facts: Facts) -> str:
         if facts.integrator not in VOLUMETRIC:
@@ -46,7 +77,7 @@ def media_alone(name: str, grids: bool = True) -> Refusal:
         else:
             varies = facts.grids and not grids
             reason = f"there are media whose density varies, which '{name}' does not render" if varies else ""
-        return refused_if_polarised(facts, name) or reason
+        return refused_if_polarised(facts, name) or reason or refused_by_photons(facts.camera)
 
     return refuses
 

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 
+from data_gen.scenes.cameras import camera_name, check_camera
+
 # By the names of their classes, the integrators that matter here
 _PLUGINS = {
     "PathIntegrator": "path",
@@ -23,6 +25,7 @@ class Facts:
     ``polarised``   the name of a variant that renders polarised light, or ""
     ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
     ``grids``       whether there are media whose density varies
+    ``camera``      the plugin name of its first camera, or the name of its class
     """
 
     integrator: str
@@ -30,14 +33,17 @@ class Facts:
     polarised: str = ""
     mirrors: bool = False
     grids: bool = False
+    camera: str = "perspective"
 
 
 def scene_facts(scene: mi.Scene) -> Facts:
-    """The facts about a scene that is loaded."""
+    """The facts about a scene that is loaded. Raises NgptError for a camera that no sampler renders."""
+    camera = scene.sensors()[0]
+    check_camera(camera)
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
-    return Facts(integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids)
+    return Facts(integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera))
 
 
 def integrator_name(scene: mi.Scene) -> str:

@@ -112,7 +112,8 @@ def _pilot(scene: mi.Scene, paths: int) -> tuple[np.ndarray, np.ndarray, np.ndar
     def pair() -> mi.Point2f:
         return mi.Point2f(random.next_float32(), random.next_float32())
 
-    ray, _ = sensor.sample_ray(sensor.shutter_open(), random.next_float32(), pair(), pair())
+    # Meters on shapes have no other way to sample a ray.
+    ray, _ = sensor.sample_ray_differential(sensor.shutter_open(), random.next_float32(), pair(), pair())
     ray, active, found = mi.Ray3f(ray), dr.full(mi.Bool, True, paths), []
     emitters = scene.emitters_dr()
     for vertex in range(_VERTICES):

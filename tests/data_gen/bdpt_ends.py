@@ -47,13 +47,14 @@ class Ends:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.eye import Eye
         from data_gen.paths.light_ends import LightEnds
         from data_gen.samplers.bdpt import mis
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, RADIANCE, cosine
 
         self.mi, self.dr, self.scene, self.η, self.connectable = mi, dr, scene, η, connectable
         camera = CameraSamples(scene.sensors()[0], 1, spp)
-        self.sensor, self.lens = camera.sensor, camera.lens
+        self.sensor, self.lens, self.eye = camera.sensor, camera.lens, Eye.of(camera)
         ray, _, _ = camera.rays()
         self.random, self.lights = camera.random.clone(), LightEnds(scene)
         self.start = start = self.lights.sample(scene, self.random, ray.time, ray.wavelengths)
@@ -197,6 +198,6 @@ def check_weights(ends):
     for s in range(1, 4):
         y, _, y_bsdf, _ = ends.from_light[s - 1]
         C, others, _ = to_camera(
-            ends.sensor, ends.lens, y, y_bsdf, scatters_smoothly(y_bsdf), lambda si, toward, active: mi.Bool(False)
+            ends.eye, ends.lens, y, y_bsdf, scatters_smoothly(y_bsdf), lambda si, toward, active: mi.Bool(False)
         )
         compare(others, ends.densities(0, s), s + 1, dr.max(C) > 0, ends.from_light[:s])

@@ -136,7 +136,7 @@ def test_nothing_kept_is_a_bool(renderer):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"sensor": {"type": "orthographic"}}, "light paths cannot reach a camera of type OrthographicCamera"),
+        ({"sensor": {"type": "orthographic"}}, "light paths cannot reach a camera 'orthographic'"),
         ({"lamp": {"type": "projector", "irradiance": 1.0}}, r"from emitter 'lamp' \(Projector\); use --sampler gpt"),
     ],
 )

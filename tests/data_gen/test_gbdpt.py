@@ -337,6 +337,7 @@ def test_planted_errors_are_found(paths, t):
 
 def splatted(paths, s):
     """The light path of ``s`` vertices beside its light's own, ended at the camera."""
+    from data_gen.paths.eye import Eye
     from data_gen.samplers.bdpt.strategies import to_camera
     from data_gen.samplers.gbdpt.light_shift import Splatted
 
@@ -347,7 +348,7 @@ def splatted(paths, s):
         good &= smooth
     good &= paths.plan.materials.connectable(y.si.bsdf())
     nothing_between = lambda si, to, active: paths.scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
-    C, others, uv = to_camera(paths.sensor, paths.lens, y, y.si.bsdf(), good, nothing_between)
+    C, others, uv = to_camera(Eye.of(paths.camera), paths.lens, y, y.si.bsdf(), good, nothing_between)
     before_it = {"first": mi.Bool(s == 1), "start": paths.first, "before": before, "p": p, "survival": mi.Float(1)}
     return Splatted(y, d, uv, paths.lens, C, others, **before_it, events=mi.UInt32(0), allowed=mi.Bool(good))
 
@@ -596,7 +597,7 @@ def test_what_the_camera_has_seen_is_found_again(renderer, name):
     again = light_again(plan, some, depths)
     end, link, left, there = again.end, again.link, again.left, again.there
     seen = lambda *_: mi.Bool(False)  # noqa: E731
-    C, others, uv = to_camera(camera.sensor, again.lens, end.y, end.y.si.bsdf(), there, seen)
+    C, others, uv = to_camera(some.eye, again.lens, end.y, end.y.si.bsdf(), there, seen)
     marker = Marker(second, some.ray, some.importance)
     marker.sees(mi.UInt64(0), Seen(end.y, C, others, some.eye.pixel_at(uv), None))
     smooth = link.depth + 1 == end.y.depth

@@ -48,6 +48,7 @@ class Caustics:
         import drjit as dr
 
         from data_gen.paths.camera import CameraSamples
+        from data_gen.paths.eye import Eye
         from data_gen.samplers.bdpt import mis
         from data_gen.samplers.bdpt.strategies import to_camera
         from data_gen.samplers.bdpt.vertex import IMPORTANCE, Vertex, context, cosine, light_leaves, scatters_smoothly
@@ -84,7 +85,7 @@ class Caustics:
             dr.eval(found, kept, si, d, β, end, link, there)
         y, d, link, before, good = found
         nothing_between = lambda si, to, active: scene.ray_test(si.spawn_ray_to(to.p), active)  # noqa: E731
-        C, others, uv = to_camera(camera.sensor, camera.lens, y, y.si.bsdf(), good, nothing_between)
+        C, others, uv = to_camera(Eye.of(camera), camera.lens, y, y.si.bsdf(), good, nothing_between)
         before_it = {"first": link.depth == 0, "start": start, "before": before, "p": link.p}
         before_it |= {"survival": link.survival, "events": link.events}
         self.path = Splatted(y, d, uv, camera.lens, C, others, **before_it, allowed=good)
@@ -189,7 +190,7 @@ def moved_path(paths, uv, good):
         dr.eval(si, d, β, end)
     y = Vertex(si, β, end, path.y.depth)
     C, others, uv_back = to_camera(
-        camera.sensor,
+        Eye.of(camera),
         path.lens,
         y,
         si.bsdf(),

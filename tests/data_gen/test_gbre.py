@@ -144,7 +144,7 @@ def assert_copies_are_light_paths(mi, name, receivers):
 
     scene = load(mi, getattr(media_scenes, name), (8, 8))
     lights, n = LightEnds(scene), 1 << 14
-    ways = Fog(scene, lights, "gbre")
+    ways = Fog(scene, scene.sensors()[0], lights, "gbre")
     random = sample_streams(0, dr.arange(mi.UInt32, n), mi.UInt32(0))
     world = World(scene, lights, Materials(scene, 0.05, media.index_matched, media=True), ways)
     starts, maps = trace(world, random, 6, 4)

@@ -184,7 +184,7 @@ def test_kernels_of_vcm_are_recorded_once(renderer):
     [
         (
             {"sensor": {"type": "orthographic"}},
-            "'vcm' cannot .* light paths cannot reach a camera of type Orthographic",
+            "'vcm' cannot .* light paths cannot reach a camera .orthographic",
         ),
         ({"lamp": {"type": "projector", "irradiance": 1.0}}, r"'vcm' cannot .* from emitter 'lamp' \(Projector\)"),
     ],

@@ -64,7 +64,7 @@ def test_the_medium_around_a_lamp_is_found(renderer):
 
     mi = renderer
     scene = load(mi, media_scenes.nested, (8, 8))
-    ways = Fog(scene, LightEnds(scene), "vpm")
+    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
     # Outside of all, in the cloud, in its core, and behind the wall at the back
     points = np.array([[0.9, 0.9, 0.9], [0.5, -0.5, 0.5], [-0.2, 0.2, 0.1], [0.2, 0.1, -3.0]])
     found = np.array(dr.reinterpret_array(mi.UInt32, ways.around(scene, mi.Point3f(points.T))))

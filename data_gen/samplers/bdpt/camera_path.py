@@ -51,8 +51,8 @@ def camera_path(plan: Plan, sight: Sight, light_path: LightPath | None, merging:
     depth = mi.UInt32(1)  # edges of the path up to si
     sky = Sky.from_camera(limits.hide_emitters)
     active = si.is_valid() & (depth < limits.max_depth)
-    _, density = sight.eye.sensor.sample_direction(si, sight.eye.lens, active)
-    end = mis.begin_camera(density[0], cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    _, density = sight.eye.toward(si, sight.eye.lens, active)
+    end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
     while dr.hint(active, label="camera path"):
         z = Vertex(si, β, end, depth)
         bsdf = si.bsdf()

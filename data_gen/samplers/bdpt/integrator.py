@@ -38,9 +38,9 @@ from data_gen.samplers.bdpt.camera_path import camera_path
 from data_gen.samplers.bdpt.light_path import Seen, light_path
 from data_gen.samplers.bdpt.plan import Plan
 from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.shared import refused_by_light_paths
+from data_gen.scenes.cameras import camera_name
 from ngpt.errors import NgptError
-
-_CAMERAS = ("PerspectiveCamera", "ThinLensCamera")
 
 
 @dataclass
@@ -93,8 +93,8 @@ class BDPT(GradientIntegrator):
             **more,
         )
 
-    def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        refuse(sensor or scene.sensors()[0], self.name)
         plan = self.plan(World(scene, LightEnds(scene, self.name)))
         return lambda camera, film: self.sample_pass(plan, camera, film)
 
@@ -113,7 +113,7 @@ class BDPT(GradientIntegrator):
         film.put_all(values)
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
-        """Whether something is between ``si`` and the camera; lamps are not, if they are hidden."""
+        """Whether something is between ``si`` and the camera's near plane; lamps are not, if they are hidden."""
         if not self.hide_emitters:
             return scene.ray_test(si.spawn_ray_to(camera.p), active)
         on_lamp = si.emitter(scene) != None  # noqa: E711 - a comparison of arrays of pointers
@@ -126,19 +126,15 @@ class BDPT(GradientIntegrator):
         return on_lamp | blocked
 
 
-def refuse(scene, sampler: str) -> None:
+def refuse(sensor: mi.Sensor, sampler: str) -> None:
     """Raises NgptError, in the name of the ``sampler``, for a variant or a camera that light paths cannot reach."""
     if mi.is_polarized:
         raise NgptError(
             f"sampler '{sampler}' does not follow polarised light (variant '{mi.variant()}'); "
             f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
         )
-    camera = scene.sensors()[0]
-    if camera.class_name() not in _CAMERAS:
-        raise NgptError(
-            f"sampler '{sampler}' cannot render this scene: light paths cannot reach a camera of type "
-            f"{camera.class_name()}, but perspective and thin lens; use --sampler gpt, or primal"
-        )
+    if reason := refused_by_light_paths(camera_name(sensor)):
+        raise NgptError(f"sampler '{sampler}' cannot render this scene: {reason}; use --sampler gpt, or primal")
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

@@ -123,7 +123,7 @@ def light_path(plan: Plan, sight: Sight, visitor: Visitor) -> tuple[LightPath, A
 
         # --------------------- To the camera ---------------------
         on_lens = eye.place_on_lens(random)
-        C, others, uv = to_camera(eye.sensor, on_lens, y, bsdf, smooth, partial(plan.hidden, plan.scene))
+        C, others, uv = to_camera(eye, on_lens, y, bsdf, smooth, partial(plan.hidden, plan.scene))
         state = visitor.sees(state, Seen(y, C, others, eye.pixel_at(uv), here))
 
         # ---------------------- Next vertex ----------------------

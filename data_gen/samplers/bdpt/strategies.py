@@ -13,6 +13,7 @@ from __future__ import annotations
 import drjit as dr
 import mitsuba as mi
 
+from data_gen.paths.eye import Eye
 from data_gen.paths.light_ends import LightEnds
 from data_gen.samplers.bdpt import mis
 from data_gen.samplers.bdpt.mis import Edge, Side
@@ -59,12 +60,14 @@ def connection(scene, z: Vertex, z_bsdf, y: Vertex, active, seen: mi.Bool | bool
     return C, Edge(Side(cosine(z.si, d), p_z, q_z), Side(cosine(y.si, d), p_y, q_y), distance2)
 
 
-def to_camera(sensor, lens: mi.Point2f, y: Vertex, bsdf, active, occluded) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
+def to_camera(
+    eye: Eye, lens: mi.Point2f, y: Vertex, bsdf, active, occluded
+) -> tuple[mi.Spectrum, mi.Float, mi.Point2f]:
     """t = 1; and the place on the film, in pixels. ``occluded`` is asked for (si, toward the camera, active)."""
-    camera, importance = sensor.sample_direction(y.si, lens, active)
-    active = active & (camera.pdf > 0) & (dr.max(importance) > 0)
+    camera, importance = eye.toward(y.si, lens, active)
+    active = active & (camera.pdf > 0)
     f, _, q = evaluate(IMPORTANCE, y.si, bsdf, y.si.to_local(camera.d), active)
     C = y.β * f * importance
     seen = active & (dr.max(C) > 0)
     C = dr.select(seen & ~occluded(y.si, camera, seen), C, 0)
-    return C, mis.others_to_camera(y.end, importance[0], cosine(y.si, camera.d), q), camera.uv
+    return C, mis.others_to_camera(y.end, importance, cosine(y.si, camera.d), q), camera.uv

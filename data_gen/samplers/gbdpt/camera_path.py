@@ -53,8 +53,8 @@ def shifted_camera_path(
     depth = mi.UInt32(1)  # edges of the path up to si
     past = Past(mi.Float(1), Sky.from_camera(limits.hide_emitters))
     active = si.is_valid() & (depth < limits.max_depth) & matters(course, chain)
-    _, density = sight.eye.sensor.sample_direction(si, sight.eye.lens, active)
-    end = mis.begin_camera(density[0], cosine(si, ray.d))  # what the path knows of the other strategies, at si
+    _, density = sight.eye.toward(si, sight.eye.lens, active)
+    end = mis.begin_camera(density, cosine(si, ray.d))  # what the path knows of the other strategies, at si
     while dr.hint(active, label="camera path"):
         # ------- The base path: to a light, and to the next vertex -------
         z = Vertex(si, β, end, depth)

@@ -67,8 +67,8 @@ class GBDPT(BDPT):
     name = "gbdpt"
     plan_class = Plan
 
-    def prepare(self, scene) -> SamplePass:
-        refuse(scene, self.name)
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        refuse(sensor or scene.sensors()[0], self.name)
         materials = Materials(scene, self.options["roughness_threshold"])
         plan = self.plan(World(scene, LightEnds(scene, self.name), materials), pair=difference)
         return lambda camera, film: self.gradient_pass(plan, camera, film)

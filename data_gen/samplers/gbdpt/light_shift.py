@@ -64,7 +64,7 @@ def splat_differences(
     bsdf = y.si.bsdf()
     joined = again.there & scatters_smoothly(bsdf)
     # It has been seen: nothing is in between.
-    C, others, uv = to_camera(eye.sensor, again.lens, y, bsdf, joined, lambda *_: mi.Bool(False))
+    C, others, uv = to_camera(eye, again.lens, y, bsdf, joined, lambda *_: mi.Bool(False))
     lit = dr.max(C) > 0
 
     # --------------------- Its four shifts -----------------------
@@ -123,15 +123,15 @@ def differences(
 def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: bool = False) -> tuple:
     """f J / p, r and ``others`` of a path that the camera sees at ``uv`` on the film; f is 0 if there is none."""
     # --------------------- The last vertex -----------------------
-    scene, sensor, y = plan.scene, eye.sensor, path.y
+    scene, y = plan.scene, path.y
     ray = eye.ray(uv, path.lens)
     x = plan.first_hit(scene, ray, active).compute_surface_interaction(ray, active=active)
     bsdf = x.bsdf()
     active = active & x.is_valid() & plan.materials.connectable(bsdf)
-    toward, importance = sensor.sample_direction(x, path.lens, active)
-    toward0, importance0 = sensor.sample_direction(y.si, path.lens, active)
+    toward, importance = eye.toward(x, path.lens, active)
+    toward0, importance0 = eye.toward(y.si, path.lens, active)
     # Per area, the film's density at either vertex is importance times cosine: J is their ratio.
-    J = importance0[0] * cosine(y.si, toward0.d) / (importance[0] * cosine(x, toward.d))
+    J = importance0 * cosine(y.si, toward0.d) / (importance * cosine(x, toward.d))
 
     # ---------------- The edge to the one before -----------------
     edge = (mi.Vector3f(0), mi.Spectrum(0), mi.Float(0), mi.Float(0), mi.Float(0), mi.Ray3f(ray))
@@ -172,7 +172,7 @@ def shifted(plan: Plan, eye: Eye, path: Splatted, uv: mi.Point2f, active, bent: 
     # Nothing is in the way of what has been followed.
     C = dr.select(seen if bent else seen & ~scene.ray_test(shadow, seen), C, 0)
     end = plan.known(Partial(vcm, vc), bsdf)
-    return C, r * J, mis.others_to_camera(end, importance[0], cosine(x, toward.d), q)
+    return C, r * J, mis.others_to_camera(end, importance, cosine(x, toward.d), q)
 
 
 def through_glass(plan: Plan, path: Splatted, x, active) -> tuple:

@@ -45,8 +45,8 @@ def start(eye: Eye, x, shifted: tuple, hit) -> Offset:
     ray, importance, inside = shifted
     y = hit.compute_surface_interaction(ray)
     lives = inside & hit.is_valid() & x.is_valid()
-    _, density = eye.sensor.sample_direction(y, eye.lens, lives)
-    end = mis.begin_camera(density[0], cosine(y, ray.d))
+    _, density = eye.toward(y, eye.lens, lives)
+    end = mis.begin_camera(density, cosine(y, ray.d))
     n = dr.width(hit.t)
     return Offset(
         ray=mi.Ray3f(ray),

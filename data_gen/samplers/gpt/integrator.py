@@ -99,7 +99,7 @@ class GPT(GradientIntegrator):
         path = mi.load_dict({"type": "volpath" if self.volumes else "path", **self.limits.parameters()})
         return path.sample(scene, sampler, ray, medium, active)
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         plan = self.plan(scene)
         return lambda camera, film: self.sample_pass(scene, plan, camera, film)
 

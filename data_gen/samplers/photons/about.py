@@ -3,7 +3,7 @@
 from typing import Any
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import GATHERING, first_radius, media_alone, notes_on_photons, surfaces_alone
+from data_gen.samplers.shared import GATHERING, first_radius, notes_on_photons, photons_in_media, photons_on_surfaces
 
 _GATHERED: dict[str, Option] = {
     "radius": first_radius(3.0),
@@ -24,7 +24,7 @@ _by_photons(
     "ppm",
     "photons gathered within a shrinking radius, without gradients (caustics seen in mirrors and through glass)",
     standing="use",
-    refuses=surfaces_alone("ppm"),
+    refuses=photons_on_surfaces("ppm"),
     options=_GATHERED,
     gradients=False,
     tried=True,
@@ -34,7 +34,7 @@ _by_photons(
 _by_photons(
     "gpm",
     "gradients of photons gathered within a shrinking radius (caustics seen in mirrors and through glass)",
-    refuses=surfaces_alone("gpm"),
+    refuses=photons_on_surfaces("gpm"),
     options=_GATHERED,
     diagnoses=True,
     finds=("caustics",),
@@ -43,7 +43,7 @@ _by_photons(
     "vpm",
     "photons in media and on surfaces, without gradients (caustics in fog, beams of lamps in haze)",
     standing="study",
-    refuses=media_alone("vpm"),
+    refuses=photons_in_media("vpm"),
     options=_GATHERED,
     gradients=False,
     finds=("grids",),
@@ -52,7 +52,7 @@ _by_photons(
     "gvpm",
     "gradients of photons in media and on surfaces, gathered near to points (caustics in fog, beams of lamps)",
     standing="study",
-    refuses=media_alone("gvpm"),
+    refuses=photons_in_media("gvpm"),
     options=_GATHERED,
     diagnoses=True,
     finds=("grids",),
@@ -60,7 +60,7 @@ _by_photons(
 _by_photons(
     "bre",
     "photons in media gathered along whole rays, without gradients (caustics in fog, beams of lamps in haze)",
-    refuses=media_alone("bre"),
+    refuses=photons_in_media("bre"),
     options=_GATHERED,
     gradients=False,
     finds=("caustics", "grids"),
@@ -69,7 +69,7 @@ _by_photons(
     "gbre",
     "gradients of photons in media gathered along whole rays (caustics in fog, beams of lamps in haze)",
     standing="study",
-    refuses=media_alone("gbre", grids=False),
+    refuses=photons_in_media("gbre", grids=False),
     options=_GATHERED,
     diagnoses=True,
     finds=("caustics",),
@@ -78,7 +78,7 @@ _by_photons(
     "beams",
     "photon beams: light in media gathered from whole light paths, without gradients (thin fog, beams of lamps)",
     standing="study",
-    refuses=media_alone("beams"),
+    refuses=photons_in_media("beams"),
     options=_GATHERED,
     gradients=False,
     finds=("grids",),
@@ -87,7 +87,7 @@ _by_photons(
     "gbeams",
     "gradients of photon beams (thin fog, beams of lamps)",
     standing="study",
-    refuses=media_alone("gbeams", grids=False),
+    refuses=photons_in_media("gbeams", grids=False),
     options=_GATHERED,
     diagnoses=True,
 )
@@ -95,7 +95,7 @@ _by_photons(
     "planes",
     "photon planes: light scattered in media again and again without blur, without gradients (thin fog)",
     standing="study",
-    refuses=media_alone("planes", grids=False),
+    refuses=photons_in_media("planes", grids=False),
     options=_GATHERED | _PLANES,
     gradients=False,
 )
@@ -103,7 +103,7 @@ _by_photons(
     "gplanes",
     "gradients of photon planes (thin fog)",
     standing="study",
-    refuses=media_alone("gplanes", grids=False),
+    refuses=photons_in_media("gplanes", grids=False),
     options=_GATHERED | _PLANES,
     diagnoses=True,
 )

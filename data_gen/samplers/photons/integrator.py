@@ -22,6 +22,8 @@ from data_gen.samplers.photons.map.fog import Fog
 from data_gen.samplers.photons.map.radius import pixel_width, shrunk
 from data_gen.samplers.photons.map.trace import MAP_BYTES, VERTICES_PER_PATH, trace
 from data_gen.samplers.photons.passes import Passes, refuse_variants
+from data_gen.samplers.shared import refused_by_photons
+from data_gen.scenes.cameras import camera_name
 from data_gen.scenes.facts import media_of
 from ngpt.errors import NgptError
 
@@ -80,11 +82,14 @@ class PhotonIntegrator(GradientIntegrator):
         fits = (lane_bytes - self.camera_bytes) // self.map_bytes
         return f", or no more than -O photons={fits}" if fits > 0 else ""
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        sensor = sensor or scene.sensors()[0]
         refuse_variants(self.name)
+        if reason := refused_by_photons(camera_name(sensor)):
+            raise NgptError(f"sampler '{self.name}' cannot render this scene: {reason}; use --sampler gpt, or primal")
         lights = LightEnds(scene, self.name)
         _refuse_lamps_never_chosen(scene, self.name)
-        fog = Fog(scene, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
+        fog = Fog(scene, sensor, lights, self.name, self.grids) if self.sees_media and media_of(scene) else None
         if fog is None and self.instead_of_media:
             raise NgptError(
                 f"sampler '{self.name}' cannot render this scene: there are no media; "
@@ -95,7 +100,7 @@ class PhotonIntegrator(GradientIntegrator):
         passed = {"passed": media.index_matched, "media": True} if fog else {}
         materials = Materials(scene, self.options["roughness_threshold"], **passed)
         world = World(scene, lights, materials, fog)
-        return Passes(self, world, pixel_width(scene), self.walk and self.walk(self, world))
+        return Passes(self, world, pixel_width(scene, sensor), self.walk and self.walk(self, world))
 
     def maps(self, passes: Passes, camera: CameraSamples) -> Iterator[Traced]:
         """The photon maps of the pass: of ``photons`` light paths for each sample of the ``camera``."""

@@ -80,7 +80,7 @@ class GPTTiles(GradientIntegrator):
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         refuse(self.limits)
         return Tiles(self, scene)
 

@@ -50,7 +50,7 @@ class GPTBasic(GradientIntegrator):
         """The primal estimate alone: see the nested integrator."""
         return self.integrator.sample(scene, sampler, ray, medium, active)
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         estimate = radiance(scene, self.integrator)
         return lambda camera, film: self.sample_pass(scene, estimate, camera, film)
 

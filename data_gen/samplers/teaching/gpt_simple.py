@@ -63,7 +63,7 @@ class GPTSimple(GradientIntegrator):
         L, Le, _ = trace(scene, self.limits, sampler, ray, mi.Spectrum(1), [])
         return L + Le, mi.Bool(True), []
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         refuse(scene, self.limits)
         return lambda camera, film: self.sample_pass(scene, camera, film)
 

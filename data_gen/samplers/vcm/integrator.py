@@ -98,11 +98,12 @@ class VCM(BDPT):
         fits = 1 + (1 << (places.bit_length() - 1)) if places > 0 else 0
         return f", or no more than -O joined_depth={fits}" if fits else ""
 
-    def prepare(self, scene) -> SamplePass:
+    def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
+        sensor = sensor or scene.sensors()[0]
         refuse_variants(self.name)
-        refuse_camera(scene, self.name)
+        refuse_camera(sensor, self.name)
         world = World(scene, LightEnds(scene, self.name), Materials(scene, self.threshold))
-        return Passes(self, world, pixel_width(scene))
+        return Passes(self, world, pixel_width(scene, sensor))
 
     def sample_pass(self, passes: Passes, camera: CameraSamples, film: GradientFilm) -> None:
         """One light path and one camera path for each camera sample, of which a pixel has one."""

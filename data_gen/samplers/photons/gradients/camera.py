@@ -135,7 +135,7 @@ class CameraPaths:
 
     def first(self, ray, importance, inside) -> Path:
         """A path before its first ray is traced."""
-        ray, n = mi.Ray3f(ray.o, ray.d, ray.time, ray.wavelengths), dr.width(ray)
+        ray, n = mi.Ray3f(ray), dr.width(ray)
         β = mi.Spectrum(importance) + dr.zeros(mi.Spectrum, n)
         # Of the width of the ray, and no constant
         alive = inside & (mi.UInt32(0) == dr.zeros(mi.UInt32, n))
@@ -180,6 +180,7 @@ def at_lanes(path: Path, lanes: mi.UInt32) -> Path:
     time = taken(old.time, lanes) if dr.width(old.time) > 1 else old.time
     wavelengths = taken(old.wavelengths, lanes) if dr.width(old.wavelengths) > 1 else old.wavelengths
     ray = mi.Ray3f(taken(old.o, lanes), taken(old.d, lanes), time, wavelengths)
+    ray.maxt = taken(old.maxt, lanes) if dr.width(old.maxt) > 1 else old.maxt
     sky = Sky(taken(path.sky.seen, lanes))
     return replace(path, ray=ray, β=taken(path.β, lanes), alive=taken(path.alive, lanes), sky=sky)
 

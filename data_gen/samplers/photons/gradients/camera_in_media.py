@@ -29,18 +29,27 @@ from data_gen.samplers.photons.passes import Start
 
 @dataclass
 class Piece(Path):
-    """A piece of a camera path through one ``medium`` of extinction ``σ``; β is that with which it begins."""
+    """A piece of a camera path through one ``medium`` of extinction ``σ``; β is that with which it begins.
+
+    Where it meets nothing, ``hit.t`` is how far its ray goes.
+    """
 
     medium: mi.MediumPtr
     σ: mi.Spectrum
 
     def length(self) -> mi.Float:
-        return dr.select(self.hit.is_valid(), self.hit.t, dr.inf)
+        return self.hit.t
 
     def end(self, alive: mi.Bool) -> Path:
         """The path where the piece ends."""
         β = self.β * dr.exp(-media.depth(self.σ, self.length()))
         return Path(self.ray, self.hit, β, alive, self.sky)
+
+
+def ended(hit: mi.PreliminaryIntersection3f, ray: mi.Ray3f) -> mi.PreliminaryIntersection3f:
+    """The ``hit`` of a ``ray``, or its end."""
+    hit.t = dr.select(hit.is_valid(), hit.t, media.end_of(ray))
+    return hit
 
 
 class PathsByPieces(CameraPaths):
@@ -53,7 +62,8 @@ class PathsByPieces(CameraPaths):
         pieces, fog = [], self.world.fog
         for path in (self.first(*ray) for ray in rays):
             medium = dr.gather(mi.MediumPtr, fog.within, dr.zeros(mi.UInt32, dr.width(path.ray)))
-            path.hit = self.integrator.first_surface(self.world.scene, fog.media, path.ray, medium, mi.Bool(True))
+            hit = self.integrator.first_surface(self.world.scene, fog.media, path.ray, medium, mi.Bool(True))
+            path.hit = ended(hit, path.ray)
             pieces.append(Piece(**vars(path), medium=medium, σ=media.extinction(medium, path.ray)))
         return replace(start, paths=pieces)
 
@@ -74,7 +84,9 @@ class PathsByPieces(CameraPaths):
             medium = dr.select(changes, si.target_medium(d), piece.medium)
             β = dr.select(straight, at_surface.β, path.β)
             alive = (straight | path.alive) & (dr.max(β) > 0)
-            after.append(Piece(si.spawn_ray(d), piece.hit, β, alive, path.sky, medium, piece.σ))
+            ray = si.spawn_ray(d)
+            ray.maxt = dr.select(straight, piece.ray.maxt - piece.hit.t, ray.maxt)
+            after.append(Piece(ray, piece.hit, β, alive, path.sky, medium, piece.σ))
             if k == 0:
                 η = dr.select(path.alive, η * eta, η)
         survive(after, u_survival, ~passes & (depth >= self.limits.rr_depth), η)
@@ -90,7 +102,7 @@ class PathsByPieces(CameraPaths):
             else:
                 seen = self.integrator.first_surface(scene, self.world.fog.media, ray, medium, alive & (depth == 1))
                 hit = dr.select(depth == 1, seen, scene.ray_intersect_preliminary(ray, active=alive & (depth > 1)))
-            pieces.append(replace(piece, hit=hit, medium=medium, σ=media.extinction(medium, ray)))
+            pieces.append(replace(piece, hit=ended(hit, ray), medium=medium, σ=media.extinction(medium, ray)))
         return self.of_lanes(level, pieces, random.at(lanes), lanes)
 
     def direct(self, level: Level, start: Start, frozen: Callable) -> mi.Spectrum:

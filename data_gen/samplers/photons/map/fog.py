@@ -13,22 +13,23 @@ from ngpt.errors import NgptError
 
 
 class Fog:
-    """The media of a scene, one of which may be around its camera: ``within``.
+    """The media of a scene, one of which may be around the camera ``sensor``: ``within``.
 
     Raises NgptError, in the name of the ``sampler``, for media whose density varies unless it renders ``grids``, and
     where light from infinitely far away comes through a medium without end.
     """
 
-    def __init__(self, scene: mi.Scene, lights: LightEnds, sampler: str, grids: bool = False):
+    def __init__(self, scene: mi.Scene, sensor: mi.Sensor, lights: LightEnds, sampler: str, grids: bool = False):
         self.media = Media(scene)
         if self.media.grids and not grids:
             raise NgptError(
                 f"sampler '{sampler}' cannot render this scene: there are media whose density varies; "
                 "use --sampler gpt, or gvpm, vpm, bre or beams for photons"
             )
-        sensor = scene.sensors()[0]
         self.within = mi.MediumPtr(sensor.get_medium())
-        self.eye = mi.Point3f(sensor.world_transform().translation())
+        # Where a ray begins: of a meter on a shape, or one infinitely far away, to_world says nothing of that.
+        middle = mi.Point2f(0.5)
+        self.eye = sensor.sample_ray_differential(sensor.shutter_open(), 0.5, middle, middle)[0].o
         corner = mi.Point3f(scene.bbox().max) + float(np.linalg.norm(np.array(scene.bbox().extents())))
         outside = dr.reinterpret_array(mi.UInt32, self.around(scene, corner))[0]
         if outside and lights.emitters is not None and dr.any(lights.far(dr.arange(mi.UInt32, len(scene.emitters())))):

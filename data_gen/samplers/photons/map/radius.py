@@ -27,17 +27,19 @@ def shrunk(i: int, dimension: int = 2) -> float:
     return math.exp(log_ratio / dimension)
 
 
-def pixel_width(scene: mi.Scene) -> float:
-    """How wide a pixel is where the camera sees something, in world units: the median over the image.
+def pixel_width(scene: mi.Scene, sensor: mi.Sensor) -> float:
+    """How wide a pixel of ``sensor`` is where that sees something, in world units: the median over the image.
 
-    Where it sees nothing, a thousandth of the scene's diagonal.
+    Where it sees nothing, or knows of no rays side by side, a thousandth of the scene's diagonal.
     """
-    camera = CameraSamples(scene.sensors()[0], 0, 1)
+    camera = CameraSamples(sensor, 0, 1)
     ray, _, _ = camera.rays()
     depth = features(scene, camera.sensor, camera.random.clone(), ray)["depth"]
-    aside = dr.norm((ray.o_x - ray.o) + (ray.d_x - ray.d) * depth)
+    # Of a perspective camera Mitsuba 3.9 begins the neighbour's ray where this one begins, on the near plane.
+    fans = dr.squared_norm(ray.d_x - ray.d) > 0
+    aside = dr.select(fans, dr.norm(ray.d_x - ray.d) * depth, dr.norm(ray.o_x - ray.o))
     dr.eval(depth, aside)
-    seen = np.array(depth) > 0
+    seen = (np.array(depth) > 0) & ray.has_differentials
     box = scene.bbox()
     wide = np.median(np.array(aside)[seen]) if seen.any() else 1e-3 * np.linalg.norm(np.array(box.extents()))
     return float(wide)

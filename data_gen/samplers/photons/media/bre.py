@@ -184,7 +184,7 @@ def _by_pieces(integrator: PhotonIntegrator, world: World, start: Start, near, e
             hit = scene.ray_intersect_preliminary(ray, active=active)
         si = hit.compute_surface_interaction(ray, active=active)
         σ, found = media.extinction(medium, ray), active & hit.is_valid()
-        length = dr.select(found, hit.t, dr.inf)
+        length = dr.select(found, hit.t, media.end_of(ray))
         if dr.hint(grids, mode="scalar"):
             ahead, u_real = -dr.log(1 - random.next_1d()), random.next_1d()
             stop = collisions.next_stop(ray, length, medium, channel, ahead, active)

@@ -94,8 +94,7 @@ def fields_of(piece: Piece, index: mi.UInt32) -> tuple:
     o, d = dr.gather(mi.Point3f, piece.ray.o, index), dr.gather(mi.Vector3f, piece.ray.d, index)
     hit = dr.gather(mi.PreliminaryIntersection3f, piece.hit, index)
     some = (piece.medium, piece.σ, piece.β, piece.alive)
-    length = dr.select(hit.is_valid(), hit.t, dr.inf)
-    return o, d, length, *(dr.gather(type(value), value, index) for value in some)
+    return o, d, hit.t, *(dr.gather(type(value), value, index) for value in some)
 
 
 def inside_of(base: Piece) -> mi.Bool:

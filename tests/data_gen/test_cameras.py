@@ -1,0 +1,279 @@
+"""Cameras: every sampler before every one of Mitsuba's, right or refused; and what samplers know of a camera."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from camera_cases import (
+    CAMERAS,
+    camera,
+    card,
+    compare,
+    film,
+    orthographic,
+    perspective,
+    references_of,
+    scene_with,
+    stacks_of,
+)
+
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+from ngpt.errors import NgptError
+
+FROM_BOTH_ENDS = ("bdpt", "gbdpt", "vcm", "gvcm")
+# Where light paths end at the camera, and elsewhere
+QUICK = [("bdpt", "principal point"), ("gbdpt", "near plane"), ("gpt", "principal point, crop")]
+SLOW = [(name, view) for view in CAMERAS for name in (*SAMPLERS, *FRAME_SAMPLERS) if (name, view) not in QUICK]
+# Of a layer: a cell of the matrix fails by chance once in 3000 times.
+LEVEL = 1e-4
+
+
+def in_media(sampler):
+    """Whether it renders scenes with media alone."""
+    from data_gen.scenes.facts import Facts
+
+    return bool({**SAMPLERS, **FRAME_SAMPLERS}[sampler].refuses(Facts("path", ())))
+
+
+@cache
+def references(mi, view, media):
+    meter = view in ("radiancemeter", "distant")
+    return references_of(mi, view, media, 16, 1024 if meter else 256)
+
+
+def check(mi, sampler, view, batches, spp, media=False):
+    media = media or in_media(sampler)
+    scene = scene_with(mi, view, media)
+    kind = CAMERAS[view]()["sensor"]["type"]
+    kind = view if view == "irradiancemeter" else kind
+    by_photons = sampler in SAMPLERS and "photons" in SAMPLERS[sampler].options
+    if (
+        view in ("batch", "radiancemeter, scaled")
+        or (sampler in FROM_BOTH_ENDS and kind not in ("perspective", "thinlens"))
+        or (by_photons and kind not in ("perspective", "thinlens", "orthographic"))
+    ):
+        with pytest.raises(NgptError, match=rf"camera '{kind}'.*; (use --sampler gpt|remove <scale>|take its cameras)"):
+            stacks_of(scene, sampler, 1, 1)
+        return
+    stacks = stacks_of(scene, sampler, batches, spp)
+    expected = references(mi, view, media)
+    assert expected.mean() > 0.01
+    for layer, result in compare(stacks, expected, LEVEL, slack=0.01 if by_photons else 0.0):
+        assert result.passed, f"{layer}: {result}"
+
+
+@pytest.mark.parametrize(("sampler", "view"), QUICK)
+def test_right(renderer, sampler, view):
+    check(renderer, sampler, view, batches=8, spp=16)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("sampler", "view"), SLOW)
+def test_right_or_refused(renderer, sampler, view):
+    check(renderer, sampler, view, batches=10, spp=8 if getattr(SAMPLERS.get(sampler), "batch", 0) == 1 else 16)
+
+
+@pytest.mark.parametrize("sampler", ["gpt", pytest.param("gpt-basic", marks=pytest.mark.slow)])
+def test_fog_ends_at_the_far_plane(renderer, sampler):
+    """Nothing scatters beyond it, and what does not scatter before it is gone."""
+    check(renderer, sampler, "far plane", batches=10, spp=32, media=True)
+
+
+def test_paths_and_their_copies_to_photons_end_at_the_far_plane(renderer):
+    """The cells of the matrix that show it are slow."""
+    from types import SimpleNamespace
+
+    from data_gen.paths.walk import Limits
+    from data_gen.samplers.photons.gradients.camera import CameraPaths
+
+    _, ray, _ = eye_of(renderer, camera(fov=40, near_clip=1.6, far_clip=4.0))
+    walk = CameraPaths(SimpleNamespace(limits=Limits(4, 100)), None)
+    assert np.array_equal(np.array(walk.first(ray, 1.0, True).ray.maxt), np.array(ray.maxt))
+    assert np.array(ray.maxt).max() < 4
+
+
+def eye_of(mi, sensor, samples=64):
+    """Camera samples and their rays, and the eye, of a sensor that a dictionary describes."""
+    from data_gen.paths.camera import CameraSamples
+    from data_gen.paths.eye import Eye
+
+    samples = CameraSamples(mi.load_dict(sensor), 0, samples)
+    return samples, samples.rays()[0], Eye.of(samples)
+
+
+def at(mi, p):
+    import drjit as dr
+
+    si = dr.zeros(mi.SurfaceInteraction3f, dr.width(p))
+    si.p = p
+    return si
+
+
+@pytest.mark.parametrize("view", ["perspective", "thin lens", "mirrored", "principal point", "principal point, crop"])
+def test_the_importance_of_a_camera_is_the_density_of_its_rays(renderer, view):
+    """On all of the film: Mitsuba's own is 0 in the part that an offset of the principal point adds."""
+    mi = renderer
+    samples, ray, eye = eye_of(mi, CAMERAS[view]()["sensor"])
+    to, importance = eye.toward(at(mi, ray(1.7)), samples.lens)
+    assert np.allclose(np.array(to.uv), np.array(samples.position), atol=1e-4) and np.all(np.array(to.pdf) == 1)
+    assert np.allclose(np.array(to.d), -np.array(ray.d), atol=1e-5)
+    # Points on two neighbouring rays lie a pixel apart across the ray: that many square metres are a pixel.
+    width, height = samples.size
+    beside = [np.array(d, np.float64) for d in (ray.d, ray.d_x, ray.d_y)]
+    n = np.array(eye.sensor.world_transform() @ mi.Vector3f(0, 0, 1), np.float64).reshape(3, 1)
+    plane = [d / (d * n).sum(axis=0) for d in beside]
+    pixel = np.linalg.norm(np.cross(plane[1] - plane[0], plane[2] - plane[0], axis=0), axis=0)
+    cos, distance = (beside[0] * n).sum(axis=0), np.array(to.dist, np.float64)
+    assert np.allclose(np.array(importance), 1 / (pixel * width * height * cos**3 * distance**2), rtol=2e-3)
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens"])
+def test_what_the_near_plane_cuts_away_hides_nothing(renderer, kind):
+    mi = renderer
+    lens = {"aperture_radius": 0.1} if kind == "thinlens" else {}
+    sensor = camera(kind, fov=40, near_clip=1.6, far_clip=4.0, **lens)
+    samples, ray, eye = eye_of(mi, sensor)
+    scene = mi.load_dict({"type": "scene", **card()})
+    si = at(mi, ray(1.0))
+    to, _ = eye.toward(si, samples.lens)
+    begins = np.array(ray.o)
+    assert np.allclose(np.array(to.p), begins, atol=1e-5)
+    assert not np.array(scene.ray_test(si.spawn_ray_to(to.p))).any()
+    lens_point = mi.Point3f(to.p + to.d * (to.dist - 1.0))
+    assert np.array(scene.ray_test(si.spawn_ray_to(lens_point))).mean() > 0.05
+    # Beyond the far plane and before the near one there is nothing to see.
+    for t, seen in ((-0.2, 0), (0.01, 1), (2.2, 1), (3.0, 0)):
+        assert np.all(np.array(eye.toward(at(mi, ray(t)), samples.lens)[0].pdf) == seen)
+
+
+def rendered(mi, sensor, **objects):
+    from data_gen.render import render_stack
+
+    wall = {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f().look_at([0, 0, -1], [0.5, 0.3, 0], [0, 1, 0]).scale(20),
+    }
+    scene = {"type": "scene", "sensor": sensor, "light": {"type": "constant"}, "wall": wall, **objects}
+    return render_stack(mi.load_dict(scene), 4, sampler="primal")
+
+
+@pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
+def test_depth_is_from_the_camera_and_not_from_its_near_plane(renderer, kind):
+    more = {"perspective": {"fov": 40}, "thinlens": {"fov": 40, "aperture_radius": 0.01}}.get(kind, {})
+    near, far = (rendered(renderer, camera(kind, near_clip=clip, **more)) for clip in (0.01, 2.0))
+    assert near["depth"].min() > 3 and np.allclose(near["depth"], far["depth"], rtol=1e-4)
+
+
+def test_depth_counts_in_world_units_where_an_orthographic_camera_is_scaled(renderer):
+    flat, deep = (rendered(renderer, orthographic([1.2, 0.9, z], near_clip=1.0)["sensor"]) for z in (1, 2))
+    assert np.allclose(flat["depth"], deep["depth"], rtol=1e-4) and flat["depth"].min() > 3
+
+
+def test_normals_do_not_depend_on_how_a_camera_is_scaled(renderer):
+    even, wide = (rendered(renderer, orthographic(scale)["sensor"]) for scale in (1.0, [1.5, 0.7, 3.0]))
+    assert np.allclose(even["normal"], even["normal"][0, 0], atol=1e-4)
+    assert np.allclose(wide["normal"], even["normal"][0, 0], atol=1e-4)
+
+
+def test_a_mirrored_camera_has_mirrored_features(renderer):
+    """As the image that it sees: x of normals to the right of that."""
+    mirror = renderer.ScalarTransform4f().scale([-1, 1, 1])
+    straight, mirrored = (rendered(renderer, perspective(turned)["sensor"]) for turned in (None, mirror))
+    assert np.allclose(mirrored["depth"], straight["depth"][:, ::-1], rtol=0.02)
+    assert np.allclose(mirrored["normal"] * [-1, 1, 1], straight["normal"], atol=1e-4)
+
+
+def test_photons_are_gathered_in_pixels_wherever_the_near_plane_is(renderer):
+    from data_gen.samplers.photons.map.radius import pixel_width
+
+    mi = renderer
+    wall = {"type": "rectangle", "to_world": mi.ScalarTransform4f().scale(20)}
+
+    def width(sensor):
+        scene = mi.load_dict({"type": "scene", "sensor": sensor, "wall": wall})
+        return pixel_width(scene, scene.sensors()[0])
+
+    expected = 2 * np.tan(np.radians(20)) / 24 * 3.6
+    for near in (0.01, 2.5):
+        assert width(camera(fov=40, near_clip=near)) == pytest.approx(expected, rel=0.05)
+
+
+@pytest.mark.parametrize("view", ["perspective", "irradiancemeter"])
+def test_lamps_are_weighed_by_what_any_camera_sees(renderer, view):
+    """Mitsuba's meters on shapes have rays with differentials alone."""
+    from data_gen.scenes.lamps import lamp_weights
+
+    dim = {"type": "sphere", "center": [0.5, 0.2, 0.5], "radius": 0.1, "emitter": {"type": "area"}}
+    weights = lamp_weights(renderer.load_dict(scene() | CAMERAS[view]() | {"zz": dim}, optimize=False))
+    assert len(weights) == 2 and 0.1 <= weights.min() < 0.4
+
+
+@pytest.mark.parametrize("kind", ["distant", "irradiancemeter"])
+def test_lamps_know_their_medium_wherever_the_camera_is(renderer, kind):
+    """It is looked for on the way to the camera: not to the middle of the world, where meters say they are."""
+    from data_gen.paths.light_ends import LightEnds
+    from data_gen.samplers.photons.map.fog import Fog
+
+    mi = renderer
+    meter = {"type": kind, "film": film(1, 1)}
+    if kind == "irradiancemeter":
+        meter = {"type": "sphere", "center": [0, 0, 5], "radius": 0.5, "meter": meter}
+    fog = {"type": "homogeneous", "albedo": 0.8, "sigma_t": 0.5}
+    ball = {"type": "sphere", "bsdf": {"type": "null"}, "interior": fog}
+    lamp = {"type": "sphere", "radius": 0.1, "center": [0, 0.5, 0], "emitter": {"type": "area"}}
+    scene = mi.load_dict({"type": "scene", "meter": meter, "ball": ball, "lamp": lamp})
+    ways = Fog(scene, scene.sensors()[0], LightEnds(scene), "vpm")
+    inside, outside = (ways.around(scene, mi.Point3f([0.0], [y], [0.0])) for y in (0.7, 1.3))
+    assert (inside != None)[0] and not (outside != None)[0]  # noqa: E711 - arrays of pointers
+
+
+@pytest.mark.parametrize("view", ["principal point", "principal point, crop", "crop", "mirrored", "near plane"])
+def test_a_still_camera_sees_nothing_move_and_knows_where_its_pixels_look(renderer, view):
+    from data_gen.frames.motion import motion_vectors, seen, snapshot
+
+    scene = scene_with(renderer, view)
+    now, what = snapshot(scene), seen(scene)
+    assert np.array_equal(motion_vectors(scene, now, snapshot(scene)), np.zeros((16, 24, 2)))
+    x, y, _, w = now.film @ what.points.T
+    rows, columns = np.mgrid[:16, :24].reshape(2, -1) + 0.5
+    assert np.allclose(x / w, columns, atol=2e-3) and np.allclose(y / w, rows, atol=2e-3)
+
+
+@pytest.mark.parametrize("view", ["batch", "radiancemeter, scaled"])
+def test_cameras_that_no_sampler_renders(renderer, view):
+    for sampler in (*SAMPLERS, *FRAME_SAMPLERS):
+        check(renderer, sampler, view, 1, 1)
+    integrator = renderer.load_dict({"type": "gpt"})
+    with pytest.raises(NgptError, match="camera '"):
+        integrator.render(scene_with(renderer, view))
+
+
+@pytest.mark.parametrize("sampler", ["gpt", "bdpt", pytest.param("ppm", marks=pytest.mark.slow)])
+def test_plugins_render_from_any_camera_of_a_scene(renderer, sampler):
+    """``sensor`` of ``mi.render`` may be another one than the first, of a kind that the sampler refuses."""
+    mi = renderer
+    one, other = perspective()["sensor"], orthographic(1.5)["sensor"]
+    integrator = mi.load_dict({"type": sampler, "max_depth": 3, "lamps": "uniform"})
+    first = mi.load_dict({**scene(), "a": one, "b": other}, optimize=False)
+    second = mi.load_dict({**scene(), "b": other, "c": one}, optimize=False)
+    assert [s.class_name() for s in second.sensors()] == ["OrthographicCamera", "PerspectiveCamera"]
+    images = [np.array(integrator.render(s, sensor=i, seed=3, spp=4)) for s, i in ((first, 0), (second, 1))]
+    assert np.array_equal(*images) and images[0][..., :3].mean() > 0.01
+    if sampler in FROM_BOTH_ENDS:
+        with pytest.raises(NgptError, match="light paths cannot reach a camera 'orthographic'"):
+            integrator.render(second, sensor=0, spp=4)
+
+
+def scene():
+    from camera_cases import corner
+
+    return corner()
+
+
+def test_info_says_which_samplers_refuse_the_camera(renderer, tmp_path):
+    from data_gen.inspect import inspect_scene
+
+    file = tmp_path / "plan.xml"
+    file.write_text('<scene version="3.0.0"><sensor type="orthographic"/><shape type="sphere"/></scene>')
+    refused = [line for line in inspect_scene(str(file))["plan"] if "light paths cannot reach" in line]
+    assert [line.split("`")[1] for line in refused] == ["--sampler gbdpt", "--sampler vcm"]
