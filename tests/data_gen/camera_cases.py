@@ -183,7 +183,7 @@ def stacks_of(scene, sampler, batches, spp):
         # Beams and planes are all tried for each camera ray: fewer do.
         options = {"photons": 1 if sampler.endswith(("beams", "planes")) else 8, "radius": 0.6}
     if np.prod(scene.sensors()[0].film().crop_size()) == 1:
-        spp *= 128
+        spp *= 8 if getattr(SAMPLERS.get(sampler), "batch", 0) else 128
     return [render_stack(scene, spp, seed, sampler, **options).layers for seed in range(batches)]
 
 
