@@ -60,6 +60,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         mirrors,
         grids="heterogeneous" in plugins["Medium"],
         camera=cameras[0] if cameras else "perspective",
+        hair="hair" in plugins["BSDF"],
     )
     sampler, reason = choose(facts)
     return {

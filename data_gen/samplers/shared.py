@@ -40,7 +40,7 @@ def surfaces_from_both_ends(name: str) -> Refusal:
     alone = surfaces_alone(name)
 
     def refuses(facts: Facts) -> str:
-        return alone(facts) or refused_by_light_paths(facts.camera)
+        return alone(facts) or refused_by_light_paths(facts.camera) or refused_by_hair(facts)
 
     return refuses
 
@@ -48,6 +48,11 @@ def surfaces_from_both_ends(name: str) -> Refusal:
 def refused_by_light_paths(camera: str) -> str:
     reached = camera in ("perspective", "thinlens")
     return "" if reached else f"light paths cannot reach a camera '{camera}', but 'perspective' and 'thinlens'"
+
+
+def refused_by_hair(facts: Facts) -> str:
+    """Mitsuba's hair scatters otherwise from the light to the eye than back, and tells nothing of its adjoint."""
+    return "light paths lose light at the material 'hair', which is not the same in both directions" * facts.hair
 
 
 def refused_by_photons(camera: str) -> str:
@@ -61,7 +66,7 @@ def photons_on_surfaces(name: str) -> Refusal:
     alone = surfaces_alone(name)
 
     def refuses(facts: Facts) -> str:
-        return alone(facts) or refused_by_photons(facts.camera)
+        return alone(facts) or refused_by_photons(facts.camera) or refused_by_hair(facts)
 
     return refuses
 
@@ -77,7 +82,8 @@ def photons_in_media(name: str, grids: bool = True) -> Refusal:
         else:
             varies = facts.grids and not grids
             reason = f"there are media whose density varies, which '{name}' does not render" if varies else ""
-        return refused_if_polarised(facts, name) or reason or refused_by_photons(facts.camera)
+        reason = refused_if_polarised(facts, name) or reason
+        return reason or refused_by_photons(facts.camera) or refused_by_hair(facts)
 
     return refuses
 

@@ -26,6 +26,7 @@ class Facts:
     ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
     ``grids``       whether there are media whose density varies
     ``camera``      the plugin name of its first camera, or the name of its class
+    ``hair``        whether there is Mitsuba's material ``hair``, which is not the same in both directions
     """
 
     integrator: str
@@ -34,6 +35,7 @@ class Facts:
     mirrors: bool = False
     grids: bool = False
     camera: str = "perspective"
+    hair: bool = False
 
 
 def scene_facts(scene: mi.Scene) -> Facts:
@@ -43,7 +45,24 @@ def scene_facts(scene: mi.Scene) -> Facts:
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
-    return Facts(integrator_name(scene), tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera))
+    hair = any(_has_hair(shape.bsdf()) for shape in scene.shapes())
+    kind = integrator_name(scene)
+    return Facts(kind, tuple(sorted(names)), polarised(), grids=grids, camera=camera_name(camera), hair=hair)
+
+
+def _has_hair(bsdf: mi.BSDF | None) -> bool:
+    """Whether a material is hair, or one within it: of a mask, a blend, a two-sided one."""
+    if bsdf is None:
+        return False
+    nested: list[mi.BSDF] = []
+
+    class Inside(mi.TraversalCallback):
+        def put(self, name, value, *_):
+            if isinstance(value, mi.BSDF):
+                nested.append(value)
+
+    bsdf.traverse(Inside())
+    return bsdf.class_name() == "Hair" or any(map(_has_hair, nested))
 
 
 def integrator_name(scene: mi.Scene) -> str:

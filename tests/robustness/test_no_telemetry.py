@@ -130,7 +130,7 @@ def test_the_runtime_is_loaded_in_one_place_and_examples_turn_it_off():
         _check_example(
             "\n".join("".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"), str(notebook)
         )
-    for host in ("hosts/node/host.mjs", "capi/network.cpp"):
+    for host in ("hosts/node/host.mjs", "capi/graph.cpp"):
         assert SWITCH in (ROOT / "export" / host).read_text(), host
 
 
