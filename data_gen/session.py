@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import sys
-import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -99,7 +98,7 @@ def render_scene(
     pilot = sharing is None and sampler == "auto"
     plan = None
     if pilot:
-        plan = _plan(scene, spp, seconds, method, memory, said, stop)
+        plan = _plan(scene, spp, seconds, method, memory, said=said, stop=stop)
         _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
@@ -240,10 +239,12 @@ def _adaptive(error: float | None, method: str) -> Adaptive:
     return Adaptive(error, method)
 
 
-def _plan(scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int, *told: Any) -> Plan:
+def _plan(
+    scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int, **told: Any
+) -> Plan:
     """By a pilot: of the sampler and the method for so many ``seconds``, or, without a ``method``, of the sampler."""
     from data_gen.choosing.plans import plan, plan_sampler
 
     if method is None or seconds is None:
-        return plan_sampler(scene, spp, seconds, memory, *told)
-    return plan(scene, seconds, method, memory, time.perf_counter, *told)
+        return plan_sampler(scene, spp, seconds, memory, **told)
+    return plan(scene, seconds, method, memory, **told)

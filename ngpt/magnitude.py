@@ -65,7 +65,8 @@ def bound(image: np.ndarray) -> float:
 def _median(values: np.ndarray) -> float:
     """Of the absolute values that are finite and not 0; 0 for none."""
     sizes = np.abs(values[np.isfinite(values) & (values != 0)])
-    return float(np.median(sizes)) if sizes.size else 0.0
+    # In double precision: the mean of two in the middle may be beyond the largest of single precision.
+    return float(np.median(sizes.astype(np.float64))) if sizes.size else 0.0
 
 
 def scaled(stack: GradientStack, power: int) -> GradientStack:

@@ -78,6 +78,7 @@ def explore(
     seconds: float = LONG,
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
+    *,
     clock: Callable[[], float] = time.perf_counter,
     said: Said = silent,
     stop: Stop = never,
@@ -89,7 +90,7 @@ def explore(
     _check_memory(scene, able[0], None, memory)
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
-        trials = try_all(scene, able, lambda _: SHARE * seconds, SHARE * seconds, clock, said, stop)
+        trials = try_all(scene, able, lambda _: SHARE * seconds, SHARE * seconds, clock=clock, said=said, stop=stop)
     if not trials or stop():
         return []
     found = measure(
@@ -115,6 +116,7 @@ def plan(
     seconds: float,
     method: str = "auto",
     memory: int = DEFAULT_MEMORY,
+    *,
     clock: Callable[[], float] = time.perf_counter,
     said: Said = silent,
     stop: Stop = never,
@@ -132,7 +134,7 @@ def plan(
     able = _able(scene, method)
     whole: list[Pipeline] = []
     if seconds >= LEAST_SECONDS and not stop():
-        whole = explore(scene, seconds, method, memory, clock, said, stop)
+        whole = explore(scene, seconds, method, memory, clock=clock, said=said, stop=stop)
     left = seconds - (clock() - start)
     if ranked := choose(whole, left):
         first = ranked[0]
@@ -147,6 +149,7 @@ def plan_sampler(
     spp: int | None,
     seconds: float | None,
     memory: int = DEFAULT_MEMORY,
+    *,
     said: Said = silent,
     stop: Stop = never,
 ) -> Plan:

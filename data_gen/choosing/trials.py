@@ -63,6 +63,7 @@ def try_all(
     samplers: Sequence[str],
     budget: Callable[[dict[str, Trial]], float] = lambda trials: math.inf,
     first: float = math.inf,
+    *,
     clock: Callable[[], float] = time.perf_counter,
     said: Callable[[str], None] = lambda line: None,
     stop: Callable[[], bool] = lambda: False,

@@ -105,7 +105,7 @@ def fly_on(passes, trace, ray, medium, channel, u, *, active):
 
 
 @dr.syntax
-def cross(passes, trace, ray, medium, reach, active, target=None):
+def cross(passes, trace, ray, medium, reach, *, active, target):
     """Straight along ``ray`` for the distance ``reach``, or up to the first surface that is no boundary.
 
     With a ``target``, where that is finite, each piece aims at it anew: see ``media.onward()``. Returns τ, the surface,
@@ -131,7 +131,7 @@ def see(media: Media, trace, ray, medium, reach, *, channel, key, active) -> tup
     Returns T, that surface, and the last piece of the ray.
     """
     if not media.grids:
-        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
+        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
         return dr.exp(-τ), hit, ray
     # Ratio tracking: at each collision of the majorant what is null goes on.
     every = {"channel": channel, "key": key, "scale": mi.Float(1), "most": mi.UInt32(0xFFFFFFFF), "target": None}
@@ -146,7 +146,7 @@ def clear_view(media: Media, trace, ray, medium, channel, active) -> tuple:
     """
     reach = end_of(ray)
     if not media.grids:
-        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active)
+        τ, hit, ray, _ = cross(media.passes, trace, ray, medium, reach, active=active, target=None)
         return dr.exp(-τ), hit, ray
     none = {"channel": channel, "key": mi.UInt32(0), "scale": mi.Float(1), "most": mi.UInt32(0), "target": None}
     τ, hit, ray, _, M, _ = collisions.cross(media.passes, trace, ray, medium, reach, **none, active=active)
@@ -178,7 +178,7 @@ def reconnect(scene, media: Media, y, place: Place, ray, *, x1, base: Segment, c
             media.passes, trace, ray, medium, reach, base.nulls, channel=channel, active=active, target=target
         )
     else:
-        τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active, target)
+        τ, hit, _, medium = cross(media.passes, trace, ray, medium, reach, active=active, target=target)
         N, N_c = 1, 1
     # In what is around x1 both paths must have come: a boundary may have holes.
     blocked = hit.is_valid() | (medium != base.place.medium)

@@ -210,7 +210,8 @@ def _fitted(line: str, indent: int) -> None:
             break_long_words=False,
             break_on_hyphens=False,
         )
-    tell(line)
+    for part in line.split("\n"):
+        tell(part)
 
 
 def _number(value: object) -> str:

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
     if target.suffix.lower() not in (".html", ".htm"):
-        raise NgptError(f"{target}: browsers know a page by its name; let it end in .html")
+        raise WrongUse(f"{target}: browsers know a page by its name; let it end in .html")
     names = labels(args.images)
     if any(os.path.isdir(path) for path in args.images):
         return run_shots(args, names, target, console)

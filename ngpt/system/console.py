@@ -101,6 +101,9 @@ def print_line(text: str, stream: TextIO) -> None:
     """A message, at once. That nobody takes it, as when the disk with the log is full, stops no work."""
     try:
         print(printable(text), file=stream, flush=True)
+    except RuntimeError:
+        # From a signal's handler, amid a line of ours: no buffer can be entered twice.
+        os.write(stream.fileno(), f"{printable(text)}\n".encode(errors="backslashreplace"))
     except OSError:
         _close(stream)
 

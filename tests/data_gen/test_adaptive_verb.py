@@ -47,7 +47,7 @@ def test_a_pilot_chooses_for_a_method(renderer, tmp_path, capsys, monkeypatch):
 
     asked = []
 
-    def plan(scene, seconds, method, memory):
+    def plan(scene, seconds, method, memory, **told):
         asked.append((seconds, method))
         return plans.Plan("primal", "oidn", True, 1.5, "for a test")
 

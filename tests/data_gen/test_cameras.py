@@ -276,4 +276,4 @@ def test_info_says_which_samplers_refuse_the_camera(renderer, tmp_path):
     file = tmp_path / "plan.xml"
     file.write_text('<scene version="3.0.0"><sensor type="orthographic"/><shape type="sphere"/></scene>')
     refused = [line for line in inspect_scene(str(file))["plan"] if "light paths cannot reach" in line]
-    assert [line.split("`")[1] for line in refused] == ["--sampler gbdpt", "--sampler vcm"]
+    assert [line.split(":")[0] for line in refused] == ["refused by gbdpt, vcm"]

@@ -24,7 +24,7 @@ def verdicts(stacks, references, pixels=1):
 @pytest.mark.parametrize("scene", SCENES[3:6])  # the first is the one of all samplers' law
 def test_unbiased(renderer, scene):
     scene = load(renderer, scene, (32, 32))
-    references = render_references(renderer, scene, spp=128)
+    references = render_references(renderer, scene, spp=256)
     assert references.mean() > 0.01  # black images agree all too well
     for pixels in DISTANCES:
         for name, result in gradient_tests(render_ours(scene, "gpt", pixels=pixels), references, pixels=pixels):

@@ -70,7 +70,8 @@ def test_one_pixel_of_1e30_leaves_nfor_the_others(room, variance):
     assert np.median(np.abs(image - usual)[far] / clean[far]) < 0.01
 
 
-@pytest.mark.parametrize("power", [-100, -60, 60, 100])
+# Far below 2^-60 a variance of 0 in single precision may be one that was too small for it.
+@pytest.mark.parametrize("power", [-60, 60, 100])
 def test_nfor_scales_with_the_image_to_the_bit(room, power):
     stack, _ = room
     silent = stack.replace(primal_var=0 * stack["primal_var"])

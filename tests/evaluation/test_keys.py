@@ -62,7 +62,8 @@ def test_a_sampler_has_the_key_of_the_code_it_runs(tree, tmp_path):
         "auto",
         "gpt",
         "gmlt",
-    }  # gmlt shifts the paths of its chains by it
+        "primal",
+    }  # gmlt shifts the paths of its chains by it, and primal walks its base paths where lamps are chosen by place
     assert {"ppm", "gpm"} <= changed("samplers/photons/map/trace.py") <= {"ppm", "gpm"}
     (tree / "paths" / "fresh.py").write_text("x = 1\n")
     before = keys_of()

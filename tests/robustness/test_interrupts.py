@@ -82,7 +82,7 @@ def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
         assert ": 0/" in process.stderr.readline()  # progress, as the first pass begins
         process.terminate()
         errors = process.stderr.read()
-        assert process.wait(60) == 143
+        assert process.wait(60) == 143, errors
     spp = ngpt.read(out).attributes["ngpt:spp"]
     assert spp > 0 and one_error(errors) and f"interrupted: {out} holds the {spp} samples per pixel" in errors
     assert os.listdir(tmp_path) == ["s.exr"]
@@ -224,3 +224,21 @@ def test_an_interrupt_during_import_is_one_line():
     )
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=ROOT, check=False)
     assert (run.returncode, run.stderr) == (130, "ngpt: error: interrupted\n")
+
+
+def test_a_handler_prints_amid_a_line(tmp_path):
+    """Where a signal comes while a line is printed, its handler cannot enter the same buffer: it ended the render."""
+    from ngpt.system.console import print_line
+
+    class Entered:
+        encoding = "utf-8"
+
+        def __init__(self, file):
+            self.fileno = file.fileno
+
+        def write(self, text):
+            raise RuntimeError("reentrant call inside <_io.BufferedWriter name=3>")
+
+    with open(tmp_path / "log", "wb") as file:
+        print_line("interrupted", Entered(file))
+    assert (tmp_path / "log").read_text() == "interrupted\n"

@@ -210,11 +210,11 @@ def replayed_light(scene, plan: Plan, step: Step, path: Offset, own: Own) -> tup
     """
     y, bsdf = own.y, own.bsdf
     lit = mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) | media.scatters(own.place)
-    base = (plan.lights, step.light, step.light_weight)
+    lights, base, weight = plan.lights, step.light, step.light_weight
     if step.lamp is None:
-        light, r = replay_light(scene, *base, step.u_light, y, lit=lit), 1
+        light, r = replay_light(scene, lights, base, weight, step.u_light, y, lit=lit), 1
     else:
-        light, r = replay_lamp(*base, step.lamp, step.x, y, lit=lit)
+        light, r = replay_lamp(lights, base, weight, step.lamp, step.x, y, lit=lit)
     f, p = media.evaluate_vertex(bsdf, y, own.place, y.to_local(light.d), lit)
     # A shadow ray where there is something to be shadowed
     L_light = f * light.weight

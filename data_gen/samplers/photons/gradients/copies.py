@@ -151,7 +151,9 @@ def let_through(world: World, way: Way, active, target: mi.Point3f | None = None
             to_surface=target is None,
         )
     else:
-        τ, met, ray, medium = segments.cross(fog.media.passes, trace, ray, through.medium, reach, active, target)
+        τ, met, ray, medium = segments.cross(
+            fog.media.passes, trace, ray, through.medium, reach, active=active, target=target
+        )
         N, N_c = 1, 1
     T, T_c = dr.exp(through.τ_c - τ) * N, dr.exp(through.τ_c - media.pick(τ, through.channel)) * N_c
     return Passage(T, T_c, met, ray, medium)
@@ -237,7 +239,9 @@ def known_of_media(world: World, photons, photon: Photon, origin) -> Through:
         τ = media.depth(media.extinction(medium, back), reach)
     else:
         back = media.shortened(back, reach)
-        τ, _, _, medium = segments.cross(fog.media.passes, trace, back, medium, reach, True)
+        τ, _, _, medium = segments.cross(
+            fog.media.passes, trace, back, medium, reach, active=mi.Bool(True), target=None
+        )
     return Through(medium, media.pick(τ, photon.channel), photon.channel, nulls)
 
 

@@ -169,7 +169,7 @@ def turned(world: World, paths: LightPaths, beam: Beam, A: Beside, B: Beside, ra
     good &= ~copy.past(A, radius).near
 
     # ------------------- What comes through, and is scattered there -------------------
-    passage = let_through(world, way, reach, good)
+    passage = let_through(world, way, good, target)
     good &= ~passage.met.is_valid() & (passage.medium == beam.part.medium)
     here = dr.zeros(mi.MediumInteraction3f, dr.width(reach))
     here.p, here.wavelengths, here.medium = target, way.ray.wavelengths, passage.medium

@@ -142,7 +142,9 @@ class AcrossPlanes:
         """T(s) T(t) of planes; 0 where anything is in the way, or x would be in another ``medium``."""
         ray = media.shortened(mi.Ray3f(plane.a + plane.d * at.s, plane.e), at.t)
         trace = segments.next_surface(self.world.scene)
-        τ, met, _, there = segments.cross(self.world.fog.media.passes, trace, ray, plane.medium, at.t, active)
+        τ, met, _, there = segments.cross(
+            self.world.fog.media.passes, trace, ray, plane.medium, at.t, active=active, target=None
+        )
         return dr.select(active & ~met.is_valid() & (there == medium), dr.exp(-plane.σ * at.s - τ), 0)
 
 
