@@ -35,8 +35,9 @@ _BLOCK_LANES = 1 << 21
 _MOST_LANES = 1 << 30
 # Lanes of the first pass of a render that time may end: fewer leave cores idle.
 _FEWEST_LANES = 1 << 13
-# Of the time that is left, what a pass that ends the render is expected to take.
-_CAUTION = 0.9
+# Of the time that is left, what a pass that ends the render is expected to take; and how many times as long as the
+# longest before it a pass may be where there is a time.
+_CAUTION, _GROWTH = 0.9, 8
 # Lanes of the first pass of others: enough to render small images at one go, and to judge how long the next may be.
 FIRST_LANES = 1 << 20
 # A pass this long makes little of the time that it takes to start one, and reacts soon enough.
@@ -108,6 +109,9 @@ def render_passes(
         begin, each = foretold(done)
         # Where a pass takes long to begin, it goes on for longer.
         wanted = min(time_left - begin, max(PASS_SECONDS - begin, 3 * begin)) / each
+        if seconds is not None:
+            # What short passes took says little of one that is a hundred times as long.
+            wanted = min(wanted, _GROWTH * max(n for n, _ in done))
         n = min(left, size * max(1, min(blocks, int(wanted / size))))
         if begin + each * n <= time_left:
             return n

@@ -242,7 +242,9 @@ class Ways:
         camera = self.point((0.2, 0.3, 2.2))
         ray, reach = camera.spawn_ray_to(x.p), dr.norm(x.p - camera.p)
         trace, medium = self.segments.next_surface(self.scene), mi.MediumPtr(self.scene.sensors()[0].get_medium())
-        medium = self.segments.cross(self.media.passes, trace, ray, medium, reach, mi.Bool(True))[-1]
+        medium = self.segments.cross(self.media.passes, trace, ray, medium, reach, active=mi.Bool(True), target=None)[
+            -1
+        ]
         return Place(medium, mi.Bool(True))
 
     def reconnect(self, y, place, base):
