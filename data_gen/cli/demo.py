@@ -118,9 +118,9 @@ def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target
 
 def print_table(scenes: list[Scene]) -> None:
     """The numbers of the report, for those who do not open it."""
-    print(f"{'scene':14}{'method':10}{'relMSE':>12}{'of primal':>12}{'seconds':>10}")
+    print(f"{'scene':14}{'method':14}{'relMSE':>12}{'of primal':>12}{'seconds':>10}")
     for scene in scenes:
         for entry in scene.entries:
             error = median(entry.metrics["relMSE"])
             share = error / max(median(scene.entries[0].metrics["relMSE"]), 1e-30)
-            print(f"{scene.name:14}{entry.name:10}{error:12.5f}{share:12.1%}{entry.seconds:10.2f}")
+            print(f"{scene.name:14}{entry.name:14}{error:12.5f}{share:12.1%}{entry.seconds:10.2f}")
