@@ -112,7 +112,7 @@ def test_what_is_written_and_spoken_to_is_read_from_a_trace():
         '7 connect(5, {sa_family=AF_INET, sin_port=htons(53), sin_addr=inet_addr("127.0.0.53")}, 16) = 0',
         '7 connect(5, {sa_family=AF_UNIX, sun_path="/var/run/nscd/socket"}, 110) = -1 ENOENT',
     ]
-    assert written(lines, Path("/work")) == {"/home/me/id", "/work/late", "/b"}
+    assert written(lines, Path("/desk")) == {"/home/me/id", "/desk/late", "/b"}
     assert spoken_to(lines) == {"192.0.2.7", "2001:db8::1"}
 
 
