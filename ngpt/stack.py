@@ -128,6 +128,8 @@ class GradientStack:
             needs = f"{why} needs" if why else "no"
             what = f"layer{'s' if len(missing) > 1 else ''} {' and '.join(repr(name) for name in missing)}"
             remedy = " ".join(f"--layer {name}=NAME" for name in missing)
+            if "primal_var" in missing:
+                remedy += "; if its renderer writes none, several seeds do: 'With variances' in from-your-renderer.md"
             raise NgptError(
                 f"{self.path}: {needs} {what}; the stack holds {', '.join(self.names)}; "
                 f"if the file has it under another name, pass {remedy}"

@@ -333,7 +333,8 @@ def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
 def _no_primal(groups: list[_Group], path: str) -> NgptError:
     root: set[str] = set().union(*(group.channels for group in groups if group.name == ""))
     if "Y" in root and not root & set(RGB):
-        return NgptError(f"{path}: holds luminance (channel Y) but no colour; save the image with channels R G B")
+        held = "luminance and chroma (channels Y RY BY)" if {"RY", "BY"} <= root else "luminance (channel Y)"
+        return NgptError(f"{path}: holds {held} but no colours R G B; save the image with channels R G B")
     return NgptError(
         f"{path}: no primal image (root R G B, or a layer such as primal, Noisy Image or Combined); "
         f'the file holds {_listing(groups)}; name it with --layer primal="NAME"'

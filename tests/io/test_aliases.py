@@ -321,6 +321,7 @@ def test_bad_overrides_name_what_the_file_holds(overrides, expected):
         ([*names("RGB", "dy.RGB"), "dy.red"], "layer 'dy' has one channel twice, dy.R and dy.red"),
         (names("N.XYZ", "fog.RGB"), 'the file holds "N" (X Y Z), "fog" (R G B); name it with --layer primal="NAME"'),
         (["Y"], "holds luminance (channel Y) but no colour"),
+        (["Y", "RY", "BY"], "holds luminance and chroma (channels Y RY BY) but no colours R G B"),
         (["Y", "A"], "holds luminance (channel Y) but no colour"),
         ([], "no primal image"),
     ],
