@@ -58,7 +58,7 @@ def measure(config, job) -> dict:
     ideal = 0.0
     with tempfile.TemporaryDirectory() as folder:
         path = job.path or str(made_scene(config, job.scene, Path(folder)))
-        scene = load_scene(path, None, job.parameters)
+        scene = load_scene(path, None, job.parameters, merged=config.frames == 1)
     for crop in record["crops"]:
         View(**crop["view"]).apply(scene)
         start = time.perf_counter()

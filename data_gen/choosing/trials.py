@@ -116,6 +116,9 @@ def try_out(
     except NgptError:
         return None, clock()
     compiled = clock()
+    if compiled - begins > limit / 2:
+        # Each of the stacks takes a good part of that again.
+        return None, compiled
 
     def timed(n: int, seed: int) -> tuple[GradientStack, float]:
         start = clock()

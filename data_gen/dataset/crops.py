@@ -47,7 +47,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
     try:
         with tempfile.TemporaryDirectory(prefix="ngpt-scene-") as temporary:
             path = job.path or str(made_scene(config, job.scene, Path(temporary)))
-            scene = load_scene(path, None, job.parameters)
+            scene = load_scene(path, None, job.parameters, merged=config.frames == 1)
         around = Surroundings(scene, job.box)
     except (NgptError, RuntimeError) as error:
         stop_if_interrupted(error)

@@ -50,7 +50,7 @@ class Shot:
         if self._scene is None or wanted != self._loaded:
             self._scene = self._shapes = None
             gc.collect()  # two scenes in memory would make kernels larger
-            self._scene, self._loaded = load_scene(name, self.size, wanted[1]), wanted
+            self._scene, self._loaded = load_scene(name, self.size, wanted[1], merged=False), wanted
         scene = self._scene
         if self.update is not None:
             params = mi.traverse(scene)

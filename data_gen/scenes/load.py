@@ -8,20 +8,28 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.scenes.builtin import SCENES
+from data_gen.scenes.merging import load_merged
 from ngpt.errors import NgptError, stop_if_interrupted
 
 
-def load_scene(name: str, size: tuple[int, int] | None = None, parameters: dict[str, str] | None = None) -> mi.Scene:
+def load_scene(
+    name: str,
+    size: tuple[int, int] | None = None,
+    parameters: dict[str, str] | None = None,
+    *,
+    merged: bool = True,
+) -> mi.Scene:
     """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
 
     ``size`` is (width, height) in pixels and replaces that of the scene's film, crop window included; ``parameters``
-    sets the file's ``<default>`` values. Raises NgptError with the file and Mitsuba's own complaint when it cannot.
+    sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which renders the same and
+    starts much sooner; where they are to move, or to be found by name, they must not be. Raises NgptError with the file
+    and Mitsuba's own complaint when it cannot.
     """
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            # Merged as Mitsuba would, shapes and emitters come in another order each time, and with them other bits.
-            scene = mi.load_file(name, optimize=False, **parameters)
+            scene = load_merged(name, parameters) if merged else mi.load_file(name, optimize=False, **parameters)
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")

@@ -107,7 +107,7 @@ def test_a_change_of_any_size_is_measured():
 
 def test_stacks_without_variances_are_refused(stack):
     colour = GradientStack.from_arrays(primal=stack["primal"])
-    with pytest.raises(NgptError, match="an estimate of the error needs layer 'primal_var'.*several seeds"):
+    with pytest.raises(NgptError, match=r"an estimate of the error needs layer 'primal_var'.*several seeds"):
         ngpt.reconstruct_with_error(colour)
     some = {name: stack[name] for name in stack.names if name != "dy_var"}
     with pytest.raises(NgptError, match="what gradients give needs layer 'dy_var'"):

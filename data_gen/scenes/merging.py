@@ -1,0 +1,75 @@
+"""Scene files whose meshes are merged by material.
+
+Each shape of a scene is a case of its own in the kernels, which Dr.Jit records anew for each pass. A room of 800 meshes
+takes seconds for that, and a tenth of it once meshes of one material are one.
+"""
+
+from __future__ import annotations
+
+from contextlib import contextmanager
+from pathlib import Path
+
+import mitsuba as mi
+
+# The plugins that read meshes, and those of their settings by which normals differ.
+_MESHES = ("obj", "ply", "serialized")
+_NORMALS = ("face_normals", "flip_normals")
+
+
+def load_merged(path: str, parameters: dict[str, str]) -> object:
+    """What ``mi.load_file`` gives, but meshes of one material that neither shine nor bound a medium are one.
+
+    They lose their names. Merged as Mitsuba would (``optimize=True``), shapes and emitters come in another order each
+    time, and with them other bits; here they have the file's order, each group the place of its first mesh.
+    """
+    config = mi.parser.ParserConfig(mi.variant())
+    config.merge_equivalent = config.merge_meshes = False
+    with _found_beside(path):
+        state = mi.parser.parse_file(config, path, **parameters)
+        mi.parser.transform_all(config, state)
+        if state.root.props.plugin_name() == "scene":
+            _merge(state)
+        return mi.parser.instantiate(config, state)
+
+
+def _merge(state: mi.parser.ParserState) -> None:
+    scene, groups = state.root.props, {}
+    for name, reference in scene.items():
+        if isinstance(reference, mi.Properties.ResolvedReference) and (key := _group(state, reference.index())):
+            groups.setdefault(key, []).append(name)
+    for names in groups.values():
+        if len(names) == 1:
+            continue
+        node = mi.parser.SceneNode()
+        node.type, node.props = mi.ObjectType.Shape, mi.Properties("merge")
+        for i, name in enumerate(names):
+            node.props[f"mesh_{i}"] = scene[name]
+        state.nodes.append(node)
+        # The list may have moved.
+        scene = state.root.props
+        scene[names[0]] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
+        for name in names[1:]:
+            del scene[name]
+
+
+def _group(state: mi.parser.ParserState, number: int) -> tuple | None:
+    """What meshes that become one have in common; None for a node that stays as it is."""
+    props = state.nodes[number].props
+    parts = [part.index() for _, part in props.items() if isinstance(part, mi.Properties.ResolvedReference)]
+    if props.plugin_name() not in _MESHES or len(parts) != 1 or state.nodes[parts[0]].type != mi.ObjectType.BSDF:
+        return None
+    return (*parts, *(bool(props.get(name, False)) for name in _NORMALS))
+
+
+@contextmanager
+def _found_beside(path: str):
+    """While in it, files that a scene names are looked for beside it first."""
+    resolver = mi.file_resolver()
+    before = list(resolver)
+    resolver.prepend(str(Path(path).resolve().parent))
+    try:
+        yield
+    finally:
+        resolver.clear()
+        for folder in before:
+            resolver.append(folder)

@@ -1,0 +1,134 @@
+"""Scene files whose meshes are merged by material, against the same files as they are."""
+
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from ngpt.errors import NgptError
+
+QUAD = """ply
+format ascii 1.0
+element vertex 4
+property float x
+property float y
+property float z
+{normals}element face 2
+property list uchar int vertex_indices
+end_header
+{vertices}
+3 0 1 2
+3 0 2 3
+"""
+
+
+def quad(x: float, smooth: bool = False) -> str:
+    """A wall of a side of 1 at ``x``, whose corners have normals of their own or none."""
+    corners = [(x, -0.5), (x + 1, -0.5), (x + 1, 0.5), (x, 0.5)]
+    more = " 0.1 0 0.995" if smooth else ""
+    names = "property float nx\nproperty float ny\nproperty float nz\n" if smooth else ""
+    return QUAD.format(normals=names, vertices="\n".join(f"{a} {b} 0{more}" for a, b in corners))
+
+
+def shape(name: str, inside: str) -> str:
+    return f'<shape type="ply" id="{name}"><string name="filename" value="{name}.ply"/>{inside}</shape>'
+
+
+def bsdf(name: str, color: str) -> str:
+    return f'<bsdf type="diffuse" id="{name}"><rgb name="reflectance" value="{color}"/></bsdf>'
+
+
+@pytest.fixture
+def scene_file(tmp_path):
+    """Meshes of two materials: of red two flat ones and a smooth one, of green two, a lamp, and the bounds of fog."""
+    red, green = '<ref id="red"/>', '<ref id="green"/>'
+    lamp = red + '<emitter type="area"><rgb name="radiance" value="2"/></emitter>'
+    fog = green + '<medium type="homogeneous" name="interior"/>'
+    inside = {"a": red, "b": green, "c": red, "lamp": lamp, "smooth": red, "d": green, "fog": fog}
+    for i, name in enumerate(inside):
+        (tmp_path / f"{name}.ply").write_text(quad(1.2 * i - 4.2, name == "smooth"))
+    shapes = "".join(shape(name, text) for name, text in inside.items())
+    camera = (
+        '<sensor type="perspective"><float name="fov" value="60"/><transform name="to_world">'
+        '<lookat origin="0,0,8" target="0,0,0" up="0,1,0"/></transform>'
+        '<film type="hdrfilm"><integer name="width" value="48"/><integer name="height" value="12"/></film></sensor>'
+    )
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="volpath"/><emitter type="constant"/>'
+        f"{camera}{bsdf('red', '.7,.2,.2')}{bsdf('green', '.2,.7,.2')}{shapes}</scene>"
+    )
+    return path
+
+
+def test_meshes_of_one_material_are_one(renderer, scene_file):
+    from data_gen.scenes.load import load_scene
+
+    merged = load_scene(str(scene_file))
+    plain = load_scene(str(scene_file), merged=False)
+    assert [s.id() for s in plain.shapes()] == ["a", "b", "c", "lamp", "smooth", "d", "fog"]
+    assert sum(s.primitive_count() for s in merged.shapes()) == 14
+    # Where corners have normals of their own, others of that material have none to take.
+    assert len(merged.shapes()) in (4, 5)
+    kept = [s for s in merged.shapes() if s.id() in ("lamp", "fog")]
+    assert kept[0].is_emitter() and kept[1].is_medium_transition() and len(merged.emitters()) == 2
+
+
+def test_it_is_the_same_scene(renderer, scene_file):
+    import mitsuba as mi
+
+    from data_gen.scenes.load import load_scene
+
+    views = mi.load_dict({"type": "aov", "aovs": "n:sh_normal,g:geo_normal,u:uv,d:depth,a:albedo"})
+    images = [
+        np.array(mi.render(load_scene(str(scene_file), merged=merged), integrator=views, spp=4, seed=1))
+        for merged in (True, False)
+    ]
+    assert images[0][..., 0].max() > 0
+    # The smooth one turns its normal, the flat ones do not.
+    assert 0.01 < (np.abs(images[0][..., 0]) > 0.05).mean() < 0.3
+    assert np.allclose(*images, atol=1e-5)
+
+
+def test_the_order_is_that_of_the_file_in_every_process(scene_file):
+    code = (
+        "from data_gen.backend import use_variant; use_variant('llvm_ad_rgb')\n"
+        "from data_gen.scenes.load import load_scene\n"
+        f"scene = load_scene({str(scene_file)!r})\n"
+        "print([(s.primitive_count(), s.bbox().min[0]) for s in scene.shapes()])"
+    )
+    pytest.importorskip("mitsuba")
+    runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True) for _ in range(3)]
+    assert runs[0].returncode == 0, runs[0].stderr
+    assert len({run.stdout for run in runs}) == 1
+
+
+def test_files_are_found_beside_their_scene_alone(renderer, scene_file, tmp_path):
+    """A scene that was loaded before is not where the next one's meshes come from."""
+    import mitsuba as mi
+
+    from data_gen.scenes.load import load_scene
+
+    before = list(mi.file_resolver())
+    load_scene(str(scene_file))
+    assert list(mi.file_resolver()) == before
+    other = tmp_path / "other"
+    other.mkdir()
+    (other / "scene.xml").write_text(scene_file.read_text())
+    with pytest.raises(NgptError, match=r"a\.ply"):
+        load_scene(str(other / "scene.xml"))
+    assert list(mi.file_resolver()) == before
+
+
+def test_parameters_and_errors_are_those_of_mitsuba(renderer, scene_file):
+    from data_gen.scenes.load import load_scene
+
+    text = scene_file.read_text().replace(
+        '<scene version="3.0.0">', '<scene version="3.0.0"><default name="n" value="48"/>'
+    )
+    scene_file.write_text(text.replace('value="48"/><integer name="height"', 'value="$n"/><integer name="height"'))
+    assert load_scene(str(scene_file), parameters={"n": "20"}).sensors()[0].film().size()[0] == 20
+    for merged in (True, False):
+        with pytest.raises(NgptError, match="nosuch"):
+            load_scene(str(scene_file), parameters={"nosuch": "1"}, merged=merged)
