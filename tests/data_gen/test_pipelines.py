@@ -165,7 +165,8 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
         return None, compiled
 
     monkeypatch.setattr(trials, "try_out", try_out)
-    for seconds, names, size in ((30.0, 0, None), (50.0, 1, (6, 4)), (100.0, 2, (12, 8)), (250.0, 3, (24, 16)), (500.0, 4, (24, 16))):
+    cases = ((30.0, 0, None), (50.0, 1, (6, 4)), (100.0, 2, (12, 8)), (250.0, 3, (24, 16)), (500.0, 4, (24, 16)))
+    for seconds, names, size in cases:
         tried.clear()
         found = plans.plan(scene, seconds, clock=ticking(1.0))
         assert found.sampler == "gpt" and "no time for a pilot" in found.reason
