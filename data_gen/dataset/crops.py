@@ -83,8 +83,10 @@ def made_scene(config: Config, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
-    """K samples per pixel, log-uniform between the bounds, stratified, smallest first."""
+    """K samples per pixel, log-uniform between the bounds, stratified, smallest first; those of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
+    if config.pairs:
+        return 2 * [int(np.exp(low + rng.random() * (high - low)))]
     u = (rng.random() + np.arange(config.inputs)) / config.inputs
     return [int(n) for n in np.exp(low + u * (high - low))]
 
@@ -150,7 +152,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 first = render_input(config, scene, counts[0], seeds[0], uneven[0])
             data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock)
             told = {"crop": crop, "view": movement.view_at(frame).record()} | told
-            told["seconds"]["camera"] = round(found, 4)
+            told["seconds"] = {part: round(value, 4) for part, value in (told["seconds"] | {"camera": found}).items()}
             if moving:
                 now = snapshot(scene, None if before is None or movement.shape else before.shapes)
                 motion = np.full((config.size, config.size, 2), np.nan, np.float32)
@@ -184,6 +186,16 @@ def _crop(
     further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
     stacks = [first] + [render_input(config, scene, *each) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
+    cleaned = [finite(stack) for stack in stacks]
+    told = {
+        "spp": counts,
+        "seeds": seeds,
+        **({"adaptive": uneven} if config.adaptive else {}),
+        "repaired": [count for _, count in cleaned],
+        "seconds": seconds,
+    }
+    if config.pairs:
+        return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
     halves = [render_stack(scene, spp, seed, config.sampler, **config.options) for seed in seeds[-HALVES:]]
@@ -191,7 +203,6 @@ def _crop(
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]
     seconds["reference"] = time.perf_counter() - clock
-    cleaned = [finite(stack) for stack in stacks]
     direct = np.nan_to_num(converged["direct"], posinf=0)
     light = np.maximum(reference, direct)
     data = CropData(
@@ -202,13 +213,6 @@ def _crop(
         caustic,
         tuple(np.maximum(half, direct) for half in apart),
     )
-    told = {
-        "spp": counts,
-        "seeds": seeds,
-        **({"adaptive": uneven} if config.adaptive else {}),
-        "repaired": [count for _, count in cleaned],
-        "seconds": {part: round(value, 4) for part, value in seconds.items()},
-    }
     return data, told
 
 

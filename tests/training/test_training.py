@@ -211,7 +211,8 @@ def test_targets_hold_what_the_inputs_estimate():
         drawn = examples.Examples([crop], config, Augmentation(quieter=(0.1, 0.5)), 32, seed=0)
         target = examples.target_of(crop, config)
         assert np.allclose(target, crop.reference if with_layer else crop.plain)
-        errors = [drawn._layers(0, k)["primal"] - drawn._layers(0, k)["target"] for k in range(3)]
+        parts = [drawn._layers(0, drawn.crops[0], k) for k in range(3)]
+        errors = [layers["primal"] - judge["target"] for layers, judge in parts]
         assert max(float(error.abs().max()) for error in errors) < 2
 
 
