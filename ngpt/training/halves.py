@@ -39,8 +39,12 @@ def halves(prediction: Tensor, other: dict[str, Tensor]) -> Tensor:
     ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors that A tells
     ``counts``                           (N, 1, H, W) 1, or 0 where the image says nothing, as where lamps are seen
     """
-    light = avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False).square() + DARK
-    counts, total = other["counts"], prediction.new_zeros(())
+    return judged(prediction, avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False), other)
+
+
+def judged(prediction: Tensor, smooth: Tensor, other: dict[str, Tensor]) -> Tensor:
+    """L with ``smooth`` for m."""
+    light, counts, total = smooth.square() + DARK, other["counts"], prediction.new_zeros(())
     images = counts * (prediction - other["primal"]), light + spread(other["primal_se"]), counts
     for scale in range(SCALES):
         error, size, share = (avg_pool2d(image, 2**scale) for image in images)
