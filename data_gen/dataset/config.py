@@ -125,9 +125,12 @@ class Config:
             if bad:
                 raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")
 
-    def plan(self) -> list[Job]:
-        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""
-        sources: list[tuple] = [(made_name(i), self.crops) for i in range(self.scenes)]
+    def plan(self, turn: int = 0) -> list[Job]:
+        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which.
+
+        ``turn``  of those who never end: from 1 on further procedural scenes, and further views of scene files
+        """
+        sources: list[tuple] = [(made_name(turn * self.scenes + i), self.crops) for i in range(self.scenes)]
         for source in self.files:
             paths = sorted(glob(source.pattern, recursive=True))
             if not paths:
@@ -138,17 +141,20 @@ class Config:
         names = [source[0] for source in sources]
         if len(set(names)) < len(names):
             raise NgptError("data configuration: two scene files have the same folder and name; rename one")
-        return [job for source in sources for job in self.scene_jobs(*source)]
+        return [job for source in sources for job in self._scene_jobs(turn, *source)]
 
-    def scene_jobs(
-        self, name: str, crops: int, path: str = "", parameters: dict[str, str] | None = None, box: list | None = None
+    def _scene_jobs(
+        self, turn: int, name: str, crops: int, path: str = "", parameters: dict | None = None, box: list | None = None
     ) -> list[Job]:
         """The shards of one scene."""
-        batches = [
-            tuple(range(first, min(first + self.crops_per_shard, crops)))
-            for first in range(0, crops, self.crops_per_shard)
-        ]
-        return [Job(name, i, batch, path, parameters or {}, box) for i, batch in enumerate(batches)]
+        starts = range(0, crops, self.crops_per_shard)
+        # Procedural scenes are others in each turn, and have all their crops in one.
+        turn = turn if path else 0
+        jobs = []
+        for i, start in enumerate(starts, turn * len(starts)):
+            batch = range(turn * crops + start, turn * crops + min(start + self.crops_per_shard, crops))
+            jobs.append(Job(name, i, tuple(batch), path, parameters or {}, box))
+        return jobs
 
 
 def made_name(number: int) -> str:

@@ -41,6 +41,11 @@ class Pool(ProcessPoolExecutor):
         # Spawned, since LLVM does not survive a fork.
         super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent)
 
+    def end(self) -> None:
+        """Ends the processes, whatever they are at."""
+        for process in tuple(self._processes.values()):
+            process.terminate()
+
     def __exit__(self, kind, *rest):
         if kind is not None and issubclass(kind, KeyboardInterrupt):
             # What they are at is made again; waiting for it takes minutes.

@@ -1,15 +1,14 @@
 """Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
 
 import copy
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset as TorchDataset
 
-from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
 from ngpt.network import features, padding
 from ngpt.network.model import ModelConfig
@@ -22,13 +21,6 @@ from ngpt.training.augment import Augmentation, Layers, quieter, rarer
 OTHER = "other/"
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
-
-
-def read(path: str) -> GradientStack:
-    """The stack in a file. Training sets need no OpenEXR: it comes in with the first file that does."""
-    from ngpt.io import exr
-
-    return exr.read(path)
 
 
 class Crop(Protocol):
@@ -55,106 +47,6 @@ class Crop(Protocol):
 
     @property
     def reference_halves(self) -> tuple[np.ndarray, ...]: ...
-
-
-class StackCrop:
-    """The stacks of one folder and the reference they share."""
-
-    reference_halves = ()
-    paired = False
-
-    def __init__(self, folder: Path, stacks: list[Path], reference: Path):
-        self.scene, self.inputs = folder.name, len(stacks)
-        self._stacks, self._reference = stacks, reference
-        held = [read(str(path)) for path in stacks]
-        self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
-        self._caustic = ["caustic" in stack for stack in held]
-        self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
-
-    def stack(self, k: int) -> GradientStack:
-        return read(str(self._stacks[k]))
-
-    @property
-    def reference(self) -> np.ndarray:
-        return read(str(self._reference))["primal"]
-
-    @property
-    def reference_direct(self) -> np.ndarray:
-        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
-        most = self._stacks[int(np.argmax(self.spp))]
-        for path in (self._reference, most):
-            stack = read(str(path))
-            if "direct" in stack:
-                return stack["direct"]
-        return np.zeros_like(stack["primal"])
-
-    @property
-    def reference_caustic(self) -> np.ndarray:
-        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
-
-        Raises NgptError if only some of the stacks have it.
-        """
-        reference = read(str(self._reference))
-        if all(self._caustic) and "caustic" in reference:
-            return reference["caustic"]
-        if not self._lit:
-            return np.zeros_like(reference["primal"])
-        if not all(self._caustic):
-            raise NgptError(
-                f"{self._stacks[self._caustic.index(False)]}: has no layer 'caustic', but other stacks of {self.scene} "
-                "have: their gradients hold nothing of that light, so they have no target in common; render all alike"
-            )
-        stacks = [read(str(path)) for path in self._stacks]
-        shares = np.divide(self.spp, sum(self.spp)) if all(self.spp) else np.full(len(stacks), 1 / len(stacks))
-        light = sum(share * stack["caustic"] for share, stack in zip(shares, stacks, strict=True))
-        layers = {"caustic": light, "primal": reference["primal"]}
-        if all("caustic_var" in stack for stack in stacks):
-            noise = [share**2 * stack["caustic_var"] for share, stack in zip(shares, stacks, strict=True)]
-            layers["caustic_var"] = np.sum(noise, axis=0)
-        features = {name: stacks[0][name] for name in ("albedo", "normal", "depth") if name in stacks[0]}
-        return caustic.denoised(repair(GradientStack(layers | features)))
-
-
-class StackFolder(Sequence[StackCrop]):
-    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
-
-    Raises NgptError where a folder has stacks without a reference, or sizes differ.
-    """
-
-    def __init__(self, folder: str | Path):
-        self._crops = []
-        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
-            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
-            reference = view / "reference.exr"
-            if not stacks:
-                continue
-            if not reference.is_file():
-                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
-            self._crops.append(StackCrop(view, stacks, reference))
-        if not self._crops:
-            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
-
-    def __len__(self) -> int:
-        return len(self._crops)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return self._crops[index]
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
-
-
-def open_crops(folder: str | Path) -> Iterable[Any]:
-    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
-    path = Path(folder)
-    if not path.is_dir():
-        raise NgptError(f"{folder}: no such folder; make a training set: ngpt dataset --config ... --out {folder}")
-    if (path / "manifest.json").is_file():
-        from ngpt.training.dataset import Dataset
-
-        return Dataset(path)
-    return StackFolder(path)
 
 
 class Mixture(Sequence[Any]):
@@ -205,7 +97,7 @@ class Examples(TorchDataset):
         # What makes an input of a crop that was not rendered.
         made = {self._quieter: augmentation.quieter, self._rarer: augmentation.rarer}
         self._made = [make for make, asked in made.items() if asked]
-        self._cache: dict[tuple[int, int], tuple[Layers, Layers]] = {}
+        self._cache: OrderedDict[tuple[Crop, int], tuple[Layers, Layers]] = OrderedDict()
         self._free = cache
 
     def __len__(self) -> int:
@@ -239,8 +131,9 @@ class Examples(TorchDataset):
 
     def _layers(self, which: int, crop: Crop, k: int) -> tuple[Layers, Layers]:
         """Input ``k`` of a crop, and what it is judged by: the "target", or the other half."""
-        if (which, k) in self._cache:
-            return self._cache[which, k]
+        if (crop, k) in self._cache:
+            self._cache.move_to_end((crop, k))
+            return self._cache[crop, k]
         stack = crop.stack(k) if k < crop.inputs else self._made[k - crop.inputs](which, crop)
         data = repair(stack, self.config.reads_gradients)
         layers = layers_of(data, self.config)
@@ -248,9 +141,11 @@ class Examples(TorchDataset):
             judge = _tensors(other_half(data, crop.stack(1 - k)))
         else:
             judge = _tensors({"target": target_of(crop, self.config)})
-        size = sum(layer.numel() * layer.element_size() for part in (layers, judge) for layer in part.values())
-        if size <= self._free:
-            self._cache[which, k], self._free = (layers, judge), self._free - size
+        self._cache[crop, k] = layers, judge
+        self._free -= _bytes(layers, judge)
+        while self._free < 0:
+            # The one that nobody asked for in the longest time: of a stream, a crop that is gone.
+            self._free += _bytes(*self._cache.popitem(last=False)[1])
         return layers, judge
 
     def _quieter(self, which: int, crop: Crop) -> GradientStack:
@@ -301,6 +196,10 @@ def other_half(data: Repaired, other: GradientStack) -> dict[str, np.ndarray]:
     layers = {"primal": theirs.image, "dx": theirs.dx, "dy": theirs.dy}
     layers |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
     return layers | {"counts": counts[..., None].astype(np.float32)}
+
+
+def _bytes(*parts: Layers) -> int:
+    return sum(layer.numel() * layer.element_size() for part in parts for layer in part.values())
 
 
 def _tensors(arrays: dict[str, np.ndarray]) -> Layers:

@@ -21,6 +21,8 @@ class DataSettings:
     ``validation``  beginnings of the names of scenes that are kept out of training
     ``crop``        pixels of an example's side
     ``pairs``       share of the examples that have no reference but another half, where there are both kinds
+    ``kept``        folder for references of sets that are rendered while the network trains: made once, they are met
+                    again with inputs of new noise. "" renders new ones for ever
     ``workers``     processes that prepare examples; 0 prepares them in between
     ``cache``       MiB of memory, for each of these, to keep what was prepared in
     """
@@ -29,6 +31,7 @@ class DataSettings:
     validation: tuple[str, ...] = ()
     crop: int = 128
     pairs: float = 0.5
+    kept: str = ""
     workers: int = 0
     cache: int = 2048
 

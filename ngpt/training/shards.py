@@ -58,7 +58,7 @@ MOTION = "motion"
 FAR = 1e6
 
 # Types of numbers in safetensors
-_TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I32": np.int32, "I64": np.int64}
+_TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "U8": np.uint8, "I32": np.int32, "I64": np.int64}
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3

@@ -50,8 +50,8 @@ class Trainer:
     ``crops`` and ``held_out`` are for training and validation, ``loss`` takes scene-linear prediction and target
     (N, 3, H, W) and a generator of the step's random numbers; where there are pairs, what judges them too, and the
     target is that of the others, None without. Files in ``out``: ``checkpoint.safetensors``,
-    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``. ``cache`` keeps
-    what was read in memory: crops must stay what they are. Where they do not, as in a stream, no two runs are alike.
+    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``.
+    Where crops are rendered meanwhile, as in a stream, no two runs are alike.
     """
 
     def __init__(
@@ -63,7 +63,6 @@ class Trainer:
         out: str | Path,
         processes: Processes | None = None,
         say: Callable[[str], None] = show,
-        cache: bool = True,
     ):
         if not len(crops):
             raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
@@ -84,7 +83,7 @@ class Trainer:
             settings.augmentation,
             settings.data.crop,
             settings.run.seed,
-            settings.data.cache << 20 if cache else 0,
+            settings.data.cache << 20,
             settings.data.pairs,
         )
         if (settings.data.crop + 2 * padding.MARGIN) % self.model.alignment:
