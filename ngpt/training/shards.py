@@ -151,6 +151,8 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
+    # Of arrays in another order of memory safetensors writes the bytes as they lie there.
+    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
     try:
         with atomic_output(path) as temporary:

@@ -56,7 +56,10 @@ def test_inputs_are_rendered_anew(renderer, tmp_path):
     assert len(Kept(tmp_path / "kept.safetensors").places) == len(read[0]) == 2
     for first, second, third in zip(*read, strict=True):
         for crop in (second, third):
-            np.testing.assert_allclose(crop.reference, first.reference, rtol=0.01, atol=1e-4)
+            # Light of the layer ``caustic`` may be negative here and there, and sums of both err by more than each.
+            for name in ("reference_direct", "reference_caustic"):
+                np.testing.assert_allclose(getattr(crop, name), getattr(first, name), rtol=0.01, atol=1e-4)
+            np.testing.assert_allclose(crop.reference, first.reference, rtol=0.01, atol=1e-3)
             # What has next to no noise shows that the camera is the same.
             depths = [np.median(c.stack(1)["depth"]) for c in (first, crop)]
             assert depths[0] == pytest.approx(depths[1], rel=0.05)

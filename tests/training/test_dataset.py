@@ -305,3 +305,12 @@ def test_bad_manifests(tmp_path, text, message):
         (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(NgptError, match=message):
         Dataset(tmp_path)
+
+
+def test_arrays_in_any_order_of_memory(tmp_path, rng):
+    crop = crop_data(rng)
+    turned = np.ascontiguousarray(crop.reference_direct.transpose(2, 0, 1)).transpose(1, 2, 0)
+    told = CropData(crop.stacks, crop.spp, crop.reference, turned)
+    write_shard(tmp_path / "a.safetensors", [told], {"scene": "a"})
+    read = Crop(Shard(tmp_path / "a.safetensors"), 0, "a", (2, 9))
+    np.testing.assert_allclose(read.reference_direct, crop.reference_direct, rtol=2e-3)
