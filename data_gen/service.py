@@ -95,7 +95,8 @@ def stream(config: Path, kept: str = "") -> Iterator[Any]:
     from data_gen.dataset.jobs import Pool
     from data_gen.dataset.stream import Stream
 
-    with Pool(1) as worker, Stream(read_config(config), worker, kept=kept) as data:
+    # Training that is interrupted finishes its step, and may still ask for crops.
+    with Pool(1, interruptible=False) as worker, Stream(read_config(config), worker, kept=kept) as data:
         try:
             yield data
         finally:
