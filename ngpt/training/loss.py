@@ -27,7 +27,7 @@ class LossSettings:
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
                      weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
-    ``halves``       weight of what judges crops without a reference, ``ngpt.training.halves``
+    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 pulls like those of combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -41,7 +41,7 @@ class LossSettings:
     huber: float = 0.0
     pyramid: float = 0.0
     flip: float = 0.0
-    halves: float = 1.0
+    halves: float = 0.25
     backbone: str = ""
     weights: str = ""
 

@@ -52,7 +52,7 @@ def settings(**run):
     return from_dict(values, "test")
 
 
-def render(generator, truth, share, n=8, size=128):
+def render(generator, truth, share, n=8, size=256):
     """The mean of n samples that find the light with the probability ``share`` each, and its standard error."""
     found = torch.rand(n, 1, 3, size, size, generator=generator) < share
     samples = truth * (0.5 + 0.5 * found / share)
@@ -69,16 +69,17 @@ def the_least(other):
     return low
 
 
-@pytest.mark.parametrize("share", [0.5, 0.1, 0.05])
-def test_the_least_is_at_the_truth_however_rare_light_is(share):
-    """Weights of the half that judges would be small where it is bright, and the least of it far too dark."""
+@pytest.mark.parametrize(
+    ("share", "best", "worse"), [(0.5, 1, 1), (0.1, 1, 0.96), (0.03, 0.99, 0.69), (0.01, 0.88, 0.52)]
+)
+def test_the_least_is_at_the_truth_however_rare_light_is(share, best, worse):
+    """Docs/train/losses.md has these numbers. Weights of the half that judges are small where it is bright."""
     generator = torch.Generator().manual_seed(1)
     (_, errors), (image, own) = (render(generator, 4.0, share) for _ in range(2))
     zero, one = torch.zeros_like(image), torch.ones_like(image[:, :1])
     other = {"primal": image, "dx": zero, "dy": zero, "dx_se": zero, "dy_se": zero, "counts": one}
-    assert the_least(other | {"primal_se": errors}) == pytest.approx(1, abs=0.015)
-    if share < 0.1:
-        assert the_least(other | {"primal_se": own}) < 0.95
+    assert the_least(other | {"primal_se": errors}) == pytest.approx(best, abs=0.01)
+    assert the_least(other | {"primal_se": own}) == pytest.approx(worse, abs=0.01)
 
 
 def some_other(generator, size=8, **options):
