@@ -23,7 +23,7 @@ SMALL = Config(size=16, inputs=2, spp=(2, 4), scenes=1, crops=2, reference_spp=8
 
 def test_numbers_come_back_within_half_a_step(rng):
     image = (10.0 ** rng.uniform(-30, 30, (7, 9, 3)) * rng.choice([-1, 0, 1], (7, 9, 3))).astype(np.float32)
-    back = unpacked(packed(image), image.shape)
+    back = unpacked(packed(image), image.shape[:2])
     np.testing.assert_allclose(back, image, rtol=2 ** (0.5 / 64) - 1 + 1e-5)
     assert np.array_equal(back == 0, image == 0) and back.dtype == np.float32
 
@@ -32,14 +32,14 @@ def test_images_become_small():
     """Smooth light takes less than a byte for each number, and what is black next to nothing."""
     y, x = np.mgrid[:64, :64] / 64
     image = (0.2 + np.sin(3 * x + 2 * y)[..., None] ** 2 * (1, 0.8, 0.5)).astype(np.float32)
-    assert len(packed(image)) < image.size and len(packed(0 * image)) < 100
+    assert len(packed(image)) < 0.6 * image.size and len(packed(0 * image)) < 200
 
 
 def test_damage_is_named():
     data = packed(np.ones((4, 4, 3), np.float32))
     for bad in (data[:-3], data[::-1].copy(), packed(np.ones((4, 5, 3), np.float32))):
         with pytest.raises(NgptError, match=r"x\.safetensors: is damaged"):
-            unpacked(bad, (4, 4, 3), "x.safetensors")
+            unpacked(bad, (4, 4), "x.safetensors")
 
 
 def test_inputs_are_rendered_anew(renderer, tmp_path):
