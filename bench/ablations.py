@@ -26,7 +26,8 @@ from ngpt.network.weights import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
 from ngpt.training.cost import per_pixel
-from ngpt.training.examples import judges_of, open_crops, split
+from ngpt.training.examples import judges_of, split
+from ngpt.training.folders import open_crops
 from ngpt.training.settings import read_settings
 
 # What is changed of the configuration; the plain network has as many parameters.

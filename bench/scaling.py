@@ -17,7 +17,8 @@ import numpy as np
 from bench.common import metadata, save
 from bench.curves import read_curve
 from ngpt.errors import NgptError
-from ngpt.training.examples import open_crops, split
+from ngpt.training.examples import split
+from ngpt.training.folders import open_crops
 from ngpt.training.loss import make_loss
 from ngpt.training.settings import Settings, read_settings
 from ngpt.training.trainer import Trainer

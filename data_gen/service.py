@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,9 +89,16 @@ def inspect(name: str, parameters: dict[str, str]) -> dict[str, Any]:
     return inspect_scene(name, parameters)
 
 
-def stream(config: Path) -> Any:
+@contextmanager
+def stream(config: Path, kept: str = "") -> Iterator[Any]:
     from data_gen.dataset.config import read_config
-    from data_gen.dataset.jobs import processes
+    from data_gen.dataset.jobs import Pool
     from data_gen.dataset.stream import Stream
 
-    return Stream(read_config(config), processes(1))
+    # Training that is interrupted finishes its step, and may still ask for crops.
+    with Pool(1, interruptible=False) as worker, Stream(read_config(config), worker, kept=kept) as data:
+        try:
+            yield data
+        finally:
+            # What it is at would take minutes, and nobody is going to see it.
+            worker.end()

@@ -62,5 +62,8 @@ class Renderer(Protocol):
     def inspect(self, name: str, parameters: dict[str, str]) -> dict[str, Any]:
         """What a scene is made of and how it would be rendered."""
 
-    def stream(self, config: Path) -> Any:
-        """Crops of a dataset's configuration, rendered in another process while they are trained on."""
+    def stream(self, config: Path, kept: str = "") -> Any:
+        """To be entered: crops of a dataset's configuration, rendered in another process while they are trained on.
+
+        ``kept``  folder for its references, which are made once; "" makes new ones for ever
+        """

@@ -60,6 +60,11 @@ class View:
     def record(self) -> dict:
         return asdict(self)
 
+    @classmethod
+    def of(cls, record: dict) -> View:
+        """The view of a record."""
+        return cls(**{name: tuple(value) if isinstance(value, list) else value for name, value in record.items()})
+
 
 class Surroundings:
     """What rays find in a scene, and how large its inhabited part is."""

@@ -11,7 +11,7 @@ from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output
-from ngpt.training.dataset import Dataset, summary
+from ngpt.training.dataset import Crop, Dataset, summary
 
 CELLS = 24  # crops on the contact sheet, evenly chosen
 COLUMNS = 4  # each shows its noisiest input and its reference
@@ -31,16 +31,21 @@ def write_card(folder: Path) -> None:
 
 
 def contact_sheet(data: Dataset) -> np.ndarray:
-    """(H, W, 3) uint8: pairs of the noisiest input and the reference, at the reference's automatic exposure."""
+    """(H, W, 3) uint8: what is ``shown`` of some crops, at the automatic exposure of the second."""
     pairs = []
     for index in np.unique(np.linspace(0, len(data) - 1, min(CELLS, len(data))).astype(int)):
-        crop = data[int(index)]
-        stops = auto_exposure(crop.reference)
-        pair = [to_srgb8(image, stops) for image in (crop.stack(0)["primal"], crop.reference)]
+        images = shown(data[int(index)])
+        stops = auto_exposure(images[1])
+        pair = [to_srgb8(image, stops) for image in images]
         pairs.append(np.pad(np.hstack(pair), ((0, 4), (0, 4), (0, 0)), constant_values=32))
     while len(pairs) % COLUMNS:
         pairs.append(np.full_like(pairs[0], 32))
     return np.vstack([np.hstack(pairs[i : i + COLUMNS]) for i in range(0, len(pairs), COLUMNS)])
+
+
+def shown(crop: Crop) -> tuple[np.ndarray, np.ndarray]:
+    """The noisiest input and the reference, (H, W, 3) each; the two halves of a pair."""
+    return crop.stack(0)["primal"], crop.stack(1)["primal"] if crop.paired else crop.reference
 
 
 def card(data: Dataset, told: dict) -> str:
@@ -49,8 +54,17 @@ def card(data: Dataset, told: dict) -> str:
     failures = [(entry["scene"], failure) for entry in data.manifest["shards"] for failure in entry["failures"]]
     counts = np.array([n for crop in records for n in crop["spp"]])
     edges = 2 ** np.arange(int(np.log2(config["spp"][0])), int(np.log2(config["spp"][1])) + 2)
-    exposures = np.array([-auto_exposure(crop.reference) for crop in data])
+    exposures = np.array([-auto_exposure(shown(crop)[1]) for crop in data])
     shots = f"{told['shots']} shots of up to {config['frames']} frames: " if "shots" in told else ""
+    sampler = config.get("sampler", "gpt")
+    if config["reference_spp"]:
+        what = "the noisiest input and the reference"
+        how = (
+            f"References: {sampler} at {config['reference_spp']} samples per pixel, reconstructed by "
+            f"{config['reference_method']}."
+        )
+    else:
+        what, how = "halves", f"No references: the two inputs of a crop, by {sampler}, judge each other."
     lines = [
         "# Training set",
         "",
@@ -58,10 +72,9 @@ def card(data: Dataset, told: dict) -> str:
         f"({told['planned']} planned, {told['failed']} failed), {config['inputs']} inputs each; "
         f"{told['megabytes']} MB in {told['shards']} shards. Verify it by `ngpt info DIR`.",
         "",
-        f"References: {config.get('sampler', 'gpt')} at {config['reference_spp']} samples per pixel, reconstructed by "
-        f"{config['reference_method']}. Seed {config['seed']}.",
+        f"{how} Seed {config['seed']}.",
         "",
-        "![Pairs of the noisiest input and the reference](contact.png)",
+        f"![Pairs of {what}](contact.png)",
         "",
         "| samples per pixel | inputs |",
         "|---|---|",

@@ -54,7 +54,10 @@ class Config:
             (not 2 <= low <= high, f"spp = [{low}, {high}]: at least 2 (one sample has no variance), low to high"),
             (self.size < 8, f"size = {self.size}: at least 8 pixels"),
             (min(self.inputs, self.frames, self.crops, self.crops_per_shard) < 1, "counts must be at least 1"),
-            (self.reference_spp < 4, f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves"),
+            (
+                0 < self.reference_spp < 4 or self.reference_spp < 0,
+                f"reference_spp = {self.reference_spp}: at least 4, two for each of its halves; or 0, for pairs",
+            ),
             (self.reference_method not in METHODS, f"reference_method: no method '{self.reference_method}'"),
             (
                 bool(unknown),
@@ -75,6 +78,9 @@ class Config:
             check_options(name, options)
         if self.adaptive:
             self._check_adaptive()
+        if self.pairs:
+            self._check_pairs()
+            return
         if self.sampler == "auto":
             return
         if not find(self.sampler).gradients and "dx" in METHODS[self.reference_method].needs:
@@ -87,6 +93,24 @@ class Config:
     def options(self) -> dict[str, Any]:
         """Those of the sampler."""
         return self.samplers.get(self.sampler, {})
+
+    @property
+    def pairs(self) -> bool:
+        """Whether its crops have no reference, and two inputs of equally many samples that judge each other."""
+        return self.reference_spp == 0
+
+    def _check_pairs(self) -> None:
+        for bad, text in (
+            (self.inputs != 2, f"inputs = {self.inputs}: set inputs = 2, the halves that judge each other"),
+            (self.frames > 1, f"frames = {self.frames}: shots are learnt from references; leave it out"),
+            (self.adaptive > 0, f"adaptive = {self.adaptive:g}: halves are alike; leave it out"),
+            (
+                self.sampler != "auto" and not find(self.sampler).gradients,
+                f"sampler = '{self.sampler}': renders no gradients, and without them halves teach nothing; use 'gpt'",
+            ),
+        ):
+            if bad:
+                raise NgptError(f"data configuration: {text} (reference_spp = 0 asks for pairs)")
 
     def _check_adaptive(self) -> None:
         from data_gen.adaptive import LEAST  # It needs the renderer.
@@ -101,9 +125,12 @@ class Config:
             if bad:
                 raise NgptError(f"data configuration: adaptive = {self.adaptive:g}: {text}")
 
-    def plan(self) -> list[Job]:
-        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which."""
-        sources: list[tuple] = [(made_name(i), self.crops) for i in range(self.scenes)]
+    def plan(self, turn: int = 0) -> list[Job]:
+        """The shards to make. It depends on the configuration alone, so that n machines agree on who makes which.
+
+        ``turn``  of those who never end: from 1 on further procedural scenes, and further views of scene files
+        """
+        sources: list[tuple] = [(made_name(turn * self.scenes + i), self.crops) for i in range(self.scenes)]
         for source in self.files:
             paths = sorted(glob(source.pattern, recursive=True))
             if not paths:
@@ -114,17 +141,20 @@ class Config:
         names = [source[0] for source in sources]
         if len(set(names)) < len(names):
             raise NgptError("data configuration: two scene files have the same folder and name; rename one")
-        return [job for source in sources for job in self.scene_jobs(*source)]
+        return [job for source in sources for job in self._scene_jobs(turn, *source)]
 
-    def scene_jobs(
-        self, name: str, crops: int, path: str = "", parameters: dict[str, str] | None = None, box: list | None = None
+    def _scene_jobs(
+        self, turn: int, name: str, crops: int, path: str = "", parameters: dict | None = None, box: list | None = None
     ) -> list[Job]:
         """The shards of one scene."""
-        batches = [
-            tuple(range(first, min(first + self.crops_per_shard, crops)))
-            for first in range(0, crops, self.crops_per_shard)
-        ]
-        return [Job(name, i, batch, path, parameters or {}, box) for i, batch in enumerate(batches)]
+        starts = range(0, crops, self.crops_per_shard)
+        # Procedural scenes are others in each turn, and have all their crops in one.
+        turn = turn if path else 0
+        jobs = []
+        for i, start in enumerate(starts, turn * len(starts)):
+            batch = range(turn * crops + start, turn * crops + min(start + self.crops_per_shard, crops))
+            jobs.append(Job(name, i, tuple(batch), path, parameters or {}, box))
+        return jobs
 
 
 def made_name(number: int) -> str:

@@ -6,12 +6,14 @@ import tempfile
 import time
 import zlib
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
 from data_gen.backend import use_variant
 from data_gen.dataset.config import Config, Job
+from data_gen.dataset.kept import Again, Kept
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import merge
 from ngpt.methods import denoise
@@ -27,10 +29,11 @@ HALVES = 2
 LIT = 0.1  # the share of pixels of the first input that must have seen any light
 
 
-def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
+def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again | None = None) -> str:
     """Renders the crops of ``job`` and writes its shard into ``folder``; returns its name there.
 
     Runs in any process. The same config and job give the same bits. A crop that fails is recorded and left out.
+    ``again``  references that are there already, of which only inputs are rendered, with new noise
     """
     if (Path(folder) / job.file).exists():  # made by a worker that was lost before it said so
         return job.file
@@ -48,15 +51,20 @@ def make_shard(config: Config, job: Job, folder: str, variant: str) -> str:
         with tempfile.TemporaryDirectory(prefix="ngpt-scene-") as temporary:
             path = job.path or str(made_scene(config, job.scene, Path(temporary)))
             scene = load_scene(path, None, job.parameters, merged=config.frames == 1)
-        around = Surroundings(scene, job.box)
+        if again:
+            kept = Kept(Path(again.path))
+            makers = {crop: partial(make_inputs, config, scene, kept, i, again.seed) for crop, i in kept.places.items()}
+        else:
+            around = Surroundings(scene, job.box)
+            makers = {crop: partial(make_crop, config, around, job.scene, crop) for crop in job.crops}
     except (NgptError, RuntimeError) as error:
         stop_if_interrupted(error)
         record["failures"] = [{"crop": crop, "error": " ".join(str(error).split())} for crop in job.crops]
     else:
         record["scene_seconds"] = time.perf_counter() - start
-        for crop in job.crops:
+        for crop, make in makers.items():
             try:
-                made = make_crop(config, around, job.scene, crop)
+                made = make()
             except (NgptError, RuntimeError) as error:
                 stop_if_interrupted(error)
                 record["failures"].append({"crop": crop, "error": " ".join(str(error).split())})
@@ -83,8 +91,10 @@ def made_scene(config: Config, name: str, folder: Path) -> Path:
 
 
 def sample_counts(rng: np.random.Generator, config: Config) -> list[int]:
-    """K samples per pixel, log-uniform between the bounds, stratified, smallest first."""
+    """K samples per pixel, log-uniform between the bounds, stratified, smallest first; those of a pair are equal."""
     low, high = np.log(config.spp[0]), np.log(config.spp[1] + 1)
+    if config.pairs:
+        return 2 * [int(np.exp(low + rng.random() * (high - low)))]
     u = (rng.random() + np.arange(config.inputs)) / config.inputs
     return [int(n) for n in np.exp(low + u * (high - low))]
 
@@ -115,7 +125,7 @@ def render_input(config: Config, scene, spp: int, seed: int, uneven: bool) -> Gr
 
 
 def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropData, dict]]:
-    """One crop and its record, or one of each frame of a shot; ``around`` are the ``Surroundings`` of its scene."""
+    """One crop and its record, or one for each frame of a shot; ``around`` are the ``Surroundings`` of its scene."""
     from data_gen.dataset.cameras import find_view
     from data_gen.dataset.movement import Movement, random_movement
     from data_gen.frames.motion import motion_vectors, snapshot
@@ -150,7 +160,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 first = render_input(config, scene, counts[0], seeds[0], uneven[0])
             data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock)
             told = {"crop": crop, "view": movement.view_at(frame).record()} | told
-            told["seconds"]["camera"] = round(found, 4)
+            told["seconds"] = {part: round(value, 4) for part, value in (told["seconds"] | {"camera": found}).items()}
             if moving:
                 now = snapshot(scene, None if before is None or movement.shape else before.shapes)
                 motion = np.full((config.size, config.size, 2), np.nan, np.float32)
@@ -162,6 +172,23 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
         # Other crops of the scene find it as it was.
         movement.apply(scene, 0)
     return made
+
+
+def make_inputs(config: Config, scene, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
+    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``."""
+    from data_gen.dataset.cameras import View
+
+    told = kept.record["crops"][place]
+    rng = np.random.default_rng((*scene_seed(config, kept.record["scene"]), told["crop"], seed))
+    counts = sample_counts(rng, config)
+    seeds = [int(seed) for seed in rng.integers(0, 2**32, config.inputs)]
+    uneven = uneven_inputs(config, kept.record["scene"], told["crop"], counts)
+    clock = time.perf_counter()
+    View.of(told["view"]).apply(scene)
+    cleaned = [finite(render_input(config, scene, *each)) for each in zip(counts, seeds, uneven, strict=True)]
+    new = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
+    new["seconds"] = {"inputs": round(time.perf_counter() - clock, 4)}
+    return [(CropData([stack for stack, _ in cleaned], counts, *kept.images(place)), told | new)]
 
 
 def _seeds(rng: np.random.Generator, config: Config) -> list[int]:
@@ -184,6 +211,16 @@ def _crop(
     further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
     stacks = [first] + [render_input(config, scene, *each) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
+    cleaned = [finite(stack) for stack in stacks]
+    told = {
+        "spp": counts,
+        "seeds": seeds,
+        **({"adaptive": uneven} if config.adaptive else {}),
+        "repaired": [count for _, count in cleaned],
+        "seconds": seconds,
+    }
+    if config.pairs:
+        return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
     halves = [render_stack(scene, spp, seed, config.sampler, **config.options) for seed in seeds[-HALVES:]]
@@ -191,7 +228,6 @@ def _crop(
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]
     seconds["reference"] = time.perf_counter() - clock
-    cleaned = [finite(stack) for stack in stacks]
     direct = np.nan_to_num(converged["direct"], posinf=0)
     light = np.maximum(reference, direct)
     data = CropData(
@@ -202,13 +238,6 @@ def _crop(
         caustic,
         tuple(np.maximum(half, direct) for half in apart),
     )
-    told = {
-        "spp": counts,
-        "seeds": seeds,
-        **({"adaptive": uneven} if config.adaptive else {}),
-        "repaired": [count for _, count in cleaned],
-        "seconds": {part: round(value, 4) for part, value in seconds.items()},
-    }
     return data, told
 
 

@@ -35,11 +35,19 @@ class Serial(Executor):
 
 
 class Pool(ProcessPoolExecutor):
-    """``count`` worker processes that end with this one, however it ends, and at once when it is interrupted."""
+    """``count`` worker processes that end with this one, however it ends, and at once when it is interrupted.
 
-    def __init__(self, count: int):
+    ``interruptible``  whether Ctrl-C ends them at once; without, who uses them says when to ``end``
+    """
+
+    def __init__(self, count: int, interruptible: bool = True):
         # Spawned, since LLVM does not survive a fork.
-        super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent)
+        super().__init__(count, mp_context=get_context("spawn"), initializer=end_with_parent, initargs=(interruptible,))
+
+    def end(self) -> None:
+        """Ends the processes, whatever they are at."""
+        for process in tuple(self._processes.values()):
+            process.terminate()
 
     def __exit__(self, kind, *rest):
         if kind is not None and issubclass(kind, KeyboardInterrupt):

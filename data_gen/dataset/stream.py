@@ -4,7 +4,10 @@
         for step in ...:
             crop = data[rng.integers(len(data))]
 
-Scenes never run out: scene number n of the stream is the procedural scene number n of the configuration.
+Scenes never run out: after those of the configuration come others of their kind, and further views of scene files.
+
+With ``kept``, a folder, the references of the configuration are made once and kept there, small. Again and again they
+are met with new inputs, which take a third of the time, so that no noise is ever seen twice.
 """
 
 from __future__ import annotations
@@ -14,10 +17,14 @@ import threading
 from collections import deque
 from collections.abc import Iterator
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from itertools import count
 from pathlib import Path
 
-from data_gen.dataset.config import Config, made_name
+import numpy as np
+
+from data_gen.dataset.config import Config, Job
 from data_gen.dataset.crops import make_shard
+from data_gen.dataset.kept import Again, home, keep
 from ngpt.errors import NgptError
 from ngpt.training.dataset import Crop
 from ngpt.training.shards import Shard
@@ -28,13 +35,24 @@ class Stream:
 
     ``executor`` should have workers of its own (processes, a cluster); ``ahead`` shards are rendered at a time. A crop
     in hand stays readable after its shard has left the buffer. Entering waits for the first crops; what goes wrong in a
-    worker is raised as NgptError there and by every later access.
+    worker is raised as NgptError there and by every later access. Raises NgptError where shots or pairs are to be
+    ``kept``, a folder for references.
     """
 
     def __init__(
-        self, config: Config, executor: Executor, capacity: int = 1000, ahead: int = 2, variant: str = "llvm_ad_rgb"
+        self,
+        config: Config,
+        executor: Executor,
+        capacity: int = 1000,
+        ahead: int = 2,
+        variant: str = "llvm_ad_rgb",
+        kept: str | Path = "",
     ):
         self.config, self.executor, self.capacity, self.ahead, self.variant = config, executor, capacity, ahead, variant
+        if kept and config.frames > 1:
+            raise NgptError("references of shots cannot be kept without their inputs; leave data.kept out")
+        # Pairs have none.
+        self.kept = home(config, Path(kept)) if kept and not config.pairs else None
         self._crops: deque[Crop] = deque(maxlen=capacity)
         self._error: BaseException | None = None
         self._changed = threading.Condition()
@@ -78,19 +96,33 @@ class Stream:
         if self._error:
             raise NgptError(f"the stream of crops has stopped: {self._error}") from self._error
 
+    def _jobs(self) -> Iterator[tuple[Job, Again | None]]:
+        """What to render next, for ever: all scenes in turn, in an order that differs from run to run."""
+        rng = np.random.default_rng()
+        for turn in count():
+            plan = self.config.plan(0 if self.kept else turn)
+            for i in rng.permutation(len(plan)) if self.kept else range(len(plan)):
+                path = self.kept / plan[i].file if self.kept else None
+                there = path is not None and path.exists()
+                yield plan[i], Again(str(path), int(rng.integers(2**62))) if there else None
+
     def _feed(self) -> None:
-        number, running = 0, set()
+        jobs = self._jobs()
+        running: dict[Future, str] = {}
+        ahead = min(self.ahead, len(self.config.plan())) if self.kept else self.ahead
         try:
             while not self._stop.is_set():
-                while len(running) < self.ahead:
-                    for job in self.config.scene_jobs(made_name(number), self.config.crops):
-                        running.add(
-                            self.executor.submit(make_shard, self.config, job, self._temporary.name, self.variant)
+                while len(running) < ahead:
+                    job, again = next(jobs)
+                    # Two of one name would be one file.
+                    if job.file not in running.values():
+                        future = self.executor.submit(
+                            make_shard, self.config, job, self._temporary.name, self.variant, again
                         )
-                    number += 1
-                done, running = wait(running, timeout=0.5, return_when=FIRST_COMPLETED)
-                for future in done:
+                        running[future] = job.file
+                for future in wait(running, timeout=0.5, return_when=FIRST_COMPLETED).done:
                     self._take(future)
+                    del running[future]
         except BaseException as error:
             with self._changed:
                 self._error = error
@@ -103,6 +135,8 @@ class Stream:
     def _take(self, future: Future) -> None:
         path = Path(self._temporary.name) / future.result()
         shard = Shard(path, keep_open=True)
+        if self.kept and shard.names and not (kept := self.kept / future.result()).exists():
+            keep(shard, kept)
         told = shard.record["crops"]
         with self._changed:
             self._crops.extend(

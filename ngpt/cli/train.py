@@ -36,7 +36,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.system.parts import find_renderer
     from ngpt.training.cost import cost
     from ngpt.training.distributed import Processes
-    from ngpt.training.examples import Mixture, open_crops, split
+    from ngpt.training.examples import Mixture, split
+    from ngpt.training.folders import open_crops
     from ngpt.training.loss import make_loss
     from ngpt.training.settings import read_settings
     from ngpt.training.trainer import Trainer, show
@@ -71,10 +72,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
         on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
         crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
         made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
-        streams = [stack.enter_context(find_renderer().stream(config)) for config in made]
-        training = Mixture(crops, *streams)
-        # What is read from a stream is replaced: it must not be kept.
-        trainer = Trainer(settings, training, held_out, loss, out, processes, cache=not streams, say=say)
+        streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
+        trainer = Trainer(settings, Mixture(crops, *streams), held_out, loss, out, processes, say=say)
         if trainer.checkpoint.exists():
             trainer.resume()
             if trainer.step >= settings.run.steps:

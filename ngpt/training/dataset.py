@@ -31,6 +31,7 @@ from ngpt.training.shards import (
     OF_INPUTS,
     REFERENCE_CAUSTIC,
     REFERENCE_HALVES,
+    REFERENCES,
     SAMPLES,
     SPLIT,
     Shard,
@@ -63,6 +64,11 @@ class Crop:
         """The number of inputs."""
         return len(self.spp)
 
+    @property
+    def paired(self) -> bool:
+        """Whether it has no reference, but two inputs of equally many samples that judge each other."""
+        return REFERENCES[0] not in self.shard.names
+
     def stack(self, k: int) -> GradientStack:
         """Input ``k``, all layers of a rendered stack, with gradients if its sampler has them; all values finite.
 
@@ -85,7 +91,11 @@ class Crop:
 
     @property
     def reference(self) -> np.ndarray:
-        """(H, W, 3) float32, the converged image, emission seen directly included."""
+        """(H, W, 3) float32, the converged image, emission seen directly included; raises NgptError for a pair."""
+        if self.paired:
+            raise NgptError(
+                f"{self.shard.path}: crop {self.index} is a pair: it has no reference, its inputs are halves"
+            )
         return self.shard.crop("reference_indirect", self.index) + self.reference_direct + self.reference_caustic
 
     @property
@@ -205,6 +215,10 @@ def problems(folder: Path) -> list[str]:
             bad = int(np.sum(~np.isfinite(shard.tensor(name))))
             if bad:
                 found.append(f"{shard.path}: tensor '{name}' has {bad} values that are not finite")
+        if entry["crops"] and REFERENCES[0] not in shard.names:
+            one, other = shard.tensor("indirect").swapaxes(0, 1)
+            for crop in np.flatnonzero((one == other).all(axis=(1, 2, 3))):
+                found.append(f"{shard.path}: both halves of crop {crop} are the same: nothing is learnt from them")
     listed = {entry["file"] for entry in manifest["shards"]}
     on_disk = {path.relative_to(folder).as_posix() for path in (folder / "shards").glob("[!.]*.safetensors")}
     found += [f"{folder / name}: is not in the manifest; run `ngpt dataset` again" for name in sorted(on_disk - listed)]
@@ -226,7 +240,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
         return shard
     gradients, caustic = (not tensors.keys().isdisjoint(shard.names) for tensors in (GRADIENTS, CAUSTIC))
     optional = (REFERENCE_HALVES, MOTION, *SAMPLES, *SPLIT)
-    names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names])
+    pairs = set(REFERENCES).isdisjoint(shard.names)
+    names = tensor_names(gradients, caustic, [name for name in optional if name in shard.names], pairs=pairs)
     missing = [name for name in names if name not in shard.names]
     if missing:
         raise NgptError(f"{path}: tensors {', '.join(missing)} are missing")
@@ -234,6 +249,8 @@ def _checked(path: Path, entry: dict[str, Any]) -> Shard:
     if len(shape) != 5 or 0 in shape or any(len(crop["spp"]) != shape[1] for crop in crops):
         raise NgptError(f"{path}: tensor 'indirect' is {shape}, and its crops have {len(crops[0]['spp'])} inputs")
     inputs, height, width = shape[1:4]
+    if pairs and not (inputs == 2 and gradients):
+        raise NgptError(f"{path}: has no references, so its crops must be pairs: 2 inputs with gradients, not {inputs}")
     for name in names:
         expected: tuple[int, ...] = (len(crops), height, width, 3)
         if name == "spp":
@@ -264,6 +281,7 @@ def summary(folder: Path) -> dict[str, Any]:
         "training set": str(folder),
         **({"shots": len(data.shots)} if data.shots else {}),
         "crops": len(data),
+        **({"pairs": len(data)} if data.manifest["config"].get("reference_spp") == 0 else {}),
         "planned": data.manifest["planned"],
         "failed": sum(len(entry["failures"]) for entry in entries),
         "scenes": len(data.scenes),

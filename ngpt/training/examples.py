@@ -1,39 +1,38 @@
 """Training examples from crops: datasets on disk, folders of stacks with references, or anything alike."""
 
-from collections.abc import Iterable, Sequence
-from pathlib import Path
+import copy
+from collections import OrderedDict
+from collections.abc import Sequence
 from typing import Any, Protocol
 
 import numpy as np
 import torch
 from torch.utils.data import Dataset as TorchDataset
 
-from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
 from ngpt.network import features, padding
 from ngpt.network.model import ModelConfig
 from ngpt.network.run_torch import layers_of
-from ngpt.repair import repair
+from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
 from ngpt.training.augment import Augmentation, Layers, quieter, rarer
 
+# What the names of layers begin with that judge one half of a pair.
+OTHER = "other/"
 # Padding varies by up to this around ``padding.MARGIN``, so that networks do not learn where borders are.
 JITTER = 7
 
 
-def read(path: str) -> GradientStack:
-    """The stack in a file. Training sets need no OpenEXR: it comes in with the first file that does."""
-    from ngpt.io import exr
-
-    return exr.read(path)
-
-
 class Crop(Protocol):
-    """One view with a reference and several inputs; what ``ngpt.training.dataset`` gives, and ``StackFolder``."""
+    """One view with a reference and several inputs; what ``ngpt.training.dataset`` gives, and ``StackFolder``.
+
+    Of what has no reference, only ``paired`` is asked, and its two stacks.
+    """
 
     scene: str
     inputs: int
     spp: tuple[int, ...]
+    paired: bool
 
     def stack(self, k: int) -> GradientStack: ...
 
@@ -48,105 +47,6 @@ class Crop(Protocol):
 
     @property
     def reference_halves(self) -> tuple[np.ndarray, ...]: ...
-
-
-class StackCrop:
-    """The stacks of one folder and the reference they share."""
-
-    reference_halves = ()
-
-    def __init__(self, folder: Path, stacks: list[Path], reference: Path):
-        self.scene, self.inputs = folder.name, len(stacks)
-        self._stacks, self._reference = stacks, reference
-        held = [read(str(path)) for path in stacks]
-        self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
-        self._caustic = ["caustic" in stack for stack in held]
-        self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
-
-    def stack(self, k: int) -> GradientStack:
-        return read(str(self._stacks[k]))
-
-    @property
-    def reference(self) -> np.ndarray:
-        return read(str(self._reference))["primal"]
-
-    @property
-    def reference_direct(self) -> np.ndarray:
-        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
-        most = self._stacks[int(np.argmax(self.spp))]
-        for path in (self._reference, most):
-            stack = read(str(path))
-            if "direct" in stack:
-                return stack["direct"]
-        return np.zeros_like(stack["primal"])
-
-    @property
-    def reference_caustic(self) -> np.ndarray:
-        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
-
-        Raises NgptError if only some of the stacks have it.
-        """
-        reference = read(str(self._reference))
-        if all(self._caustic) and "caustic" in reference:
-            return reference["caustic"]
-        if not self._lit:
-            return np.zeros_like(reference["primal"])
-        if not all(self._caustic):
-            raise NgptError(
-                f"{self._stacks[self._caustic.index(False)]}: has no layer 'caustic', but other stacks of {self.scene} "
-                "have: their gradients hold nothing of that light, so they have no target in common; render all alike"
-            )
-        stacks = [read(str(path)) for path in self._stacks]
-        shares = np.divide(self.spp, sum(self.spp)) if all(self.spp) else np.full(len(stacks), 1 / len(stacks))
-        light = sum(share * stack["caustic"] for share, stack in zip(shares, stacks, strict=True))
-        layers = {"caustic": light, "primal": reference["primal"]}
-        if all("caustic_var" in stack for stack in stacks):
-            noise = [share**2 * stack["caustic_var"] for share, stack in zip(shares, stacks, strict=True)]
-            layers["caustic_var"] = np.sum(noise, axis=0)
-        features = {name: stacks[0][name] for name in ("albedo", "normal", "depth") if name in stacks[0]}
-        return caustic.denoised(repair(GradientStack(layers | features)))
-
-
-class StackFolder(Sequence[StackCrop]):
-    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
-
-    Raises NgptError where a folder has stacks without a reference, or sizes differ.
-    """
-
-    def __init__(self, folder: str | Path):
-        self._crops = []
-        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
-            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
-            reference = view / "reference.exr"
-            if not stacks:
-                continue
-            if not reference.is_file():
-                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
-            self._crops.append(StackCrop(view, stacks, reference))
-        if not self._crops:
-            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
-
-    def __len__(self) -> int:
-        return len(self._crops)
-
-    def __getitem__(self, index):  # type: ignore[no-untyped-def]
-        return self._crops[index]
-
-    @property
-    def scenes(self) -> tuple[str, ...]:
-        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
-
-
-def open_crops(folder: str | Path) -> Iterable[Any]:
-    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
-    path = Path(folder)
-    if not path.is_dir():
-        raise NgptError(f"{folder}: no such folder; make a training set: ngpt dataset --config ... --out {folder}")
-    if (path / "manifest.json").is_file():
-        from ngpt.training.dataset import Dataset
-
-        return Dataset(path)
-    return StackFolder(path)
 
 
 class Mixture(Sequence[Any]):
@@ -173,6 +73,10 @@ class Examples(TorchDataset):
     augmented and padded: a dict of layers (C, size + 16, size + 16) and the "target" (3, size - 14, size - 14) for the
     middle of that, where no padding is whatever its jitter [NGPT's code]. Crops larger than ``size`` are cut at random.
     What was read and prepared once is kept in memory, up to ``cache`` bytes.
+
+    Of a pair the input is one half, and in place of the target there is the ``other``: what ``ngpt.training.halves``
+    judges by, names beginning with "other/". Where there are pairs and crops with references, the share ``pairs`` of
+    the examples are pairs.
     """
 
     def __init__(
@@ -183,12 +87,17 @@ class Examples(TorchDataset):
         size: int,
         seed: int,
         cache: int = 0,
+        pairs: float = 0.5,
     ):
+        kinds = {crop.paired for crop in crops}
+        self.pairs = pairs if len(kinds) > 1 else None
+        if True in kinds and not config.reads_gradients:
+            raise NgptError("pairs teach by gradients, and the network reads none; train it on crops with references")
         self.crops, self.config, self.augmentation, self.size, self.seed = crops, config, augmentation, size, seed
         # What makes an input of a crop that was not rendered.
         made = {self._quieter: augmentation.quieter, self._rarer: augmentation.rarer}
         self._made = [make for make, asked in made.items() if asked]
-        self._cache: dict[tuple[int, int], Layers] = {}
+        self._cache: OrderedDict[tuple[Crop, int], tuple[Layers, Layers]] = OrderedDict()
         self._free = cache
 
     def __len__(self) -> int:
@@ -196,53 +105,105 @@ class Examples(TorchDataset):
 
     def __getitem__(self, index: int) -> Layers:
         rng = np.random.default_rng((self.seed, index))
-        # Uniform over crops, whatever the number of their inputs.
-        which = int(rng.integers(len(self.crops)))
-        crop = self.crops[which]
-        k = int(rng.integers(crop.inputs + len(self._made)))
-        layers = self.augmentation(_scaled(self._cut(self._layers(which, k), rng)), rng)
+        which, crop = self._drawn(rng)
+        k = int(rng.integers(crop.inputs + (0 if crop.paired else len(self._made))))
+        parts = _scaled(*self._cut(*self._layers(which, crop, k), rng))
+        # What judges an input goes through the same as the input.
+        same = copy.deepcopy(rng)
+        layers, judge = self.augmentation(parts[0], rng), self.augmentation(parts[1], same)
         layers = features.completed(layers, self.config.inputs)
         top, left = (padding.MARGIN + int(rng.integers(-JITTER, JITTER + 1)) for _ in range(2))
-        padded = padding.pad(layers, (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left))
+        pads = (top, 2 * padding.MARGIN - top, left, 2 * padding.MARGIN - left)
         edge = padding.MARGIN + JITTER
-        padded["target"] = padded["target"][..., edge:-edge, edge:-edge]
-        return {name: layer.contiguous() for name, layer in padded.items()}
+        inside = {name: layer[..., edge:-edge, edge:-edge] for name, layer in padding.pad(judge, pads).items()}
+        if crop.paired:
+            inside = {f"{OTHER}{name}": layer for name, layer in inside.items()}
+        return {name: layer.contiguous() for name, layer in (padding.pad(layers, pads) | inside).items()}
 
-    def _layers(self, which: int, k: int) -> Layers:
-        if (which, k) in self._cache:
-            return self._cache[which, k]
-        crop = self.crops[which]
-        stack = crop.stack(k) if k < crop.inputs else self._made[k - crop.inputs](which)
-        layers = layers_of(repair(stack, self.config.reads_gradients), self.config)
-        target = target_of(crop, self.config).transpose(2, 0, 1)
-        layers["target"] = torch.from_numpy(np.ascontiguousarray(target))
-        size = sum(layer.numel() * layer.element_size() for layer in layers.values())
-        if size <= self._free:
-            self._cache[which, k], self._free = layers, self._free - size
-        return layers
+    def _drawn(self, rng: np.random.Generator) -> tuple[int, Crop]:
+        """A crop, uniform over those of its kind, whatever the number of their inputs."""
+        paired = None if self.pairs is None else bool(rng.random() < self.pairs)
+        while True:
+            which = int(rng.integers(len(self.crops)))
+            crop = self.crops[which]
+            if paired in (None, crop.paired):
+                return which, crop
 
-    def _quieter(self, which: int) -> GradientStack:
+    def _layers(self, which: int, crop: Crop, k: int) -> tuple[Layers, Layers]:
+        """Input ``k`` of a crop, and what it is judged by: the "target", or the other half."""
+        if (crop, k) in self._cache:
+            self._cache.move_to_end((crop, k))
+            return self._cache[crop, k]
+        stack = crop.stack(k) if k < crop.inputs else self._made[k - crop.inputs](which, crop)
+        data = repair(stack, self.config.reads_gradients)
+        layers = layers_of(data, self.config)
+        if crop.paired:
+            judge = _tensors(other_half(data, crop.stack(1 - k)))
+        else:
+            judge = _tensors({"target": target_of(crop, self.config)})
+        self._cache[crop, k] = layers, judge
+        self._free -= _bytes(layers, judge)
+        while self._free < 0:
+            # The one that nobody asked for in the longest time: of a stream, a crop that is gone.
+            self._free += _bytes(*self._cache.popitem(last=False)[1])
+        return layers, judge
+
+    def _quieter(self, which: int, crop: Crop) -> GradientStack:
         """The input of that crop with most samples, as of many more."""
-        crop = self.crops[which]
         low, high = np.log(self.augmentation.quieter)
         factor = float(np.exp(np.random.default_rng((self.seed, which)).uniform(low, high)))
         best = crop.stack(int(np.argmax(crop.spp)))
         return quieter(best, crop.reference, crop.reference_direct, crop.reference_caustic, factor)
 
-    def _rarer(self, which: int) -> GradientStack:
+    def _rarer(self, which: int, crop: Crop) -> GradientStack:
         """The input of that crop with most samples, as of light that is harder to find."""
-        crop, rng = self.crops[which], np.random.default_rng((self.seed, which, 1))
+        rng = np.random.default_rng((self.seed, which, 1))
         k = float(np.exp(rng.uniform(*np.log(self.augmentation.rarer))))
         return rarer(crop.stack(int(np.argmax(crop.spp))), k, float(rng.uniform(0.5, 1)), rng)
 
-    def _cut(self, layers: Layers, rng: np.random.Generator) -> Layers:
+    def _cut(self, layers: Layers, judge: Layers, rng: np.random.Generator) -> tuple[Layers, ...]:
         height, width = layers["primal"].shape[-2:]
         if height < self.size or width < self.size:
             raise NgptError(
                 f"a crop is {width}x{height}, smaller than the {self.size} pixels of an example; lower data.crop"
             )
         y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
-        return {name: layer[..., y : y + self.size, x : x + self.size] for name, layer in layers.items()}
+        window = np.s_[..., y : y + self.size, x : x + self.size]
+        return tuple({name: layer[window] for name, layer in part.items()} for part in (layers, judge))
+
+
+def collated(examples: Sequence[Layers]) -> Layers:
+    """A batch: layers stacked, those with a "target" first, so that what judges stands in the order of the inputs."""
+    ordered = sorted(examples, key=lambda example: "target" not in example)
+    names = dict.fromkeys(name for example in ordered for name in example)
+    return {name: torch.stack([example[name] for example in ordered if name in example]) for name in names}
+
+
+def other_half(data: Repaired, other: GradientStack) -> dict[str, np.ndarray]:
+    """What ``ngpt.training.halves`` judges the half ``data`` by, arrays (H, W, C); ``other`` is the other half.
+
+    Raises NgptError where both are the same, and where one lacks gradients or their variances.
+    """
+    theirs = repair(other)
+    if data.variances is None or theirs.dx is None:
+        raise NgptError(f"{other.path}: one half lacks gradients or their variances, without which pairs teach nothing")
+    if np.array_equal(data.image, theirs.image):
+        raise NgptError(f"{other.path}: both halves are the same, so noise would be learnt; render them by other seeds")
+    known = [np.isfinite(variance).all(axis=-1) for variance in data.variances]
+    errors = (np.sqrt(np.where(k[..., None], v, 0)) for k, v in zip(known, data.variances, strict=True))
+    # Where lamps are seen, the variance of the light beside them is not known.
+    counts = known[0] & ~theirs.direct.any(axis=-1)
+    layers = {"primal": theirs.image, "dx": theirs.dx, "dy": theirs.dy}
+    layers |= dict(zip(("primal_se", "dx_se", "dy_se"), errors, strict=True))
+    return layers | {"counts": counts[..., None].astype(np.float32)}
+
+
+def _bytes(*parts: Layers) -> int:
+    return sum(layer.numel() * layer.element_size() for part in parts for layer in part.values())
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> Layers:
+    return {name: torch.from_numpy(np.ascontiguousarray(array.transpose(2, 0, 1))) for name, array in arrays.items()}
 
 
 def judges_of(crop: Crop, config: ModelConfig) -> tuple[np.ndarray, ...]:
@@ -264,15 +225,19 @@ def target_of(crop: Crop, config: ModelConfig) -> np.ndarray:
     return target - crop.reference_caustic if config.reads_gradients else target
 
 
-def _scaled(layers: Layers) -> Layers:
-    batch = {name: layer[None] for name, layer in layers.items()}
-    target = batch.pop("target")
-    scaled, exposure = features.normalised(batch)
-    return {name: layer[0] for name, layer in (scaled | {"target": target / exposure}).items()}
+def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
+    """Both over the exposure of the first."""
+    scaled, exposure = features.normalised({name: layer[None] for name, layer in layers.items()})
+    light = features.RADIANCE | {"target"}
+    return {name: layer[0] for name, layer in scaled.items()}, {
+        name: layer / exposure[0] if name in light else layer for name, layer in judge.items()
+    }
 
 
 def split(crops: Sequence[Any], validation: tuple[str, ...]) -> tuple[list[Any], list[Any]]:
     """Training and validation crops; whole scenes of which the name starts with one of ``validation`` are kept out.
+
+    Pairs of these are in neither: they have no reference to measure by.
 
     Raises NgptError for a name that no scene starts with: such a run would be judged by nothing, or by less than asked.
     """
@@ -286,5 +251,5 @@ def split(crops: Sequence[Any], validation: tuple[str, ...]) -> tuple[list[Any],
             )
     held = [crop.scene.startswith(tuple(validation)) if validation else False for crop in crops]
     return [c for c, out in zip(crops, held, strict=True) if not out], [
-        c for c, out in zip(crops, held, strict=True) if out
+        c for c, out in zip(crops, held, strict=True) if out and not c.paired
     ]

@@ -12,6 +12,7 @@ from ngpt.measure.distances import perceptual
 from ngpt.measure.distances.perceptual import PerceptualDistance
 from ngpt.system.records import from_table
 from ngpt.training import pixelwise
+from ngpt.training.halves import halves
 
 KINDS = (*perceptual.KINDS, "l1")
 
@@ -26,6 +27,7 @@ class LossSettings:
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
                      weights of the pixelwise parts; NGPT has 0.01, 0.01, 0, 0, 0, 0, 0
+    ``halves``       weight of the loss of pairs, ``ngpt.training.halves``; 0.25 pulls like those of combine.toml
     ``backbone``, ``weights``  files of E-LPIPS (docs/train/losses.md); "" looks for the backbone in PyTorch's cache
     """
 
@@ -39,6 +41,7 @@ class LossSettings:
     huber: float = 0.0
     pyramid: float = 0.0
     flip: float = 0.0
+    halves: float = 0.25
     backbone: str = ""
     weights: str = ""
 
@@ -46,7 +49,9 @@ class LossSettings:
 class Loss:
     """Call it with prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
 
-    Returns the weighted sum and its parts, by name, before weighting.
+    ``other``  of the last predictions, which have no target: what judges them, see ``ngpt.training.halves``
+
+    Returns the weighted sum, a mean over the predictions, and its parts, by name, before weighting.
     """
 
     def __init__(self, settings: LossSettings):
@@ -58,6 +63,24 @@ class Loss:
             )
 
     def __call__(
+        self,
+        prediction: Tensor,
+        target: Tensor | None,
+        generator: torch.Generator,
+        other: dict[str, Tensor] | None = None,
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        count = 0 if target is None else len(target)
+        parts: dict[str, Tensor] = {}
+        total = prediction.new_zeros(())
+        if target is not None:
+            total, parts = self._by_reference(prediction[:count], target, generator)
+        if other:
+            parts["halves"] = halves(prediction[count:], other)
+            share = count / len(prediction)
+            total = share * total + (1 - share) * self.settings.halves * parts["halves"]
+        return total, parts
+
+    def _by_reference(
         self, prediction: Tensor, target: Tensor, generator: torch.Generator
     ) -> tuple[Tensor, dict[str, Tensor]]:
         s, parts = self.settings, {}

@@ -20,6 +20,9 @@ class DataSettings:
     ``folders``     datasets (``python -m data_gen``) or folders of stacks with references; all are mixed
     ``validation``  beginnings of the names of scenes that are kept out of training
     ``crop``        pixels of an example's side
+    ``pairs``       share of the examples that have no reference but another half, where there are both kinds
+    ``kept``        folder for references of sets that are rendered while the network trains: made once, they are met
+                    again with inputs of new noise. "" renders new ones for ever
     ``workers``     processes that prepare examples; 0 prepares them in between
     ``cache``       MiB of memory, for each of these, to keep what was prepared in
     """
@@ -27,6 +30,8 @@ class DataSettings:
     folders: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
     crop: int = 128
+    pairs: float = 0.5
+    kept: str = ""
     workers: int = 0
     cache: int = 2048
 
@@ -148,6 +153,8 @@ def _check(settings: Settings, path: str) -> None:
     for name in ("steps", "batch", "log", "save", "validate"):
         if getattr(settings.run, name) < 1:
             raise NgptError(f"{path}: run.{name} = {getattr(settings.run, name)}: must be at least 1")
+    if not 0 < settings.data.pairs < 1:
+        raise NgptError(f"{path}: data.pairs = {settings.data.pairs}: must be a share between 0 and 1")
     if not 0 <= settings.optimizer.ema < 1:
         raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
 

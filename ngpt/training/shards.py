@@ -16,6 +16,8 @@ Tensors, N crops of K inputs each, (N, K, H, W, C) unless said otherwise, scene-
     motion                      (N, H, W, 2), optional: the layer of that name, floats, ``FAR`` where it is not known
     spp                         (N, K) samples per pixel, int32
 
+Pairs, K = 2 inputs that judge each other, have none of the references.
+
 Shots are crops too, one for each frame, in their order; the records of crops number the frames.
 
 A tensor is of half floats where that loses at most ``MAX_LOSS`` of it, measured crop by crop, and of floats elsewhere.
@@ -56,7 +58,7 @@ MOTION = "motion"
 FAR = 1e6
 
 # Types of numbers in safetensors
-_TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "I32": np.int32, "I64": np.int64}
+_TYPES = {"F16": np.float16, "F32": np.float32, "F64": np.float64, "U8": np.uint8, "I32": np.int32, "I64": np.int64}
 
 # Share of the sum of absolute values that conversion to half floats may change; rounding alone takes about 1.8e-4.
 MAX_LOSS = 1e-3
@@ -64,7 +66,7 @@ MAX_LOSS = 1e-3
 
 @dataclass(frozen=True)
 class CropData:
-    """One crop as it was rendered: K finite stacks, and the converged image.
+    """One crop as it was rendered: K finite stacks, and the converged image; None of a pair, which has no references.
 
     ``reference`` is all of it, ``reference_direct`` the emission seen directly in it, and ``reference_caustic`` what
     the layer ``caustic`` of the stacks estimates; None where they have no such layer. ``halves`` are two independent
@@ -74,8 +76,8 @@ class CropData:
 
     stacks: Sequence[GradientStack]
     spp: Sequence[int]
-    reference: np.ndarray
-    reference_direct: np.ndarray
+    reference: np.ndarray | None = None
+    reference_direct: np.ndarray | None = None
     reference_caustic: np.ndarray | None = None
     halves: tuple[np.ndarray, ...] = ()
     motion: np.ndarray | None = None
@@ -83,6 +85,9 @@ class CropData:
     def tensors(self) -> dict[str, np.ndarray]:
         inputs = [_input_tensors(stack) for stack in self.stacks]
         tensors = {name: np.stack([i[name] for i in inputs]) for name in inputs[0]}
+        tensors["spp"] = np.array(self.spp, np.int32)
+        if self.reference is None or self.reference_direct is None:
+            return tensors
         tensors["reference_indirect"] = self.reference - self.reference_direct
         tensors["reference_direct"] = self.reference_direct
         if self.reference_caustic is not None:
@@ -92,14 +97,18 @@ class CropData:
             tensors[REFERENCE_HALVES] = np.stack(self.halves) - self.reference_direct
         if self.motion is not None:
             tensors[MOTION] = np.where(np.abs(self.motion) < FAR, self.motion, FAR).astype(np.float32)
-        tensors["spp"] = np.array(self.spp, np.int32)
         return tensors
 
 
-def tensor_names(gradients: bool, caustic: bool = False, further: Sequence[str] = ()) -> tuple[str, ...]:
-    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and others."""
-    further = (*((*CAUSTIC, REFERENCE_CAUSTIC) if caustic else ()), *further)
-    return (*INPUTS, *(GRADIENTS if gradients else ()), *further, *REFERENCES, "spp")
+def tensor_names(
+    gradients: bool, caustic: bool = False, further: Sequence[str] = (), *, pairs: bool = False
+) -> tuple[str, ...]:
+    """The tensors of a shard whose inputs have gradients, or have none; the layer ``caustic``, or not; and others.
+
+    ``pairs``  whether it holds pairs, which have no references
+    """
+    references = () if pairs else (*((REFERENCE_CAUSTIC,) if caustic else ()), *REFERENCES)
+    return (*INPUTS, *(GRADIENTS if gradients else ()), *(CAUSTIC if caustic else ()), *further, *references, "spp")
 
 
 def _input_tensors(stack: GradientStack) -> dict[str, np.ndarray]:
@@ -142,6 +151,8 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     for name, tensor in tensors.items():
         if not np.isfinite(tensor).all():
             raise NgptError(f"{path}: tensor '{name}' has {np.sum(~np.isfinite(tensor))} values that are not finite")
+    # Of arrays in another order of memory safetensors writes the bytes as they lie there.
+    tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
     try:
         with atomic_output(path) as temporary:

@@ -27,13 +27,13 @@ from ngpt.system.console import print_line
 from ngpt.system.files import atomic_output
 from ngpt.system.records import check
 from ngpt.training.distributed import Processes
-from ngpt.training.examples import JITTER, Examples
+from ngpt.training.examples import JITTER, OTHER, Examples, collated
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
 from ngpt.training.settings import Settings, changed, from_dict
 from ngpt.training.validation import validate, views
 from ngpt.version import __version__
 
-Loss = Callable[[Tensor, Tensor, torch.Generator], tuple[Tensor, dict[str, Tensor]]]
+Loss = Callable[..., tuple[Tensor, dict[str, Tensor]]]
 
 # Logarithms beyond this are cut before exp: 4.9e8 times the typical radiance, far above anything one wants to learn.
 LIMIT = 20.0
@@ -48,9 +48,10 @@ class Trainer:
     """One run in the folder ``out``, new or continued.
 
     ``crops`` and ``held_out`` are for training and validation, ``loss`` takes scene-linear prediction and target
-    (N, 3, H, W) and a generator of the step's random numbers. Files in ``out``: ``checkpoint.safetensors``,
-    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``. ``cache`` keeps
-    what was read in memory: crops must stay what they are. Where they do not, as in a stream, no two runs are alike.
+    (N, 3, H, W) and a generator of the step's random numbers; where there are pairs, what judges them too, and the
+    target is that of the others, None without. Files in ``out``: ``checkpoint.safetensors``,
+    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``.
+    Where crops are rendered meanwhile, as in a stream, no two runs are alike.
     """
 
     def __init__(
@@ -62,7 +63,6 @@ class Trainer:
         out: str | Path,
         processes: Processes | None = None,
         say: Callable[[str], None] = show,
-        cache: bool = True,
     ):
         if not len(crops):
             raise NgptError("no crops to train on: data.folders is empty, or data.validation holds out every scene")
@@ -83,7 +83,8 @@ class Trainer:
             settings.augmentation,
             settings.data.crop,
             settings.run.seed,
-            settings.data.cache << 20 if cache else 0,
+            settings.data.cache << 20,
+            settings.data.pairs,
         )
         if (settings.data.crop + 2 * padding.MARGIN) % self.model.alignment:
             raise NgptError(
@@ -201,20 +202,23 @@ class Trainer:
         self.model.train()
         run, settings = self.settings.run, self.settings.optimizer
         batch = {name: layer.to(self.device, non_blocking=True) for name, layer in batch.items()}
-        target = batch.pop("target")
+        target = batch.pop("target", None)
+        other = {name.removeprefix(OTHER): batch.pop(name) for name in list(batch) if name.startswith(OTHER)}
         generator = torch.Generator(self.device)
         generator.manual_seed(weights.random_state(run.seed, self.step * self.processes.count + self.processes.rank))
         with torch.autocast(self.device.type, torch.bfloat16, enabled=run.precision == "bfloat16"):
             logarithm = self.model.predict(batch)
         edge = padding.MARGIN + JITTER
         prediction = signed_exp(logarithm[..., edge:-edge, edge:-edge].clamp(-LIMIT, LIMIT))
-        total, parts = self.loss(prediction, target, generator)
+        total, parts = self.loss(prediction, target, generator, *([other] if other else []))
         self.optimizer.zero_grad(set_to_none=True)
         total.backward()
         self.processes.average_gradients(self.model)
         norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip or math.inf)
         if not torch.isfinite(total) or not torch.isfinite(norm):
-            self._give_up(batch | {"target": target}, float(total.detach()), float(norm))
+            judges = {f"{OTHER}{name}": layer for name, layer in other.items()}
+            judges |= {} if target is None else {"target": target}
+            self._give_up(batch | judges, float(total.detach()), float(norm))
         rate = learning_rate(settings, self.step, run.steps)
         for group in self.optimizer.param_groups:
             group["lr"] = rate
@@ -237,6 +241,7 @@ class Trainer:
         yield from DataLoader(
             self.examples,
             batch_sampler=indices,  # type: ignore[arg-type]
+            collate_fn=collated,
             num_workers=workers,
             persistent_workers=bool(workers),
             pin_memory=self.device.type == "cuda",

@@ -278,6 +278,7 @@ class MadeCrop:
     scene = "made"
     spp = (4, 32)
     inputs = 2
+    paired = False
 
     def stack(self, k: int):
         return made_stack(48, self.seed, k, self.spp[k])

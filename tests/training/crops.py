@@ -11,6 +11,7 @@ class SyntheticCrop:
 
     inputs = 2
     spp = (4, 32)
+    paired = False
 
     def __init__(self, scene: str, seed: int, size: int = 32):
         rng = np.random.default_rng(seed)

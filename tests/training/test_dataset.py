@@ -305,3 +305,34 @@ def test_bad_manifests(tmp_path, text, message):
         (tmp_path / "manifest.json").write_text(text)
     with pytest.raises(NgptError, match=message):
         Dataset(tmp_path)
+
+
+def test_arrays_in_any_order_of_memory(tmp_path, rng):
+    crop = crop_data(rng)
+    turned = np.ascontiguousarray(crop.reference_direct.transpose(2, 0, 1)).transpose(1, 2, 0)
+    told = CropData(crop.stacks, crop.spp, crop.reference, turned)
+    write_shard(tmp_path / "a.safetensors", [told], {"scene": "a"})
+    read = Crop(Shard(tmp_path / "a.safetensors"), 0, "a", (2, 9))
+    np.testing.assert_allclose(read.reference_direct, crop.reference_direct, rtol=2e-3)
+
+
+def test_pairs_without_noise_of_their_own_are_named(tmp_path, rng):
+    """Both halves rendered by one seed; and a shard without references whose crops are no pairs."""
+    good, bad = (CropData(crop_data(rng).stacks, [4, 4]) for _ in range(2))
+    bad.stacks[1] = bad.stacks[0]
+    three = crop_data(rng)
+    entries = []
+    (tmp_path / "shards").mkdir()
+    for name, given in (("a", [good, bad]), ("b", [CropData([*three.stacks, three.stacks[0]], [2, 3, 4])])):
+        path = tmp_path / "shards" / f"{name}.safetensors"
+        record = {"scene": name, "crops": [{"spp": list(c.spp), "seconds": {}} for c in given], "failures": []}
+        write_shard(path, given, record)
+        digest = hashlib.sha256(path.read_bytes()).hexdigest()
+        entries.append({"file": f"shards/{path.name}", "sha256": digest, "bytes": path.stat().st_size} | record)
+    told = {"format": FORMAT, "version": VERSION, "config": {"reference_spp": 0}, "planned": 3, "shards": entries}
+    (tmp_path / "manifest.json").write_text(json.dumps(told))
+    same, no_pair = problems(tmp_path)
+    assert "both halves of crop 1 are the same" in same and "must be pairs: 2 inputs with gradients, not 3" in no_pair
+    assert Dataset(tmp_path)[0].paired and np.allclose(
+        Dataset(tmp_path)[0].stack(1)["dx"], good.stacks[1]["dx"], atol=2e-3
+    )

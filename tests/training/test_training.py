@@ -18,7 +18,7 @@ from crops import SyntheticCrop  # noqa: E402
 import ngpt  # noqa: E402
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import weights  # noqa: E402
-from ngpt.training import examples  # noqa: E402
+from ngpt.training import examples, folders  # noqa: E402
 from ngpt.training.augment import Augmentation  # noqa: E402
 from ngpt.training.schedule import learning_rate  # noqa: E402
 from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
@@ -211,7 +211,8 @@ def test_targets_hold_what_the_inputs_estimate():
         drawn = examples.Examples([crop], config, Augmentation(quieter=(0.1, 0.5)), 32, seed=0)
         target = examples.target_of(crop, config)
         assert np.allclose(target, crop.reference if with_layer else crop.plain)
-        errors = [drawn._layers(0, k)["primal"] - drawn._layers(0, k)["target"] for k in range(3)]
+        parts = [drawn._layers(0, drawn.crops[0], k) for k in range(3)]
+        errors = [layers["primal"] - judge["target"] for layers, judge in parts]
         assert max(float(error.abs().max()) for error in errors) < 2
 
 
@@ -220,16 +221,16 @@ def test_folders_with_a_layer_that_the_reference_or_a_stack_lacks(tmp_path):
     view.mkdir()
     ngpt.write(view / "a.exr", crop.stack(0))
     ngpt.write(view / "reference.exr", crop.reference)
-    estimate = examples.open_crops(tmp_path)[0].reference_caustic
+    estimate = folders.open_crops(tmp_path)[0].reference_caustic
     assert estimate.sum(dtype=np.float64) == pytest.approx(crop.reference_caustic.sum(dtype=np.float64), rel=1e-4)
     stack = crop.stack(1)
     ngpt.write(view / "reference.exr", stack, overwrite=True)
-    assert np.array_equal(examples.open_crops(tmp_path)[0].reference_caustic, crop.reference_caustic)
+    assert np.array_equal(folders.open_crops(tmp_path)[0].reference_caustic, crop.reference_caustic)
     ngpt.write(view / "b.exr", SyntheticCrop("caustic", 0).stack(0))
     with pytest.raises(NgptError, match=r"b\.exr: has no layer 'caustic', but other stacks of view have"):
-        _ = examples.open_crops(tmp_path)[0].reference_caustic
+        _ = folders.open_crops(tmp_path)[0].reference_caustic
     (view / "a.exr").unlink()
-    assert not examples.open_crops(tmp_path)[0].reference_caustic.any()
+    assert not folders.open_crops(tmp_path)[0].reference_caustic.any()
 
 
 def test_the_best_input_is_shown_once_more_with_less_noise():
@@ -269,17 +270,17 @@ def test_folders_of_stacks_are_crops(tmp_path):
     crop = CROPS[0]
     (tmp_path / "view").mkdir()
     with pytest.raises(NgptError, match="no folder in it holds"):
-        examples.open_crops(tmp_path)
+        folders.open_crops(tmp_path)
     ngpt.write(tmp_path / "view" / "a.exr", crop.stack(0))
     with pytest.raises(NgptError, match=r"no reference\.exr"):
-        examples.open_crops(tmp_path)
+        folders.open_crops(tmp_path)
     ngpt.write(tmp_path / "view" / "reference.exr", crop.reference)
-    (read,) = examples.open_crops(tmp_path)
+    (read,) = folders.open_crops(tmp_path)
     assert read.inputs == 1 and read.scene == "view"
     assert np.allclose(read.reference, crop.reference)
     assert np.allclose(read.stack(0)["dx"], crop.stack(0)["dx"])
     with pytest.raises(NgptError, match="no such folder"):
-        examples.open_crops(tmp_path / "nowhere")
+        folders.open_crops(tmp_path / "nowhere")
 
 
 def test_the_papers_schedule():

@@ -1,0 +1,98 @@
+"""References kept small, without inputs: these are rendered anew, with new noise, each time a reference is met.
+
+A file of them has the name and the record of the shard that they were made in (scene, views, seeds, versions), and for
+each crop its images as bytes of lzma. A number x is kept as the nearest of the steps log2 |x| = n / 64 and its sign, so
+it errs by 0.54 % at most. Of the numbers n, the differences from pixel to pixel are packed, those of green and those of
+what red and blue are apart from green, high and low bytes apart.
+"""
+
+from __future__ import annotations
+
+import json
+import lzma
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from data_gen.dataset.config import Config, as_json
+from ngpt.errors import NgptError
+from ngpt.system.files import atomic_output
+from ngpt.training.shards import REFERENCE_CAUSTIC, REFERENCES, Shard
+
+STEPS = 64
+# log2 of the least number that is kept; what is smaller is 0.
+LEAST = -126
+IMAGES = (*REFERENCES, REFERENCE_CAUSTIC)
+
+
+@dataclass(frozen=True)
+class Again:
+    """The file of kept references, and the seed of the noise of their new inputs."""
+
+    path: str
+    seed: int
+
+
+def home(config: Config, folder: Path) -> Path:
+    """Where the references of ``config`` lie in ``folder``: those of another with other inputs alone are the same."""
+    told = {name: value for name, value in as_json(config).items() if name not in ("inputs", "spp", "adaptive")}
+    return folder / f"{zlib.crc32(json.dumps(told, sort_keys=True).encode()):08x}"
+
+
+def keep(shard: Shard, path: Path) -> None:
+    """Writes the references of a shard to ``path``, where they replace others."""
+    from safetensors.numpy import save
+
+    crops = range(len(shard.record["crops"]))
+    names = [name for name in IMAGES if name in shard.names]
+    tensors = {f"{name}/{crop}": packed(shard.crop(name, crop)) for name in names for crop in crops}
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with atomic_output(path, overwrite=True) as temporary:
+        temporary.write_bytes(save(tensors, {"ngpt": json.dumps(shard.record)}))
+
+
+class Kept:
+    """A file of kept references; raises NgptError for one that is missing or damaged."""
+
+    def __init__(self, path: Path):
+        self._shard = Shard(path)
+        self.record = self._shard.record
+
+    @property
+    def places(self) -> dict[int, int]:
+        """Of the number of each crop in its scene, its place in the file."""
+        return {told["crop"]: place for place, told in enumerate(self.record["crops"])}
+
+    def images(self, place: int) -> tuple[np.ndarray, ...]:
+        """The reference (H, W, 3) of all light, emission seen directly, and the layer ``caustic`` if there is one."""
+        size = self.record["crops"][place]["view"]["size"]
+        found = [f"{name}/{place}" for name in IMAGES if f"{name}/{place}" in self._shard.names]
+        parts = [unpacked(self._shard.tensor(name), (size, size), str(self._shard.path)) for name in found]
+        return (np.sum(parts, axis=0), *parts[1:])
+
+
+def packed(image: np.ndarray) -> np.ndarray:
+    """(n,) uint8 of finite float32 (H, W, 3)."""
+    size = np.abs(image)
+    with np.errstate(divide="ignore"):
+        steps = np.round((np.log2(size, dtype=np.float32) - LEAST) * STEPS)
+    numbers = np.where(size >= 2.0**LEAST, np.sign(image) * (1 + np.maximum(steps, 0)), 0).astype(np.int16)
+    numbers[..., ::2] -= numbers[..., 1:2]
+    change = np.diff(numbers, axis=1, prepend=np.int16(0))
+    planes = np.ascontiguousarray(change.astype("<i2").transpose(2, 0, 1)).view(np.uint8).reshape(-1, 2).T
+    return np.frombuffer(lzma.compress(planes.tobytes()), np.uint8)
+
+
+def unpacked(data: np.ndarray, size: tuple[int, int], where: str = "kept reference") -> np.ndarray:
+    """The image (H, W, 3) float32 of what ``packed`` made, ``size`` is (H, W); raises NgptError for other bytes."""
+    try:
+        planes = np.frombuffer(lzma.decompress(data.tobytes()), np.uint8).reshape(2, -1)
+        change = np.ascontiguousarray(planes.T).view("<i2").reshape(3, *size)
+    except (lzma.LZMAError, EOFError, ValueError) as error:
+        raise NgptError(f"{where}: is damaged: {error}; remove it, and it is made again") from error
+    numbers = np.cumsum(change, axis=2, dtype=np.int16).transpose(1, 2, 0).copy()
+    numbers[..., ::2] += numbers[..., 1:2]
+    values = np.exp2((np.abs(numbers.astype(np.float32)) - 1) / STEPS + LEAST)
+    return np.where(numbers == 0, 0, np.sign(numbers) * values).astype(np.float32)

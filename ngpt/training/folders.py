@@ -1,0 +1,119 @@
+"""What training is given: training sets, and folders of stacks with references."""
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.denoisers import caustic
+from ngpt.errors import NgptError
+from ngpt.repair import repair
+from ngpt.stack import GradientStack
+
+
+def read(path: str) -> GradientStack:
+    """The stack in a file. Training sets need no OpenEXR: it comes in with the first file that does."""
+    from ngpt.io import exr
+
+    return exr.read(path)
+
+
+class StackCrop:
+    """The stacks of one folder and the reference they share."""
+
+    reference_halves = ()
+    paired = False
+
+    def __init__(self, folder: Path, stacks: list[Path], reference: Path):
+        self.scene, self.inputs = folder.name, len(stacks)
+        self._stacks, self._reference = stacks, reference
+        held = [read(str(path)) for path in stacks]
+        self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
+        self._caustic = ["caustic" in stack for stack in held]
+        self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
+
+    def stack(self, k: int) -> GradientStack:
+        return read(str(self._stacks[k]))
+
+    @property
+    def reference(self) -> np.ndarray:
+        return read(str(self._reference))["primal"]
+
+    @property
+    def reference_direct(self) -> np.ndarray:
+        # A reference of the path tracer has no such layer; emission seen directly has next to no noise in any stack.
+        most = self._stacks[int(np.argmax(self.spp))]
+        for path in (self._reference, most):
+            stack = read(str(path))
+            if "direct" in stack:
+                return stack["direct"]
+        return np.zeros_like(stack["primal"])
+
+    @property
+    def reference_caustic(self) -> np.ndarray:
+        """Of the reference, or that of all stacks together, spread; zeros if they have no such layer.
+
+        Raises NgptError if only some of the stacks have it.
+        """
+        reference = read(str(self._reference))
+        if all(self._caustic) and "caustic" in reference:
+            return reference["caustic"]
+        if not self._lit:
+            return np.zeros_like(reference["primal"])
+        if not all(self._caustic):
+            raise NgptError(
+                f"{self._stacks[self._caustic.index(False)]}: has no layer 'caustic', but other stacks of {self.scene} "
+                "have: their gradients hold nothing of that light, so they have no target in common; render all alike"
+            )
+        stacks = [read(str(path)) for path in self._stacks]
+        shares = np.divide(self.spp, sum(self.spp)) if all(self.spp) else np.full(len(stacks), 1 / len(stacks))
+        light = sum(share * stack["caustic"] for share, stack in zip(shares, stacks, strict=True))
+        layers = {"caustic": light, "primal": reference["primal"]}
+        if all("caustic_var" in stack for stack in stacks):
+            noise = [share**2 * stack["caustic_var"] for share, stack in zip(shares, stacks, strict=True)]
+            layers["caustic_var"] = np.sum(noise, axis=0)
+        features = {name: stacks[0][name] for name in ("albedo", "normal", "depth") if name in stacks[0]}
+        return caustic.denoised(repair(GradientStack(layers | features)))
+
+
+class StackFolder(Sequence[StackCrop]):
+    """A folder with a folder for each view: its ``reference.exr``, and beside it any number of gradient stacks.
+
+    Raises NgptError where a folder has stacks without a reference, or sizes differ.
+    """
+
+    def __init__(self, folder: str | Path):
+        self._crops = []
+        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
+            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
+            reference = view / "reference.exr"
+            if not stacks:
+                continue
+            if not reference.is_file():
+                raise NgptError(f"{view}: has {len(stacks)} stacks but no reference.exr; render one with many samples")
+            self._crops.append(StackCrop(view, stacks, reference))
+        if not self._crops:
+            raise NgptError(f"{folder}: no folder in it holds a reference.exr and stacks (*.exr)")
+
+    def __len__(self) -> int:
+        return len(self._crops)
+
+    def __getitem__(self, index):  # type: ignore[no-untyped-def]
+        return self._crops[index]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(dict.fromkeys(crop.scene for crop in self._crops))
+
+
+def open_crops(folder: str | Path) -> Iterable[Any]:
+    """The crops of a dataset (it has a manifest) or of a folder of stacks."""
+    path = Path(folder)
+    if not path.is_dir():
+        raise NgptError(f"{folder}: no such folder; make a training set: ngpt dataset --config ... --out {folder}")
+    if (path / "manifest.json").is_file():
+        from ngpt.training.dataset import Dataset
+
+        return Dataset(path)
+    return StackFolder(path)

@@ -1,0 +1,76 @@
+"""The loss of pairs: what a network makes of one half of the samples, judged by the other half, with no reference.
+
+A and B are independent renders of one view, f the network. f(A) is compared with the image of B at three scales, and
+its differences with the gradients of B:
+
+    L = sum over s = 0, 1, 2 of   mean rho( D_s(f(A) - y)² / D_s(m² + ε + v) )
+      + sum over dx, dy of        mean rho( (Δ f(A) - g)² / (0.01 (m² + ε) + v_g) )
+
+    y, g     the image of B, without emission seen directly, and its dx, dy
+    D_s      mean over 2^s x 2^s pixels
+    m        mean over 3x3 pixels of f(A), of which no gradient is taken
+    v, v_g   variances of the image and of dx, dy, as A tells them, see ``spread``
+    rho      Huber's function of the squared error: itself up to ``KNEE``², straight in the error beyond it
+
+The noise of B is independent of A and of mean 0: in a square it adds a constant, and the least of it is at the truth
+[Lehtinen et al. 2018, "Noise2Noise"]. Differences have 5 to 24 times less noise than the image, so their term says what
+drowns in the image's [compare Guo et al. 2019, "GradNet", where input and target are one render].
+
+Weights are made of A alone. Made of B they would be small where B is bright by chance, and results too dark.
+"""
+
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d
+
+SCALES, KNEE = 3, 3.0
+# ε in radiance over the exposure, of which 4 is typical: that of relMSE where 1/4 is.
+DARK = 0.25
+# Of the light, squared: errors of differences below it count as little as noise does.
+RELATIVE = 0.01
+# A variance is at least this part of those around it: few samples know little of their own.
+AROUND, WINDOW = 3.0, 5
+
+
+def halves(prediction: Tensor, other: dict[str, Tensor]) -> Tensor:
+    """L of f(A) (N, 3, H, W), radiance over the exposure of A. ``other``, in the same units, is what judges it:
+
+    ``primal``, ``dx``, ``dy``           (N, 3, H, W) of B
+    ``primal_se``, ``dx_se``, ``dy_se``  (N, 3, H, W) standard errors that A tells
+    ``counts``                           (N, 1, H, W) 1, or 0 where the image says nothing, as where lamps are seen
+    """
+    return judged(prediction, avg_pool2d(prediction.detach(), 3, 1, 1, count_include_pad=False), other)
+
+
+def judged(prediction: Tensor, smooth: Tensor, other: dict[str, Tensor]) -> Tensor:
+    """L with ``smooth`` for m."""
+    light, counts, total = smooth.square() + DARK, other["counts"], prediction.new_zeros(())
+    images = counts * (prediction - other["primal"]), light + spread(other["primal_se"]), counts
+    for scale in range(SCALES):
+        error, size, share = (avg_pool2d(image, 2**scale) for image in images)
+        total = total + _mean((error / share.clamp(min=0.5**SCALES)).square() / size, share)
+    for name, axis in (("dx", -1), ("dy", -2)):
+        length = counts.shape[axis] - 1
+        gradient, light_here, noise = (
+            layer.narrow(axis, 0, length) for layer in (other[name], light, spread(other[f"{name}_se"]))
+        )
+        both = counts.narrow(axis, 0, length) * counts.narrow(axis, 1, length)
+        error = prediction.diff(dim=axis) - gradient
+        total = total + _mean(error.square() / (RELATIVE * light_here + noise), both)
+    return total
+
+
+def spread(errors: Tensor) -> Tensor:
+    """Variances of standard errors (N, 3, H, W), at least three times what is typical of the 5x5 pixels around.
+
+    Typical is the mean of their fourth roots, to the power of 4: single large ones hardly count.
+    """
+    around = avg_pool2d(errors.sqrt(), WINDOW, 1, WINDOW // 2, count_include_pad=False)
+    return torch.maximum(errors.square(), AROUND * around.pow(4))
+
+
+def _mean(squares: Tensor, share: Tensor) -> Tensor:
+    """The mean of rho over pixels, each by its ``share`` (N, 1, H, W), and channels."""
+    straight = 2 * KNEE * squares.clamp(min=KNEE**2).sqrt() - KNEE**2
+    rho = torch.where(squares < KNEE**2, squares, straight)
+    return (share * rho).sum() / (squares.shape[1] * share.sum()).clamp(min=1)

@@ -1,0 +1,88 @@
+"""Training that goes on wherever it was, and stands still while someone measures."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from ngpt.training.settings import read_settings
+from scripts import keep_training
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.mark.parametrize("network", ["combine", "fast"])
+def test_it_starts_from_the_weights_in_the_repository(tmp_path, network):
+    """Settings that the configuration takes, of the same network."""
+    words = keep_training.command(network, tmp_path, ["run.steps=7"])
+    changes = [words[i + 1] for i, word in enumerate(words) if word == "--set"]
+    settings = read_settings(ROOT / "configs" / f"{network}.toml", changes)
+    assert settings.run.steps == 7 and all(Path(folder).is_file() for folder in settings.data.folders)
+    from ngpt.network.weights import load_weights
+
+    assert load_weights(settings.initial)[0].config == settings.model
+    assert settings.data.kept == str(tmp_path / "references") and words[words.index("--out") + 1].startswith(
+        str(tmp_path)
+    )
+
+
+COUNT = """
+import signal, sys, time
+signal.signal(signal.SIGTERM, lambda *_: sys.exit(7))
+while True:
+    with open(sys.argv[1], "a") as file: file.write(".")
+    time.sleep(0.02)
+"""
+KEEP = """
+import sys
+from pathlib import Path
+from scripts import keep_training
+keep_training.LOOK = 0.02
+sys.exit(keep_training.keep([sys.executable, "-c", sys.argv[1], sys.argv[2]], Path(sys.argv[3])))
+"""
+
+
+def test_it_stands_still_while_the_file_is_there(tmp_path):
+    marks, busy = tmp_path / "marks", tmp_path / "busy"
+
+    def until(condition):
+        deadline = time.monotonic() + 30
+        while not condition() and time.monotonic() < deadline:
+            time.sleep(0.02)
+        assert condition()
+
+    def grows():
+        before = marks.stat().st_size if marks.exists() else 0
+        time.sleep(0.3)
+        return marks.exists() and marks.stat().st_size > before
+
+    words = [sys.executable, "-c", KEEP, COUNT, str(marks), str(busy)]
+    with subprocess.Popen(words, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}) as process:
+        until(grows)
+        busy.touch()
+        until(lambda: not grows())
+        # Ended while it stands still, it wakes up to save.
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(30) == 7
+
+
+@pytest.mark.slow
+def test_a_clone_trains_and_goes_on(renderer, tmp_path):
+    sets = {"views": "inputs = 2\nreference_spp = 4", "pairs": "inputs = 2\nreference_spp = 0"}
+    for name, text in sets.items():
+        (tmp_path / f"{name}.toml").write_text(f"size = 32\nspp = [2, 4]\nscenes = 2\ncrops = 2\n{text}\n")
+    folders = json.dumps([str(tmp_path / f"{name}.toml") for name in sets])
+    for steps in (2, 4):
+        changes = (f"data.folders={folders}", f"run.steps={steps}", "data.crop=32", "run.log=1", "optimizer.ema=0")
+        options = [word for change in changes for word in ("--set", change)]
+        words = [sys.executable, "-m", "scripts.keep_training", "tiny", "--state", str(tmp_path / "state"), *options]
+        subprocess.run(words, cwd=ROOT, env=os.environ | {"PYTHONPATH": str(ROOT)}, check=True, timeout=600)
+    log = [json.loads(line) for line in (tmp_path / "state" / "tiny" / "log.jsonl").read_text().splitlines()]
+    assert [entry["step"] for entry in log if "loss" in entry] == [1, 2, 3, 4]
+    assert (tmp_path / "state" / "tiny" / "weights.safetensors").is_file()
+    assert list((tmp_path / "state" / "references").rglob("*.safetensors"))
