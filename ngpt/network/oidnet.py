@@ -71,7 +71,7 @@ def exposure(colour: Tensor) -> Tensor:
 
 
 class OidnUNet(nn.Module):
-    """(N, 9, H, W) to (N, 3, H, W), codes >= 0; H and W divisible by ``alignment``.
+    """(N, 9, H, W) to (N, 3, H, W), codes, of which negative ones count as 0; H and W divisible by ``alignment``.
 
     ``channels`` are a key of ``SHAPES``. Untrained it returns the first three channels, the colour. Names of layers are
     those that OIDN looks for.
@@ -125,7 +125,7 @@ class OidnUNet(nn.Module):
         x = relu(self.dec_conv1b(relu(self.dec_conv1a(_doubled_beside(x, given)))))
         # In 16 bits codes would be off by percents of the radiance.
         with torch.autocast(x.device.type, enabled=False):
-            return relu(self.dec_conv0(x.float()))
+            return self.dec_conv0(x.float())
 
     def image(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """The denoised colour, (N, 3, H, W) of any size, as OIDN makes it, but not brighter than the colour is."""
@@ -134,8 +134,12 @@ class OidnUNet(nn.Module):
         given = [perceptual(colour.clamp(min=0) * scale), albedo.clamp(0, 1), normal.clamp(-1, 1) / 2 + 0.5]
         x = pad(torch.cat(given, 1), (0, -width % self.alignment, 0, -height % self.alignment))
         codes = self(x.contiguous(memory_format=torch.channels_last))[..., :height, :width]
+        light = radiance(codes.clamp(min=0))
+        if self.training:
+            # Black has no slope, and a network that has once made all of it black would never learn again.
+            light = light - relu(-codes)
         largest = colour.amax((1, 2, 3), keepdim=True).clamp(min=0)
-        return torch.minimum(radiance(codes) / scale, largest)
+        return torch.minimum(light / scale, largest)
 
 
 def _convolution(inputs: int, outputs: int) -> nn.Conv2d:

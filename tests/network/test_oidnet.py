@@ -123,7 +123,8 @@ def test_the_stock_tool_takes_the_file(files, tmp_path):
     with torch.no_grad():
         given = [torch.from_numpy(p.transpose(2, 0, 1)[None].copy()) for p in pictures.values()]
         expected = model(dict(zip(INPUTS, given, strict=True)))[0].permute(1, 2, 0).numpy()
-    agree(image.reshape(75, 101, 3)[::-1], expected)
+    # The bound of the brightest pixel is ours.
+    agree(np.minimum(image.reshape(75, 101, 3)[::-1], layers["primal"].max()), expected)
 
 
 def test_info_says_what_the_file_is(files, capsys):
