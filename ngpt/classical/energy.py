@@ -6,7 +6,7 @@ before and after, an image keeps the energy of the primal, which is unbiased; da
 of it.
 """
 
-from ngpt.classical.arrays import Array, cast, module
+from ngpt.classical.arrays import Array, cast, module, over_colours
 from ngpt.classical.leastsquares import solve
 
 # Pixels over which energy is compared: the screened Poisson equation's length. 16 and 64 pixels are as good.
@@ -22,7 +22,7 @@ def keep_energy(image: Array, primal: Array) -> Array:
     The factor is one for all colours, smooth, and 1 where the two agree. f(k image, k primal) = k f(image, primal).
     """
     xp = module(image)
-    before, after = (_local(cast(x, xp.float64).sum(-1)) for x in (primal, image))
+    before, after = (_local(over_colours(x)) for x in (primal, image))
     lit = (before > 0) & (after > 0)
     factor = xp.where(lit, before / xp.where(lit, after, 1), 1).clip(1 / MOST, MOST)
     return cast(factor, image.dtype)[..., None] * image

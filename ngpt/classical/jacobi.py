@@ -20,9 +20,9 @@ from ngpt.classical.arrays import map_silent
 # Sweeps between two exchanges of rows.
 DEPTH = 5
 # Rows of a strip without those of its neighbours; fewer make more of these, more leave threads without work.
-_STRIP = 120
-# Pixels that are worked on at a time: with their temporaries about a megabyte.
-_PIXELS = 10240
+_STRIP = 180
+# Pixels that are worked on at a time: fewer make more calls, more leave the cache.
+_PIXELS = 20480
 # Bytes of the widest vectors: operations on addresses that are no multiples take twice as long.
 _VECTOR = 64
 

@@ -66,7 +66,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"{', '.join(by_standing('niche'))}. See `ngpt info`",
     )
     parser.add_argument("--alpha", help="weight of the primal image in l2 and l1: a number, or auto")
-    parser.add_argument("--weights", metavar="FILE", help="a network (.onnx, .safetensors) instead of the one shipped")
+    parser.add_argument("--weights", metavar="FILE", help="a network of your own: .onnx, .safetensors, .tza")
     parser.add_argument(
         "--device", help="where networks run: cpu (default), cuda, tensorrt, openvino, directml, coreml"
     )

@@ -1,4 +1,4 @@
-"""``ngpt export``: writes a reconstruction as an ONNX file."""
+"""``ngpt export``: writes a reconstruction as an ONNX file, or a network of OIDN's shape for OIDN's runtime."""
 
 import argparse
 from pathlib import Path
@@ -11,14 +11,17 @@ from ngpt.system.files import atomic_output, check_output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    what = parser.add_mutually_exclusive_group()
-    what.add_argument("--weights", type=Path, metavar="FILE.safetensors", help="a network, as `ngpt train` makes them")
-    what.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument(
+        "--weights", type=Path, metavar="FILE.safetensors", help="a network, as `ngpt train` makes them"
+    )
+    source.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
     parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
     parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
     parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
     parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
-    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE.onnx", help="model to write")
+    what = "model to write: .onnx, or .tza for OIDN"
+    parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=what)
     add_force(parser)
 
 
@@ -28,6 +31,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             check_output(path, args.force)
     if not args.weights and (args.statistics or args.vector):
         raise WrongUse("--statistics and --vector belong to networks; leave them out for a classical method")
+    if args.output.suffix == ".tza" and (not args.weights or args.statistics or args.vector):
+        raise WrongUse(f"{args.output}: a file for OIDN holds a network and no more; give it --weights alone")
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
     return 0
@@ -35,6 +40,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def write(args: argparse.Namespace) -> list[Path]:
     """Writes what the arguments ask for; returns the files."""
+    if args.output.suffix == ".tza":
+        from ngpt.export.oidn import oidn_weights
+
+        data = oidn_weights(args.weights)
+        with atomic_output(args.output, args.force) as temporary:
+            temporary.write_bytes(data)
+        return [args.output]
     if not args.weights:
         from ngpt.export.poisson import l2_model
 

@@ -88,6 +88,8 @@ def bytes_per_pixel(model: Reconstructor) -> int:
 
 def _load(weights: str | Path) -> tuple[Reconstructor, dict]:
     model, header = load_weights(weights)
+    if model.config.network == "oidn":
+        raise NgptError(f"{weights}: the network has OIDN's shape, which has no graph; export it to a .tza file")
     if split := [name for name in model.config.inputs if name.removesuffix("_se") in features.PARTS]:
         raise NgptError(
             f"{weights}: the network reads {', '.join(split)}, for which there is no ONNX graph; run its weights in "

@@ -8,13 +8,13 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError
-from ngpt.network import inputs, run_onnx
+from ngpt.network import inputs, run_oidn, run_onnx
 from ngpt.network.identity import identify
 from ngpt.system.install import install_command
 from ngpt.system.records import parse_json
 from ngpt.version import __version__
 
-SUFFIXES = (".onnx", ".safetensors")
+SUFFIXES = (".onnx", ".safetensors", ".tza")
 # What the metadata of the network that blends frames have (``ngpt.sequence.network``).
 FRAMES = "ngpt.temporal inputs"
 
@@ -33,7 +33,13 @@ def describe(path: str | Path) -> dict[str, Any]:
     Raises NgptError for a file that is no network of ngpt, and for .safetensors where PyTorch is not installed.
     """
     path = Path(path)
-    return _safetensors(path) if path.suffix.lower() == ".safetensors" else _onnx(path)
+    readers = {".safetensors": _safetensors, ".tza": _tza}
+    return readers.get(path.suffix.lower(), _onnx)(path)
+
+
+def _tza(path: Path) -> dict[str, Any]:
+    names, base = run_oidn.reads(path)
+    return _whose(path, "weights in OIDN's shape, written by ngpt") | _reads(names, base, "OIDN")
 
 
 def _onnx(path: Path) -> dict[str, Any]:

@@ -11,13 +11,13 @@ from torch.nn.functional import avg_pool2d
 
 from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
-from ngpt.network import features, inputs, kpcn, padding, poisson
+from ngpt.network import features, inputs, kpcn, oidnet, padding, poisson
 from ngpt.network.heads import Head, head_of
 from ngpt.network.poisson import Poisson
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
 
-NETWORKS = ("dense", "plain", "kpcn")
+NETWORKS = ("dense", "plain", "kpcn", "oidn")
 # What a file may ask for: far more than networks have, far less than takes down a machine.
 MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
 # Kernels reach no further than the padding.
@@ -32,9 +32,12 @@ WINDOW, DARK, HUGE = 15, 0.01, 1e15
 class ModelConfig:
     """What a reconstruction is made of.
 
-    ``network``   "dense" or "plain", see ``ngpt.network.unet``, or "kpcn", see ``ngpt.network.kpcn``
-    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, of one level)
-    ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn)
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``, "kpcn", see ``ngpt.network.kpcn``, or "oidn", see
+                  ``ngpt.network.oidnet``
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, of one level),
+                  those of OIDN's small or default network (oidn)
+    ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn);
+                  none for plain and oidn
     ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
     ``base``      the classical method whose result is its layer "base"; "" for none
     ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
@@ -81,6 +84,9 @@ class ModelConfig:
         for name in self.inputs:
             if name not in features.CHANNELS:
                 raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
+        if self.network == "oidn":
+            self._check_oidn()
+            return
         if "primal" not in self.inputs or len(set(self.inputs)) < len(self.inputs):
             raise NgptError(f"inputs {', '.join(self.inputs)}: each once, and 'primal' among them")
         levels = len(self.channels)
@@ -143,10 +149,27 @@ class ModelConfig:
             raise NgptError(f"kernel = {self.kernel!r}: of 'kpcn' it must be an odd number from 3 to {kpcn.MAX_KERNEL}")
         if len(self.channels) > 1:
             raise NgptError(f"channels {list(self.channels)}: 'kpcn' has one level; give one number")
+        self._goes_without("kernel")
+
+    def _check_oidn(self) -> None:
+        colour = "base" if self.base else "primal"
+        if self.inputs != (colour, *oidnet.FEATURES):
+            raise NgptError(f"inputs {', '.join(self.inputs)}: of 'oidn' they must be {colour}, albedo, normal")
+        if self.base not in ("", *BASES):
+            raise NgptError(f"base '{self.base}': choose one of: {', '.join(BASES)}")
+        if self.channels not in oidnet.SHAPES:
+            shapes = " or ".join(str(list(shape)) for shape in oidnet.SHAPES)
+            raise NgptError(f"channels {list(self.channels)}: of 'oidn' they must be {shapes}")
+        if self.units:
+            raise NgptError(f"units {list(self.units)}: 'oidn' has none; give []")
+        self._goes_without("base", "start")
+
+    def _goes_without(self, *but: str) -> None:
+        """Raises NgptError where a field is set that is not one of these."""
         defaults = {field.name: field.default for field in fields(self) if field.default is not MISSING}
-        others = [name for name, value in defaults.items() if name != "kernel" and getattr(self, name) != value]
+        others = [name for name, value in defaults.items() if name not in but and getattr(self, name) != value]
         if others:
-            raise NgptError(f"network 'kpcn' goes without {', '.join(others)}: leave it out")
+            raise NgptError(f"network '{self.network}' goes without {', '.join(others)}: leave it out")
 
     @property
     def head(self) -> Head:
@@ -159,7 +182,9 @@ class ModelConfig:
     @property
     def layers(self) -> tuple[str, ...]:
         """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.inputs``)."""
-        return features.sources(self.inputs)
+        names = features.sources(self.inputs)
+        # Exposure is that of the primal.
+        return names if "primal" in names else ("primal", *names)
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -187,6 +212,8 @@ class Reconstructor(nn.Module):
 
     Any H and W. Proportional to the exposure: what goes in ``k`` times as bright comes out ``k`` times as bright. The
     result is bounded by the range of the primal, and 0. Layers hold finite values; see ``ModelConfig.inputs``.
+
+    A network of OIDN's shape has what OIDN does around it instead (``ngpt.network.oidnet``).
     """
 
     def __init__(self, config: ModelConfig):
@@ -199,6 +226,8 @@ class Reconstructor(nn.Module):
             self.network = DenseUNet(channels, config.channels, config.units, **last, pooling=config.pooling)
         elif config.network == "plain":
             self.network = PlainUNet(channels, config.channels, **last, pooling=config.pooling)
+        elif config.network == "oidn":
+            self.network = oidnet.OidnUNet(config.channels)
         else:
             self.network = kpcn.KPCN(config.inputs, config.channels[0], config.units[0], **last)
 
@@ -217,6 +246,8 @@ class Reconstructor(nn.Module):
         return max(own, WINDOW // 2 if self.config.quiet else 0)
 
     def forward(self, layers: Mapping[str, Tensor]) -> Tensor:
+        if self.config.network == "oidn":
+            return self.network.image(*(layers[name] for name in self.config.inputs))
         height, width = layers["primal"].shape[-2:]
         scaled, exposure = features.normalised({name: layers[name] for name in self.config.layers})
         bounds = self.bounds(scaled["primal"])
@@ -227,6 +258,8 @@ class Reconstructor(nn.Module):
 
     def predict(self, scaled: Mapping[str, Tensor]) -> Tensor:
         """The signed log of the image, unbounded, from layers normalised, completed and padded; float32."""
+        if self.config.network == "oidn":
+            return signed_log(self.network.image(*(scaled[name] for name in self.config.inputs)))
         # Channels last is the layout convolutions are fastest in, by half on CPUs.
         x = features.encode(scaled, self.config.inputs).contiguous(memory_format=torch.channels_last)
         prediction = self.network(x).float()

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
-from ngpt.network import inputs, run_onnx
+from ngpt.network import inputs, run_oidn, run_onnx
 from ngpt.options import Option
 from ngpt.repair import Repaired
 from ngpt.system.install import install_command, package_command
@@ -19,8 +19,10 @@ WEIGHTS = Path(__file__).parents[1] / "weights"
 
 # The options of all networks
 OPTIONS = {
-    "weights": Option("", "a file, .onnx or .safetensors, instead of the network that is shipped"),
-    "device": Option("auto", f"where it runs: {', '.join(run_onnx.DEVICES)}, or PyTorch's names for .safetensors"),
+    "weights": Option("", "a file, .onnx, .safetensors or .tza, instead of the network that is shipped"),
+    "device": Option(
+        "auto", f"where it runs: {', '.join(run_onnx.DEVICES)}, or PyTorch's names for .safetensors and OIDN's for .tza"
+    ),
     "memory": Option(run_onnx.MEMORY, "MiB that its tiles may take", range=(1, math.inf)),
 }
 
@@ -44,12 +46,15 @@ class Shipped:
         if find_spec("onnxruntime") is None:
             return f"ONNX Runtime is not installed: {package_command('onnxruntime')}"
         if not self.path.is_file():
-            return "no network is shipped for it: pass --weights FILE (weights=FILE), .onnx or .safetensors"
+            return "no network is shipped for it: pass --weights FILE (weights=FILE), .onnx, .safetensors or .tza"
         return self.also_missing()
 
     def reads(self, weights: str, device: str, memory: int) -> tuple[str, ...]:
         """What ``run`` with these options reads: layers of a stack, and what is made of them (``inputs.gather``)."""
         path = Path(weights or self.path)
+        if path.suffix == ".tza":
+            names, base = run_oidn.reads(path)
+            return (*names, *inputs.needs(names, base))
         if path.suffix != ".safetensors":
             network = run_onnx.Network(path, device)
             return (*network.inputs, *inputs.needs(network.inputs, network.base))
@@ -59,11 +64,13 @@ class Shipped:
     def run(self, data: Repaired, weights: str, device: str, memory: int) -> np.ndarray:
         """The image (H, W, 3) float32, scene-linear, of the light that the data's ``image`` is of.
 
-        ``weights``  a file instead of the shipped one: .onnx runs in ONNX Runtime, .safetensors in PyTorch
+        ``weights``  a file instead of the shipped one: .onnx for ONNX Runtime, .safetensors for PyTorch, .tza for OIDN
         ``device``   one of the runtime's, or "auto"
-        ``memory``   MiB that tiles may take (ONNX Runtime)
+        ``memory``   MiB that tiles may take (ONNX Runtime and OIDN)
         """
         path = Path(weights or self.path)
+        if path.suffix == ".tza":
+            return run_oidn.run(data, path, device, memory)
         if path.suffix != ".safetensors":
             network = run_onnx.Network(path, device)
             # NumPy makes the base several times faster than the graph would.

@@ -49,8 +49,12 @@ def layers_of(
 def reconstruct(model: Reconstructor, layers: dict[str, Tensor], tile: int = TILE) -> Tensor:
     """What ``model(layers)`` returns, computed tile by tile of at most ``tile`` padded pixels' side.
 
-    Exposure and bounds are those of the whole image. Layers may lie on another device than the model.
+    Exposure and bounds are those of the whole image. Layers may lie on another device than the model. A network of
+    OIDN's shape, the tiles of which are OIDN's own, is computed in one piece.
     """
+    if model.config.network == "oidn":
+        device = next(model.parameters()).device
+        return model({name: layers[name].to(device) for name in model.config.layers})
     height, width = layers["primal"].shape[-2:]
     device = next(model.parameters()).device
     scaled, exposure = features.normalised({name: layers[name] for name in model.config.layers})

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +19,7 @@ from crops import SyntheticCrop  # noqa: E402
 import ngpt  # noqa: E402
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import weights  # noqa: E402
+from ngpt.network.model import ModelConfig  # noqa: E402
 from ngpt.training import examples, folders  # noqa: E402
 from ngpt.training.augment import Augmentation  # noqa: E402
 from ngpt.training.schedule import learning_rate  # noqa: E402
@@ -71,6 +73,18 @@ def test_it_learns_and_its_weights_can_be_used(tmp_path):
     image = ngpt.denoise(crop.stack(0), "ngpt", weights=str(tmp_path / "weights.safetensors"))
     error = np.mean((image - crop.reference) ** 2)
     assert error < 0.5 * np.mean((crop.stack(0)["primal"] - crop.reference) ** 2)
+
+
+def test_a_network_of_oidns_shape_learns(tmp_path):
+    shipped = read_settings("configs/oidn-small.toml").model.to_dict()
+    made = shipped | {"inputs": ("primal", "albedo", "normal"), "base": "", "start": ()}
+    values = settings(run_steps=120, run_batch=4, run_validate=120, optimizer_learning_rate=1e-3)
+    run = Trainer(
+        replace(values, model=ModelConfig(**made)), CROPS[:4], CROPS[4:], loss, tmp_path, say=lambda text: None
+    )
+    assert run.run()
+    scores = json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])
+    assert scores["relMSE"] < 0.95 * scores["relMSE primal"]
 
 
 def test_one_batch_can_be_learnt_by_heart():

@@ -1,0 +1,86 @@
+"""Files of weights for Open Image Denoise, .tza: written for its runtime, and their tables read back.
+
+    u16 0x41D7, u8 2, u8 0      magic and version
+    u64                         where the table lies
+    tensors                     each at a multiple of 64 bytes
+    u32                         their number, and for each of them
+        u16, bytes              the name
+        u8, u32 ...             the shape
+        bytes                   the layout: "oihw" for kernels, "x" for biases
+        "f" or "h", u64         32 or 16 bits, and where it lies
+
+All numbers are little-endian [Intel Open Image Denoise 2.4.1, core/tza.cpp]. OIDN takes 16 bits alone.
+It leaves tensors alone that it has no use for; one of these says which image of ours is the colour.
+"""
+
+import struct
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.classical.bases import BASES
+from ngpt.errors import NgptError
+from ngpt.system.reading import read_bytes
+
+MAGIC, VERSION, ALIGNMENT = 0x41D7, 2, 64
+# The mark's name, before that of the image: "primal", or the base.
+MARK = "ngpt.colour."
+# More than any network has, for files that lie.
+MOST_TENSORS, MOST_BYTES = 4096, 2**28
+
+
+def packed(tensors: Mapping[str, np.ndarray], colour: str) -> bytes:
+    """A file of tensors of four or one dimensions, in 16 bits; ``colour`` is "primal" or the name of a base."""
+    body, table = bytearray(12), bytearray()
+    everything = dict(tensors) | {MARK + colour: np.ones(1)}
+    for name, tensor in everything.items():
+        body += bytes(-len(body) % ALIGNMENT)
+        table += struct.pack("<H", len(name)) + name.encode() + struct.pack("<B", tensor.ndim)
+        table += struct.pack(f"<{tensor.ndim}I", *tensor.shape)
+        table += (b"oihw" if tensor.ndim == 4 else b"x") + b"h" + struct.pack("<Q", len(body))
+        body += np.ascontiguousarray(tensor, "<f2").tobytes()
+    body += bytes(-len(body) % ALIGNMENT)
+    body[:12] = struct.pack("<HBBQ", MAGIC, VERSION, 0, len(body))
+    return bytes(body + struct.pack("<I", len(everything)) + table)
+
+
+def read(path: Path) -> tuple[bytes, str]:
+    """The file's contents, and the image that is its colour: "primal", or the name of a base.
+
+    Raises NgptError where it is no such file, is damaged, or was not written by ngpt.
+    """
+    data = read_bytes(path, MOST_BYTES)
+    shapes = _shapes(data, path)
+    marks = [name.removeprefix(MARK) for name in shapes if name.startswith(MARK)]
+    if len(marks) != 1 or marks[0] not in ("primal", *BASES):
+        raise NgptError(
+            f"{path}: does not say which image it denoises, as files by `ngpt export` do; run it by OIDN's own tools"
+        )
+    return data, marks[0]
+
+
+def _shapes(data: bytes, path: Path) -> dict[str, tuple[int, ...]]:
+    """The tensors of a file by name, each of which lies within it."""
+    try:
+        magic, version, _, place = struct.unpack_from("<HBBQ", data)
+        if magic != MAGIC or version != VERSION:
+            raise NgptError(f"{path}: is no .tza file of version {VERSION}")
+        (count,) = struct.unpack_from("<I", data, place)
+        place, shapes = place + 4, {}
+        for _ in range(min(count, MOST_TENSORS)):
+            (length,) = struct.unpack_from("<H", data, place)
+            name = data[place + 2 : place + 2 + length].decode()
+            place += 2 + length
+            (rank,) = struct.unpack_from("<B", data, place)
+            shape = struct.unpack_from(f"<{rank}I", data, place + 1)
+            place += 1 + 4 * rank + rank
+            kind, begin = struct.unpack_from("<cQ", data, place)
+            place += 9
+            size = {b"f": 4, b"h": 2}[kind] * int(np.prod(shape, dtype=object))
+            if begin + size > len(data):
+                raise NgptError(f"{path}: tensor '{name}' lies beyond the end of the file; it is damaged")
+            shapes[name] = shape
+    except (struct.error, OverflowError, UnicodeDecodeError, KeyError) as error:
+        raise NgptError(f"{path}: is no .tza file, or a damaged one") from error
+    return shapes

@@ -1,0 +1,193 @@
+"""Networks of OIDN's shape: what PyTorch makes of their weights, OIDN makes of the exported file."""
+
+import shutil
+import struct
+import subprocess
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from full_stack import full_layers, full_stack, hidden_oidn
+
+import ngpt
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.network import oidnet, run_oidn, tza
+from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.weights import save_weights
+from ngpt.training.cost import per_pixel
+
+SMALL, DEFAULT = oidnet.SHAPES
+INPUTS = ("base", "albedo", "normal")
+
+
+def config(channels=SMALL, base="wcv", **others):
+    inputs = INPUTS if base else ("primal", "albedo", "normal")
+    return ModelConfig("oidn", channels, (), inputs, base, **others)
+
+
+def in_halves(made):
+    """A network that changes colours, with weights that 16 bits hold."""
+    torch.manual_seed(3)
+    model = Reconstructor(made).eval()
+    with torch.no_grad():
+        for parameter in model.parameters():
+            parameter.copy_((parameter + 0.004 * torch.randn_like(parameter)).half())
+    return model
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory):
+    """The same weights as .safetensors and, by the command, as .tza; for each shape, and of the primal."""
+    folder = tmp_path_factory.mktemp("networks")
+    for name, made in {"small": config(), "default": config(DEFAULT), "primal": config(base="")}.items():
+        save_weights(folder / f"{name}.safetensors", in_halves(made), {})
+        arguments = ["export", "--weights", folder / f"{name}.safetensors", "-o", folder / f"{name}.tza"]
+        assert main([str(word) for word in arguments]) == 0
+    return folder
+
+
+def agree(image, expected):
+    """To 1e-4 of each value; the darkest to 1e-6 of the typical one."""
+    assert image.shape == expected.shape
+    assert (np.abs(image - expected) <= 1e-4 * (np.abs(expected) + 1e-2 * np.median(expected))).all()
+
+
+@pytest.mark.parametrize(("channels", "thousands"), [(SMALL, 62.136), (DEFAULT, 125.406)])
+def test_untrained_it_gives_the_colour_back(channels, thousands):
+    model = Reconstructor(config(channels))
+    assert per_pixel(model)[0] == pytest.approx(1000 * thousands)
+    base = 40 * torch.rand(2, 3, 37, 50) ** 4 - 0.01
+    with torch.no_grad():
+        image = model({"base": base, "albedo": torch.rand(2, 3, 37, 50), "normal": torch.randn(2, 3, 37, 50)})
+    assert torch.allclose(image, base.clamp(min=0), rtol=1e-4, atol=1e-5)
+
+
+def test_the_curve_has_an_inverse():
+    y = torch.logspace(-12, 6, 200)
+    x = oidnet.perceptual(y)
+    assert (x.diff() > 0).all() and float(oidnet.perceptual(torch.tensor(65504.0))) == pytest.approx(1, abs=1e-6)
+    assert torch.allclose(oidnet.radiance(x), y, rtol=2e-4)
+    zero = torch.zeros(1, requires_grad=True)
+    oidnet.radiance(oidnet.perceptual(zero)).sum().backward()
+    assert torch.isfinite(zero.grad).all()
+
+
+def test_exposure_is_that_of_bins():
+    image = np.random.default_rng(0).gamma(0.2, 3, (2, 3, 41, 53)).astype(np.float32)
+    image[1, :, :30] = 0
+    luminance = np.tensordot(np.array(oidnet.LUMINANCE), image.astype(float), (0, 1))
+    for one, scale in zip(luminance, oidnet.exposure(torch.from_numpy(image)), strict=True):
+        rows, columns = ([i * n // -(-n // 16) for i in range(-(-n // 16) + 1)] for n in one.shape)
+        bins = [one[a:b, c:d].mean() for a, b in pairwise(rows) for c, d in pairwise(columns)]
+        assert float(scale) == pytest.approx(0.18 / np.exp(np.mean(np.log([b for b in bins if b > 1e-8]))), rel=1e-5)
+    assert float(oidnet.exposure(torch.zeros(1, 3, 5, 5))) == 1
+
+
+@pytest.mark.parametrize("name", ["small", "default", "primal"])
+def test_oidn_gives_the_pixels_of_pytorch(files, name):
+    pytest.importorskip("mitsuba_oidn")
+    stack = full_stack(75, 101)
+    by_torch, by_oidn = (
+        ngpt.reconstruct(stack, "ngpt", weights=str(files / f"{name}{ending}")) for ending in (".safetensors", ".tza")
+    )
+    agree(by_oidn.image, by_torch.image)
+    assert by_oidn.method == f"own network {name}.tza"
+    base = ngpt.denoise(stack, "primal" if name == "primal" else "wcv")
+    assert np.abs(by_oidn.image - base).mean() > 1e-3 * base.mean()
+
+
+def test_exposure_changes_nothing(files):
+    pytest.importorskip("mitsuba_oidn")
+    images = [ngpt.denoise(full_stack(40, 40, k), weights=str(files / "small.tza")) / k for k in (2**-10, 1, 2**10)]
+    agree(images[0], images[1])
+    agree(images[2], images[1])
+
+
+def test_the_stock_tool_takes_the_file(files, tmp_path):
+    """`oidnDenoise -w`, as it comes with OIDN."""
+    tool = shutil.which("oidnDenoise")
+    if tool is None:
+        pytest.skip("oidnDenoise, of an OIDN release, is not in PATH")
+    layers = full_layers(75, 101)
+    pictures = {"hdr": layers["primal"], "alb": layers["albedo"], "nrm": layers["normal"]}
+    for name, picture in pictures.items():
+        (tmp_path / f"{name}.pfm").write_bytes(b"PF\n101 75\n-1.0\n" + picture[::-1].tobytes())
+    words = [word for name in pictures for word in (f"--{name}", tmp_path / f"{name}.pfm")]
+    result = subprocess.run([tool, *words, "-w", files / "small.tza", "-o", tmp_path / "image.pfm"], timeout=100)
+    assert result.returncode == 0
+    image = np.frombuffer((tmp_path / "image.pfm").read_bytes()[-4 * layers["primal"].size :], "<f4")
+    model = in_halves(config())
+    with torch.no_grad():
+        given = [torch.from_numpy(p.transpose(2, 0, 1)[None].copy()) for p in pictures.values()]
+        expected = model(dict(zip(INPUTS, given, strict=True)))[0].permute(1, 2, 0).numpy()
+    # The bound of the brightest pixel is ours.
+    agree(np.minimum(image.reshape(75, 101, 3)[::-1], layers["primal"].max()), expected)
+
+
+def test_info_says_what_the_file_is(files, capsys):
+    assert main(["info", str(files / "small.tza")]) == 0
+    text = capsys.readouterr().out
+    assert "wcv" in text and "OIDN" in text and "dx_var" in text
+
+
+def test_wrong_files_end_in_one_line(files, tmp_path):
+    stack, good = full_stack(20, 20), (files / "small.tza").read_bytes()
+    foreign = tza.packed({"enc_conv0.bias": np.zeros(3)}, "primal").replace(b"ngpt.colour", b"some.colour")
+    wrong = {
+        "no .tza file": b"something else, and more of it",
+        "no .tza file, or a damaged one": good[:5],
+        "beyond the end": good[:-8] + struct.pack("<Q", 2**40),
+        "does not say which image": foreign,
+        "OIDN cannot run them": tza.packed({"enc_conv0.weight": np.zeros((32, 9, 3, 3))}, "wcv"),
+    }
+    for message, data in wrong.items():
+        (tmp_path / "wrong.tza").write_bytes(data)
+        with pytest.raises(NgptError, match=message):
+            ngpt.denoise(stack, "ngpt", weights=str(tmp_path / "wrong.tza"))
+    path = str(files / "small.tza")
+    with pytest.raises(NgptError, match="device 'toaster' is unknown"):
+        ngpt.denoise(stack, "ngpt", weights=path, device="toaster")
+    with pytest.raises(NgptError, match="which the stack lacks"):
+        ngpt.denoise(ngpt.GradientStack.from_arrays(primal=stack["primal"]), "ngpt", weights=path)
+    with hidden_oidn(), pytest.raises(NgptError, match="OIDN is not installed"):
+        ngpt.denoise(stack, "ngpt", weights=path)
+
+
+def test_files_of_another_kind_are_not_made(files, tmp_path, capsys):
+    save_weights(tmp_path / "dense.safetensors", Reconstructor(ModelConfig("dense", (4,), (1,), ("primal",))), {})
+    large = Reconstructor(config())
+    large.network.enc_conv0.weight.data[0, 0, 0, 0] = 1e6
+    save_weights(tmp_path / "large.safetensors", large, {})
+    for weights, made, message in (
+        (tmp_path / "dense.safetensors", "a.tza", "has not OIDN's shape"),
+        (files / "small.safetensors", "a.onnx", "export it to a .tza file"),
+        (tmp_path / "large.safetensors", "a.tza", "beyond 65504"),
+    ):
+        assert main(["export", "--weights", str(weights), "-o", str(tmp_path / made)]) == 1
+        assert message in capsys.readouterr().err and not (tmp_path / made).exists()
+    assert main(["export", "-o", str(tmp_path / "l2.tza")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"channels": (32, 32)}, "they must be"),
+        ({"units": (1,)}, "has none"),
+        ({"inputs": ("primal", "albedo", "normal")}, "must be base, albedo, normal"),
+        ({"base": "oidn"}, "choose one of"),
+        ({"quiet": 0.03, "kernel": 3}, "goes without quiet, kernel"),
+    ],
+)
+def test_configurations_that_make_no_sense(wrong, message):
+    right = {"network": "oidn", "channels": SMALL, "units": (), "inputs": INPUTS, "base": "wcv"}
+    with pytest.raises(NgptError, match=message):
+        ModelConfig(**(right | wrong))
+
+
+def test_it_runs_without_pytorch():
+    """The names it reads are known to a process that has imported no torch."""
+    source = Path(run_oidn.__file__).read_text() + Path(tza.__file__).read_text()
+    assert "torch" not in source.replace("PyTorch", "")
