@@ -135,8 +135,9 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
     """What the script has to know of a scene, besides the pixels."""
     best = scene.best(next(iter(scene.entries[0].metrics), ""))
     names = [entry.name for entry in scene.entries]
-    second = names[best] if best is not None else (REFERENCE if scene.reference is not None else names[-1])
     first = scene.baseline.name
+    other = names[0] if first != names[0] else names[-1]
+    second = names[best] if best is not None else (REFERENCE if scene.reference is not None else other)
     return {
         "width": scene.entries[0].image.shape[1],
         "height": scene.entries[0].image.shape[0],
@@ -146,6 +147,7 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
         "layers": list(scene.layers),
         "reference": scene.reference is not None,
         "maps": list(dict.fromkeys(name for entry in scene.entries for name in entry.maps)),
+        "meanings": scene.meanings,
         "a": first,
         "b": second if second != first else names[-1],
     }
