@@ -73,8 +73,8 @@ def render_passes(
     included; with both, whichever comes first. The first pass is always rendered, and no further one that is expected
     to take longer than the time left; of the last block there may be a part. Passes are short at first where ``points``
     are "rounds", which is how their number is not known before. ``stop`` is asked after each pass whether to end
-    there, and ``look`` called with the film before. ``progress`` is called with (samples per pixel so far, spp) before the first pass and after each, or, where
-    there are ``seconds``, with whole (seconds gone, seconds).
+    there, and ``look`` called with the film before. ``progress`` is called with (samples per pixel so far, spp) before
+    the first pass and after each, or, where there are ``seconds``, with whole (seconds gone, seconds).
 
     How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
     takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which

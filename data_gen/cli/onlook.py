@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.report.live import LivePage
 from ngpt.report.preview import preview
 from ngpt.report.tev import Tev
@@ -90,17 +90,16 @@ class Onlookers:
 def onlookers(live: bool, view: str | None, scene: str, command: str, console: Console, unit: str) -> Onlookers:
     """Those that were asked for, as far as they are there: who is not is told of in a line, and the render goes on."""
     page = viewer = None
-    if live:
-        try:
-            page = LivePage(f"{scene}, live", command)
-            console.say(f"live: {page.url}")
-        except NgptError as error:
-            console.error(error)
-    if view:
-        try:
-            viewer = Tev(view, scene)
-        except WrongUse:
-            raise
-        except NgptError as error:
-            console.error(f"{error}; the render goes on")
+    try:
+        viewer = Tev(view, scene) if view else None
+    except WrongUse:
+        raise
+    except NgptError as error:
+        console.error(f"{error}; the render goes on")
+    try:
+        page = LivePage(f"{scene}, live", command) if live else None
+    except NgptError as error:
+        console.error(f"{error}; the render goes on")
+    if page is not None:
+        console.say(f"live: {page.url}")
     return Onlookers(page, viewer, console.say, unit)

@@ -60,7 +60,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for path, image in zip([*args.images[1:], args.ref], [*images[1:], reference], strict=True):
         check_size(path, image, args.images[0], images[0])
     height, width = images[0].shape[:2]
-    entries, layers = [Entry(name, image) for name, image in zip(names, images, strict=True)], {}
+    entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+    layers: dict[str, np.ndarray] = {}
     formulas, caption = {}, "no reference: with --ref the page has errors, SSIM, FLIP and their maps"
     if len(images) == 1 and reference is None:
         entries, layers = of_stack(read(args.images[0]), images[0], names[0])

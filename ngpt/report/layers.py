@@ -1,4 +1,4 @@
-"""All that one file holds, for the page: light as pictures, which have an exposure, everything else in its own colours."""
+"""All that one file holds, for the page: light as pictures, which have an exposure, all else in its own colours."""
 
 import numpy as np
 

@@ -49,7 +49,7 @@ class LivePage:
         try:
             self.server = _listening(port, self)
         except OSError as error:
-            raise NgptError(f"no live page: {ADDRESS} has no port for it ({error.strerror}); the render goes on") from None
+            raise NgptError(f"--live: no port of {ADDRESS} can be had for it ({error.strerror})") from None
         self.thread = threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
         self.thread.start()
 

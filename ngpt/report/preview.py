@@ -1,4 +1,4 @@
-"""What somebody who looks on sees of a render that goes on: the noisy image, a quick reconstruction, and their errors."""
+"""What who looks on sees of a render that goes on: the noisy image, a quick reconstruction, and their errors."""
 
 from dataclasses import dataclass, field
 
@@ -41,8 +41,8 @@ def preview(stack: GradientStack) -> Preview:
     unit = np.square(light).mean(axis=-1) + ERROR_EPSILON * 4.0 ** -auto_exposure(light)
     found, maps = Preview({_NOISY: light}), {}
     if "primal_var" in stack:
-        variance = stack["primal_var"] + (stack["caustic_var"] if "caustic_var" in stack else 0)
-        maps[_NOISY] = _place(variance, unit)
+        variances = [stack[name] for name in ("primal_var", "caustic_var") if name in stack]
+        maps[_NOISY] = _place(np.sum(variances, axis=0), unit)
     if method:
         known = "primal_var" in stack and all(f"{d}_var" in stack for d in ("dx", "dy") if d in stack)
         result = (reconstruct_with_error if known else reconstruct)(stack, method)

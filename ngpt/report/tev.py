@@ -39,10 +39,11 @@ class Tev:
         try:
             self.socket = socket.create_connection((host, int(port)), SECONDS)
         except OSError as error:
-            raise NgptError(f"--view {address}: no viewer there ({error.strerror or error}); start tev first") from error
+            reason = error.strerror or error
+            raise NgptError(f"--view {address}: no viewer there ({reason}); start tev first") from error
 
     def show(self, images: Mapping[str, np.ndarray]) -> None:
-        """Shows images (H, W, 3), scene-linear; those of a name and size that were shown before are brought up to date."""
+        """Shows images (H, W, 3), scene-linear; those of a name and size that are there are brought up to date."""
         for name, image in images.items():
             if self.sizes.get(name) != image.shape:
                 if name in self.sizes:

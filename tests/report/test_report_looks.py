@@ -155,12 +155,16 @@ def test_the_histogram_has_both_pictures_where_their_light_is(opened):
     grey = np.full((24, 36, 3), 0.18, np.float32)
     session = opened(Scene("s", "", None, [Entry("grey", grey), Entry("dark", grey / 4)]))
     # Columns, in stops from middle grey, where a line of this colour goes up.
-    peak = COPY + """(colour => {
+    peak = (
+        COPY
+        + """(colour => {
         const c = $('histogram'), d = copyOf(c).getImageData(0, 0, c.width, c.height / 2).data, found = [];
         for (let i = 0; i < d.length; i += 4)
-          if (colour.every((v, k) => Math.abs(d[i + k] - v) < 40)) found.push(((i / 4) % c.width + 0.5) / c.width * 16 - 8);
+          if (colour.every((v, k) => Math.abs(d[i + k] - v) < 40))
+            found.push(((i / 4) % c.width + 0.5) / c.width * 16 - 8);
         return found.length ? found.reduce((a, b) => a + b) / found.length : null;
     })"""
+    )
     amber, blue = [0xE3, 0xB2, 0x65], [0x7D, 0xB9, 0xDE]
     for exposure in (0, 2):
         session.ask(f"change({{exposure: {exposure}}})")
