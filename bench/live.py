@@ -2,9 +2,10 @@
 
     python -m bench.live glossy --size 640x360 --spp 96 --pairs 3
 
-Who looks on asks each second how far the render is, and fetches each page, as a browser does that draws nothing. Printed
-are, for each pair and in the median: seconds of wall clock with over without; seconds of all threads of this process
-with over without, which other programs on the machine disturb less; and which share of its time the render stood still.
+Who looks on asks each second how far the render is, and fetches each page, as a browser does that draws nothing.
+Printed are, for each pair and in the median: seconds of wall clock with over without; seconds of all threads of this
+process with over without, which other programs on the machine disturb less; and the share of its time for which the
+render stood still.
 """
 
 import argparse
@@ -34,13 +35,13 @@ def main() -> None:
         found = {live: render(args, args.spp, live) for live in ((False, True) if pair % 2 else (True, False))}
         (wall, cpu, still, images), (wall0, cpu0, _, _) = found[True], found[False]
         ratios.append((wall / wall0, cpu / cpu0, still))
-        print(
-            f"{wall0:.1f} s, live {wall:.1f} s, {images} images: wall {wall / wall0:.3f}, threads {cpu / cpu0:.3f}, ",
-            end="",
-        )
-        print(f"stood still {still:.2%}", flush=True)
-    wall, cpu, still = (statistics.median(column) for column in zip(*ratios, strict=True))
-    print(f"median: wall {wall:.3f}, threads {cpu:.3f}, stood still {still:.2%}")
+        seconds = f"{wall0:.1f} s, live {wall:.1f} s, {images} images"
+        print(f"{seconds}: {told(*ratios[-1])}", flush=True)
+    print(f"median: {told(*(statistics.median(column) for column in zip(*ratios, strict=True)))}")
+
+
+def told(wall: float, cpu: float, still: float) -> str:
+    return f"wall {wall:.3f}, threads {cpu:.3f}, stood still {still:.2%}"
 
 
 def render(args: argparse.Namespace, spp: int, live: bool) -> tuple[float, float, float, int]:

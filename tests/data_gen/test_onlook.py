@@ -15,12 +15,14 @@ from ngpt.stack import GradientStack
 
 
 @pytest.mark.parametrize("adaptive", [False, True])
-def test_looking_at_a_render_changes_no_bit(renderer, adaptive):
+def test_looking_at_a_render_changes_no_bit(renderer, monkeypatch, adaptive):
+    from data_gen import passes
     from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
     scene, seen = load(renderer, "diffuse", (32, 24)), []
-    options = {"seed": 3, "memory": 8, "adaptive": Adaptive(method="wcv") if adaptive else None}  # several passes
+    monkeypatch.setattr(passes, "FIRST_LANES", 1 << 13)  # several passes
+    options = {"seed": 3, "adaptive": Adaptive(method="wcv") if adaptive else None}
     plain = render_stack(scene, 64, sampler="gpt", **options)
     looked = render_stack(scene, 64, sampler="gpt", newest=lambda stack: seen.append(stack()), **options)
     assert len(seen) > 1 and seen[0].attributes["ngpt:spp"] < 64 and "primal_var" in seen[0]
