@@ -30,6 +30,7 @@ from ngpt.cli.denoise_shot import way, windowed
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
@@ -250,7 +251,8 @@ def compute_frame(
         over_time = {"ngpt:temporal": "history", "ngpt:history": temporal.share}
         if isinstance(temporal.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(temporal.corrections.path))
-    metrics = compare(result.image, reference) if reference is not None else None
+    shown = converted(result.image, to_rec709(stack.attributes))
+    metrics = compare(shown, reference) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)

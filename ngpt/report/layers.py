@@ -3,6 +3,7 @@
 import numpy as np
 
 from ngpt.io.exr import layers_of_light, pass_through
+from ngpt.io.primaries import converted, to_rec709
 from ngpt.report.content import Entry
 from ngpt.stack import GradientStack
 
@@ -18,6 +19,8 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
     """
     light = {layer: stack[layer] for layer in _LIGHT if layer in stack}
     light |= {layer: image for layer, image in layers_of_light(stack).items() if layer not in light}
+    matrix = to_rec709(stack.attributes)
+    light = {layer: converted(image, matrix) for layer, image in light.items()}
     entries = [Entry(name, shown)]
     for layer, image in light.items():
         # The root is in the file once more, as what its renderer calls it.
