@@ -12,7 +12,7 @@ from ngpt.report.tev import Tev
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 
-# Of the render's time, what making and sending images may take; where the end is in sight, up to half of it at once.
+# Of the render's time, what making and sending images may take; the first may take half of what all may.
 SHARE, _AHEAD = 0.02, 0.5
 # Seconds that the first image is expected to take: to load the method, and for a pixel.
 _LOAD, _PIXEL = 0.1, 3e-6
@@ -26,7 +26,7 @@ class Onlookers:
 
     def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
         self.page, self.viewer, self.say, self.unit = page, viewer, say, unit
-        self.line = "ended without an image"
+        self.line, self.shown = "ended without an image", False
         self.start, self.spent, self.expected, self.left = time.perf_counter(), 0.0, 0.0, 0.0
 
     @property
@@ -38,8 +38,11 @@ class Onlookers:
         gone = time.perf_counter() - self.start
         self.left = gone * (total - done) / done if done else 0.0
         if self.page is not None and not self.page.ended:
-            line = f"{done} of {total} {'seconds' if self.unit == 's' else 'samples per pixel'}, {gone:.0f} s"
-            self.page.tell(line + (f", about {self.left:.0f} s left" if self.left >= 1 and self.unit != "s" else ""))
+            left = f", about {self.left:.0f} s left" if self.left >= 1 else ""
+            far = (
+                f"{gone:.0f} of {total} s" if self.unit == "s" else f"{done} of {total} samples per pixel, {gone:.0f} s"
+            )
+            self.page.tell(far + left)
 
     def newest(self, stack: Callable[[], GradientStack]) -> None:
         """Shows the samples done by now, if somebody looks on and that costs little enough."""
@@ -52,6 +55,7 @@ class Onlookers:
             self.expected = _LOAD + _PIXEL * made.width * made.height
         if self._affordable(begin - self.start):
             self._show(made or stack())
+            self.shown = True
             self.expected = time.perf_counter() - begin
         self.spent += time.perf_counter() - begin
 
@@ -71,7 +75,10 @@ class Onlookers:
         return self.viewer is not None or (self.page is not None and self.page.watched)
 
     def _affordable(self, gone: float) -> bool:
-        return self.spent + self.expected <= SHARE * max(gone, _AHEAD * (gone + self.left))
+        if not self.shown:
+            # Of what the whole render may cost: how long it takes is not known well yet.
+            gone = max(gone, _AHEAD * (gone + self.left))
+        return self.spent + self.expected <= SHARE * gone
 
     def _show(self, stack: GradientStack) -> None:
         shown = preview(stack)

@@ -65,8 +65,8 @@ def windowed(
         while done < number:
             yield told[done] if done in told else write(frames.pop(done))
             done += 1
-        shown = converted(result.image, to_rec709(frames[number].stack.attributes))
-        metrics = compare(shown, reference) if reference is not None else None
+        light = converted(result.image, to_rec709(frames[number].stack.attributes))
+        metrics = compare(light, reference) if reference is not None else None
         over_time = {"ngpt:temporal": "windows"}
         yield write(frames.pop(number)._replace(result=result, metrics=metrics, over_time=over_time))
         done = number + 1

@@ -1,4 +1,4 @@
-"""Which red, green and blue a file means: its header's ``chromaticities``; and linear Rec. 709, in which light is shown.
+"""Which red, green and blue a file means: its header's ``chromaticities``; and linear Rec. 709, in which it is shown.
 
 By OpenEXR's rule a file without the attribute is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
 """

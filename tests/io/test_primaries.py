@@ -1,4 +1,4 @@
-"""Files in other primaries than those of Rec. 709: shown and compared in those, reconstructed and written in their own."""
+"""Files in other primaries than those of Rec. 709: shown and compared in those, written in their own."""
 
 import json
 
@@ -25,7 +25,7 @@ def image(rng):
     return rng.uniform(0.2, 1.0, (24, 32, 3)).astype(np.float32)
 
 
-# Published matrices: colour-science.org and ITU-R BT.2087 (2020), the ACES white adapted to D65 by Bradford's transform.
+# Published matrices: ITU-R BT.2087, and those of ACES with its white adapted to D65 by Bradford's transform.
 @pytest.mark.parametrize(
     ("primaries", "expected"),
     [
