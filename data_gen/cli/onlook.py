@@ -14,6 +14,7 @@ from ngpt.system.console import Console
 
 # Of the render's time, what making and sending images may take; the first may take half of what all may.
 SHARE, _AHEAD = 0.02, 0.5
+_CAUTION = 1.5
 # Seconds that the first image is expected to take: to load the method, and for a pixel.
 _LOAD, _PIXEL = 0.1, 3e-6
 
@@ -56,7 +57,8 @@ class Onlookers:
         if self._affordable(begin - self.start):
             self._show(made or stack())
             self.shown = True
-            self.expected = time.perf_counter() - begin
+            # On a busy machine the next may well take longer.
+            self.expected = _CAUTION * (time.perf_counter() - begin)
         self.spent += time.perf_counter() - begin
 
     def last(self, stack: GradientStack, line: str) -> None:

@@ -19,6 +19,7 @@ async function renew() {
   }
   $("scene-0").querySelector(".caption").textContent = fresh.querySelector(".caption").textContent;
   held.clear();
+  fillMaps();  // Samples may differ by now.
   await show();
 }
 
