@@ -5,6 +5,7 @@ import socket
 
 import numpy as np
 import pytest
+from tev_viewer import Viewer
 from unbiased import load
 
 from ngpt.cli import main
@@ -98,6 +99,15 @@ def test_enough_ends_a_render_as_ctrl_c_does(renderer, tmp_path, monkeypatch, ca
     done = read(target).attributes["ngpt:spp"]
     assert f"enough: {target} holds the {done} samples per pixel done by then" in messages
     assert "live: http://127.0.0.1:" in messages and output == ""
+
+
+def test_a_viewer_is_sent_the_image(renderer, tmp_path):
+    viewer, target = Viewer(), tmp_path / "a.exr"
+    words = ["diffuse", "--size", "16x12", "--sampler", "gpt", "--spp", "16", "-o", str(target)]
+    assert main(["render", *words, "--view", f"127.0.0.1:{viewer.port}"]) == 0
+    viewer.thread.join(10)
+    assert len(viewer.images) == 2
+    assert np.array_equal(viewer.images["diffuse/noisy"], read(target)["primal"])
 
 
 def test_a_viewer_that_is_not_there_stops_no_render(renderer, tmp_path, capfd):
