@@ -25,7 +25,7 @@ import numpy as np
 from scipy.ndimage import uniform_filter
 
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, Progress, SamplePass
+from data_gen.passes import DEFAULT_MEMORY, Look, Progress, SamplePass
 from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
@@ -96,6 +96,7 @@ def render_adaptive(
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
+    look: Look = lambda film: None,
     lane_bytes: int = LANE_BYTES,
     points: str = "sobol",
 ) -> tuple[GradientFilm, dict]:
@@ -117,6 +118,10 @@ def render_adaptive(
             done = int(work.film.samples_each.mean())
             progress(min(done, total), total)
 
+    def after_pass() -> None:
+        look(work.film)
+        report()
+
     most = None if spp is None else spp * pixels
     work = UnevenRender(
         sample,
@@ -127,7 +132,7 @@ def render_adaptive(
         memory=memory,
         stop=stop,
         lane_bytes=lane_bytes,
-        report=report,
+        report=after_pass,
         points=points,
     )
     report()

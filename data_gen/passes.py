@@ -26,6 +26,9 @@ Progress = Callable[[int, int], None]
 # What takes the samples of one pass: it puts, or splats, one for each camera sample into the film.
 SamplePass = Callable[[CameraSamples, GradientFilm], None]
 
+# What looks at the film between passes, and leaves it as it is.
+Look = Callable[[GradientFilm], None]
+
 # What a render may use, in MiB, beside the scene itself; see blocks_within().
 DEFAULT_MEMORY = 6144
 # Rays of lanes side by side are traced together, and do best where they start from one pixel.
@@ -59,6 +62,7 @@ def render_passes(
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
+    look: Look = lambda film: None,
     lane_bytes: int = LANE_BYTES,
     batch: int = 0,
     points: str = "sobol",
@@ -69,8 +73,8 @@ def render_passes(
     included; with both, whichever comes first. The first pass is always rendered, and no further one that is expected
     to take longer than the time left; of the last block there may be a part. Passes are short at first where ``points``
     are "rounds", which is how their number is not known before. ``stop`` is asked after each pass whether to end
-    there. ``progress`` is called with (samples per pixel so far, spp) before the first pass and after each, or, where
-    there are ``seconds``, with whole (seconds gone, seconds).
+    there, and ``look`` called with the film before. ``progress`` is called with (samples per pixel so far, spp) before
+    the first pass and after each, or, where there are ``seconds``, with whole (seconds gone, seconds).
 
     How many blocks of samples make a pass adapts to the speed of the scene and to ``memory`` (MiB), of which a lane
     takes ``lane_bytes``, or what ``sample`` says in an attribute of that name. That changes no bit of the result, which
@@ -133,6 +137,8 @@ def render_passes(
         first = ", kernels compiled or loaded" if not done else ""
         _LOG.debug("pass of %d samples per pixel, %.3g s%s", n, now - begin, first)
         done.append((n, max(now - begin - sum(compiled), 1e-6)))
+        look(film)
+        now = time.perf_counter()
         if n % size or film.samples >= total or stop():
             break
         report()

@@ -22,6 +22,9 @@ from ngpt.io.exr import with_channels
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
 
+# What is told of a render after each pass: a function that makes the stack of the samples done by then.
+Newest = Callable[[Callable[[], GradientStack]], None]
+
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
 
@@ -35,6 +38,7 @@ def render_stack(
     seconds: float | None = None,
     memory: int = DEFAULT_MEMORY,
     stop: Callable[[], bool] = lambda: False,
+    newest: Newest = lambda stack: None,
     diagnostics: bool = False,
     with_features: bool = True,
     adaptive: Adaptive | None = None,
@@ -46,7 +50,8 @@ def render_stack(
     ``sampler`` "auto" or one of ``data_gen.samplers.SAMPLERS``, ``options`` are the sampler's own, which may be texts.
     ``progress`` is called with (samples done, spp) before the first pass and after each; for it, ``memory`` and
     ``stop`` see ``data_gen.passes.render_passes()``. With ``diagnostics`` the stack carries the images of
-    ``data_gen.film.GradientFilm.diagnose()`` as further channels; without ``with_features``, which sampler "primal"
+    ``data_gen.film.GradientFilm.diagnose()`` as further channels; ``newest`` is called after each pass with a function
+    that makes the stack of the samples done by then; without ``with_features``, which sampler "primal"
     alone can do without, it holds the primal alone. The scene's reconstruction filter is not used: the pixels of a
     stack, and so their differences, are box-filtered.
 
@@ -76,6 +81,7 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
+    limits["look"] = lambda film: newest(lambda: stack_of(film, seed, sampler, start, False, {}))
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from data_gen.adaptive import Adaptive
     from data_gen.choosing.plans import Plan
     from data_gen.frames.camera_path import CameraPath
+    from data_gen.render import Newest
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
@@ -56,6 +57,7 @@ def render_scene(
     variant: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
+    newest: Newest = lambda stack: None,
     chosen: Callable[[Plan], None] = lambda plan: None,
     said: Callable[[str], None] = lambda line: None,
     **options: Any,
@@ -76,6 +78,7 @@ def render_scene(
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
                     ``stop_on_ctrl_c``
+    ``newest``      called after each pass with a function that makes the stack of the samples done by then
     ``chosen``      called before the render with what a pilot or the scene's description has chosen
     ``said``        called with a line on each sampler that a pilot tries
 
@@ -112,6 +115,7 @@ def render_scene(
         seconds=seconds,
         memory=memory,
         stop=stop,
+        newest=newest,
         diagnostics=diagnostics,
         adaptive=sharing,
         **options,

@@ -14,6 +14,7 @@ import numpy as np
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse
+from ngpt.io.primaries import converted, inside_rec709
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
@@ -39,6 +40,7 @@ class Method:
     ``uses``     layers that it takes where the stack has them
     ``estimates``  layers that it estimates from the others where the stack lacks them
     ``variant``  the method that it is with other options, "" for a method of its own
+    ``rec709``   whether it was made for colours of Rec. 709: others are converted for it, as far as they are within
     """
 
     summary: str
@@ -50,6 +52,7 @@ class Method:
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
+    rec709: bool = False
 
 
 @dataclass(frozen=True)
@@ -186,6 +189,7 @@ METHODS = {
         "use",
         oidn.missing,
         uses=("albedo", "normal"),
+        rec709=True,
     ),
 }
 # Section 5 of the survey: docs/methods/reconstructions.md
@@ -270,6 +274,10 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
+    matrix = inside_rec709(stack) if entry.rec709 else None
+    if matrix is not None:
+        light = {name: converted(stack[name], matrix) for name in ("primal", "direct", "caustic") if name in stack}
+        stack = stack.replace(**light)
     power = magnitude(stack)
     data = repair(_known(scaled(stack, power), entry.estimates), gradients="dx" in reads)
     # Extreme values may leave the range of float32 inside; what comes out is checked.
@@ -278,6 +286,8 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         if data.caustic is not None:
             image += caustic.denoised(data, by_oidn="denoised" in reads)
     image = enlarged(image, power)
+    if matrix is not None:
+        image = converted(image, np.linalg.inv(matrix))
     seconds = time.perf_counter() - start
     _LOG.info("%s: method %s, %.3g s, options %s", stack.path, name, seconds, values or "none")
     if data.pixels or data.gradients:

@@ -2,11 +2,12 @@
 
 import argparse
 import shlex
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
 from data_gen.cli.frames import frames, targets
+from data_gen.cli.onlook import onlookers
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
@@ -80,6 +81,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write the rates of failed shifts and of discarded values for each pixel too",
     )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="serve a page on this machine's loopback address that shows the render while it goes on, denoised quickly "
+        "beside the noisy image, with a button that ends it",
+    )
+    parser.add_argument(
+        "--view", metavar="HOST:PORT", help="send the same images to the viewer tev, which listens on 127.0.0.1:14158"
+    )
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -152,20 +162,35 @@ def image(args: argparse.Namespace, console: Console) -> int:
         console.say(f"{args.scene}: sampler '{plan.sampler}'{how}: {plan.reason}")
 
     unit = "s" if args.time else "spp"
-    with console.progress(f"render {args.scene}", unit) as progress, stop_on_ctrl_c(ending) as stop:
+    looking = onlookers(args.live, args.view, args.scene, args.command, console, unit)
+    with (
+        closing(looking),
+        console.progress(f"render {args.scene}", unit) as progress,
+        stop_on_ctrl_c(ending) as stop,
+    ):
+
+        def ended() -> bool:
+            return stop() or looking.enough
+
+        def told(done: int, total: int) -> None:
+            progress(done, total)
+            looking.progress(done, total)
+
         stack, plan = render_scene(
             args.scene,
             adaptive=args.adaptive,
             error=args.error,
             method=args.method,
-            progress=progress,
-            stop=stop,
+            progress=told,
+            stop=ended,
+            newest=looking.newest,
             chosen=chosen,
             said=console.say,
             **asked(args),
         )
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
         write(target, stack, overwrite=args.force)
+        looking.last(stack, f"ended: {target} is written")
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
     done, took = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
@@ -174,8 +199,9 @@ def image(args: argparse.Namespace, console: Console) -> int:
         short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
     wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
-    if interrupted := stop() and done != wanted:
-        console.error(f"interrupted: {target} holds the {done} samples per pixel done by then")
+    if interrupted := ended() and done != wanted:
+        how = "interrupted" if stop() else "enough"
+        console.error(f"{how}: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if args.time is not None and took > _LATE * args.time and done <= _FEW:
         console.say(
@@ -191,6 +217,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
 
 def shot(args: argparse.Namespace, console: Console) -> int:
     """A stack for each frame."""
+    if args.live or args.view:
+        raise WrongUse("--live and --view are for single images; leave them out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
         raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
     files = targets(args.output, args.scene, args.frames)

@@ -39,6 +39,7 @@ VERBS = {
     "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
     "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
+    "picture": Verb("make a PNG, JPEG or WebP of an image, or a film of a shot, by a view transform"),
     "train": Verb("train a network, or continue a run", extra="train", interrupted=CONTINUES),
     "evaluate": Verb(
         "compare methods on the same scenes with the same clock",

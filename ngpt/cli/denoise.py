@@ -20,21 +20,27 @@ from ngpt.cli.arguments import (
     add_force,
     add_json,
     add_layers,
+    add_look,
     add_untrusted,
     assignment,
+    exposed,
     given_files,
     print_json,
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
+from ngpt.cli.picture import check_picture
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
+from ngpt.report.pictures import write_picture
+from ngpt.report.transforms import shown
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
@@ -53,7 +59,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--output",
         metavar="OUT",
         help=f"file for one stack, folder for several; folders are made (default: STACK{RESULT_SUFFIX}.exr beside "
-        "each); -: standard output",
+        "each); of one stack a picture too (.png .jpg .webp); -: standard output",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -107,6 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
     add_files(parser)
     add_layers(parser)
+    add_look(parser)
     add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
@@ -133,7 +140,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     for _, target in pairs:
         check_output(target, args.force or args.skip_existing)
         if target.suffix.lower() != ".exr":
-            raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+            check_picture(target, args)
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
@@ -147,8 +154,8 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     }
     options |= dict(args.option)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
-    shown = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    overwrite = partial(write_frame, overwrite=args.force)
+    bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
+    overwrite = partial(write_frame, overwrite=args.force, transform=args.transform, exposure=args.exposure)
     frames: Any
     windows = False
     if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
@@ -172,7 +179,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
             overwrite,
         )
     reports = []
-    with shown as progress, closing(frames):
+    with bar as progress, closing(frames):
         progress(0, len(pairs))
         for i, ((source, _), report) in enumerate(zip(pairs, frames, strict=True), 1):
             if isinstance(report, NgptError):
@@ -250,7 +257,8 @@ def compute_frame(
         over_time = {"ngpt:temporal": "history", "ngpt:history": temporal.share}
         if isinstance(temporal.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(temporal.corrections.path))
-    metrics = compare(result.image, reference) if reference is not None else None
+    light = converted(result.image, to_rec709(stack.attributes))
+    metrics = compare(light, reference) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
@@ -259,13 +267,18 @@ def compute_frame(
     return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), over_time=over_time)
 
 
-def write_frame(frame: Frame, overwrite: bool) -> dict:
+def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
     """Writes the result, and returns what there is to report."""
     source, target, stack, result, metrics, groups, there, cut, over_time = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
-    write(target, result.image, like=stack, overwrite=overwrite or cut, attributes={**result.attributes, **over_time})
+    made = {**result.attributes, **over_time}
+    if target.suffix.lower() == ".exr":
+        write(target, result.image, like=stack, overwrite=overwrite or cut, attributes=made)
+    else:
+        light = converted(result.image, to_rec709(stack.attributes))
+        write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,

@@ -8,6 +8,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import layers_in
+from ngpt.io.primaries import converted, to_rec709
 from ngpt.measure.metrics import compare
 from ngpt.sequence.wcv_windows import LENGTH, LINK, reconstruct_shot
 from ngpt.stack import GradientStack
@@ -64,7 +65,8 @@ def windowed(
         while done < number:
             yield told[done] if done in told else write(frames.pop(done))
             done += 1
-        metrics = compare(result.image, reference) if reference is not None else None
+        light = converted(result.image, to_rec709(frames[number].stack.attributes))
+        metrics = compare(light, reference) if reference is not None else None
         over_time = {"ngpt:temporal": "windows"}
         yield write(frames.pop(number)._replace(result=result, metrics=metrics, over_time=over_time))
         done = number + 1

@@ -12,6 +12,7 @@ from ngpt.io.exr import read, read_image
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
+from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
 from ngpt.system.console import Console, tell
@@ -30,8 +31,8 @@ CHANGE = "map of the root of d^2 / (m + 0.001), with the mean m of the squared p
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Folders are shots: the page plays them, and with a folder of references there is a table of errors and "
-        "flicker."
+        "Of one file alone all layers are shown. Folders are shots: the page plays them, and with a folder of "
+        "references there is a table of errors and flicker."
     )
     parser.add_argument(
         "images", nargs="+", metavar="IMAGE.exr", help="images of one size, of any renderer; or folders of frames"
@@ -60,7 +61,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
         check_size(path, image, args.images[0], images[0])
     height, width = images[0].shape[:2]
     entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
+    layers: dict[str, np.ndarray] = {}
     formulas, caption = {}, "no reference: with --ref the page has errors, SSIM, FLIP and their maps"
+    if len(images) == 1 and reference is None:
+        entries, layers = of_stack(read(args.images[0]), images[0], names[0])
+        caption = f"all layers of {args.images[0]}"
     if reference is not None:
         caption = f"reference {args.ref}"
         metrics, lacks = available(height, width)
@@ -78,7 +83,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         formulas = {name: METRICS[name].formula for name in metrics}
         print_table(entries)
     rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
-    scene = Scene(f"{width}x{height}", caption, reference, entries, rising=rising)
+    scene = Scene(f"{width}x{height}", caption, reference, entries, layers, rising)
     title = ", ".join(names) if len(names) < 5 else f"{len(names)} images"
     facts = {"ngpt": __version__}
     overview = Overview(formulas=formulas)

@@ -20,6 +20,7 @@ from ngpt.io.aliases import layers_of_light as find_light
 from ngpt.io.header import read_headers
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.io.primaries import converted, to_rec709
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
@@ -92,6 +93,8 @@ def read(
     ``isolated`` decodes the file in a process of its own, so that one made to crash the decoder is an NgptError too:
     for files of strangers (``ngpt.io.isolated``).
 
+    Colours stay in the primaries of the file, which its header attribute ``chromaticities`` names.
+
     Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place; and for
     such a file of a layer.
     """
@@ -148,12 +151,14 @@ def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
     """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
-    ``read`` takes for the primal.
+    ``read`` takes for the primal. Unlike there, light of other primaries is converted to linear Rec. 709
+    (``ngpt.io.primaries``): pictures are looked at and compared.
     """
     part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
     if all(name in part.channels for name in RGB):
-        return _gather(part, RGB)
-    return read(path, isolated=isolated)["primal"]
+        return converted(_gather(part, RGB), to_rec709(part.header))
+    stack = read(path, isolated=isolated)
+    return converted(stack["primal"], to_rec709(stack.attributes))
 
 
 def write(

@@ -36,6 +36,8 @@ class Scene:
     # show as colour.
     layers: dict[str, np.ndarray] = field(default_factory=dict)
     rising: Collection[str] = ()  # the metrics of which more is better; every other is an error
+    # Of maps whose colours say something else than how different: name -> meaning, five marks of the scale from 0 to 1
+    meanings: dict[str, tuple[str, list[str]]] = field(default_factory=dict)
 
     @property
     def pictures(self) -> list[tuple[str, np.ndarray]]:

@@ -5,6 +5,7 @@ Nothing here is for measuring: display clamps and rounds. Every function takes s
 """
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -27,12 +28,22 @@ def to_srgb8(image: np.ndarray, exposure_stops: float = 0.0) -> np.ndarray:
 
     Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta.
     """
+    return to_display8(image, encoded_srgb, exposure_stops)
+
+
+def encoded_srgb(light: np.ndarray) -> np.ndarray:
+    """Linear values from 0 on -> those of sRGB, in [0, 1]."""
+    linear = np.minimum(light, 1.0)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def to_display8(image: np.ndarray, transform: Callable[[np.ndarray], np.ndarray], stops: float) -> np.ndarray:
+    """As :func:`to_srgb8`, by a transform of its own: (H, W, 3) of light from 0 on -> display values."""
     image = _rgb(image)
     # Clamped before and after the gain: before, so that Inf and the largest floats cannot overflow into a NaN.
-    linear = np.clip(np.nan_to_num(image, nan=0.0, posinf=1e30, neginf=0.0), 0.0, 1e30)
-    linear = np.clip(linear * 2.0**exposure_stops, 0.0, 1.0)
-    encoded = np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-    out = np.floor(255.0 * encoded + 0.5).astype(np.uint8)
+    light = np.clip(np.nan_to_num(image, nan=0.0, posinf=1e30, neginf=0.0), 0.0, 1e30)
+    values = np.clip(transform(np.minimum(light * 2.0**stops, 1e30)), 0.0, 1.0)
+    out = np.floor(255.0 * values + 0.5).astype(np.uint8)
     out[np.isposinf(image).any(axis=2)] = 255
     out[np.isnan(image).any(axis=2)] = MAGENTA
     return out

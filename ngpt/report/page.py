@@ -23,6 +23,7 @@ from ngpt.report.content import REFERENCE, Overview, Scene
 from ngpt.report.markup import overview_html, section
 from ngpt.system.files import atomic_output
 
+_SOURCES = ("report.html", "live.js")
 PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
 
 
@@ -49,12 +50,35 @@ def write_report(
         raise NgptError(f"{path}: a report needs at least one scene")
     for scene in scenes:
         _check(path, scene)
-    exposures = [
-        display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
-        for scene in scenes
-    ]
+    exposures = [auto_exposure(scene) for scene in scenes]
     if shot:
         exposures = [float(np.median(exposures))] * len(scenes)
+    text = page_text(title, scenes, exposures, command=command, footer=footer, overview=overview, shot=shot)
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
+    return path
+
+
+def auto_exposure(scene: Scene) -> float:
+    """The exposure of a scene's pictures, in stops: that of its reference, or of the first."""
+    return display.auto_exposure(scene.entries[0].image if scene.reference is None else scene.reference)
+
+
+def page_text(
+    title: str,
+    scenes: list[Scene],
+    exposures: list[float],
+    *,
+    command: str,
+    footer: dict[str, str],
+    overview: Overview | None = None,
+    shot: bool = False,
+    live: int = 0,
+) -> str:
+    """The page; each scene is shown at the exposure of its own, in stops. For the rest see ``write_report``.
+
+    ``live`` is the number of a page of ``ngpt.report.live``, from 1 on: it has a script more, which asks for the next.
+    """
     sections = [section(number, scene, exposures[number]) for number, scene in enumerate(scenes)]
     after = overview_html(overview or Overview())
     taken = len(after) + sum(map(len, sections)) + 60_000  # the template, and a margin for the estimates below
@@ -70,8 +94,10 @@ def write_report(
         "range": display.ERROR_RANGE,
         "toe": pixelcodec.TOE,
     }
+    page |= {"live": live} if live else {}
     notes = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in footer.items())
-    text = _filled(
+    return _filled(
+        live=bool(live),
         TITLE=escape(title),
         COMMAND=escape(command),
         OVERVIEW=after,
@@ -81,9 +107,6 @@ def write_report(
         PAGE=json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         PIXELS="\n".join(pixels),
     )
-    with atomic_output(path, overwrite) as temporary:
-        temporary.write_text(text, encoding="utf-8", newline="\n")
-    return path
 
 
 def oversize(path: str | os.PathLike) -> str:
@@ -97,14 +120,19 @@ def oversize(path: str | os.PathLike) -> str:
     )
 
 
-def _filled(**parts: str) -> str:
+def _filled(live: bool, **parts: str) -> str:
     """The template with its marks replaced, in one pass so that no part is searched for the marks of another."""
-    text = (package_files("ngpt.report") / "report.html").read_text(encoding="utf-8")
+    text, more = ((package_files("ngpt.report") / name).read_text(encoding="utf-8") for name in _SOURCES)
+    # The policy names the styles and the scripts that may run: nothing a name smuggles in does.
     for tag in ("style", "script"):
-        # The policy names the one style and the one script that may run: nothing a name smuggles in does.
-        body = text.split(f"<{tag}>")[1].split(f"</{tag}>")[0]
-        parts[tag.upper() + "_HASH"] = "sha256-" + base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()
+        parts[tag.upper() + "_HASH"] = _source_hash(text.split(f"<{tag}>")[1].split(f"</{tag}>")[0])
+    parts["MORE_POLICY"] = f" {_source_hash(more)}; connect-src 'self'" if live else ""
+    parts["MORE_SCRIPT"] = f"<script>{more}</script>" if live else ""
     return re.sub(r"\{\{([A-Z_]+)\}\}", lambda mark: parts[mark.group(1)], text)
+
+
+def _source_hash(body: str) -> str:
+    return f"'sha256-{base64.b64encode(hashlib.sha256(body.encode()).digest()).decode()}'"
 
 
 def _check(path: Path, scene: Scene) -> None:
@@ -135,8 +163,9 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
     """What the script has to know of a scene, besides the pixels."""
     best = scene.best(next(iter(scene.entries[0].metrics), ""))
     names = [entry.name for entry in scene.entries]
-    second = names[best] if best is not None else (REFERENCE if scene.reference is not None else names[-1])
     first = scene.baseline.name
+    other = names[0] if first != names[0] else names[-1]
+    second = names[best] if best is not None else (REFERENCE if scene.reference is not None else other)
     return {
         "width": scene.entries[0].image.shape[1],
         "height": scene.entries[0].image.shape[0],
@@ -146,6 +175,7 @@ def _facts(scene: Scene, stops: float, steps: list[int]) -> dict:
         "layers": list(scene.layers),
         "reference": scene.reference is not None,
         "maps": list(dict.fromkeys(name for entry in scene.entries for name in entry.maps)),
+        "meanings": scene.meanings,
         "a": first,
         "b": second if second != first else names[-1],
     }

@@ -167,7 +167,7 @@ def test_info_prints_the_aliases(capsys):
         (["denoise", "{text}", "-o", "{dir}/o.exr"], "notes.exr: not an OpenEXR file"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l1"], "method 'l1' needs layers 'dx' and 'dy'"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx=gx"], "fits no layer"),
-        (["denoise", "{plain}", "-o", "{dir}/o.png"], "let the name end in .exr"),
+        (["denoise", "{plain}", "-o", "{dir}/o.tiff"], "let the name end in .exr or .png"),
         (["denoise", "{plain}", "-o", "{dir}/no/o.exr"], "does not exist; create it first"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx"], "'dx' is not of the form NAME=VALUE"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l3"], "invalid choice: 'l3'"),

@@ -133,7 +133,7 @@ def test_several_stacks_are_not_written_into_one_file(frames, tmp_path, capsys, 
 
 def test_a_name_that_cannot_be_written_is_an_error_before_any_work(frames, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr("ngpt.cli.denoise.reconstruct", lambda *_, **__: pytest.fail("worked"))
-    assert main(["denoise", str(frames / "0.exr"), "-o", str(tmp_path / "o.png")]) == 2
+    assert main(["denoise", str(frames / "0.exr"), "-o", str(tmp_path / "o.tiff")]) == 2
     assert "let the name end in .exr" in capsys.readouterr().err
 
 

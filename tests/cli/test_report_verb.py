@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ngpt.cli import main
-from ngpt.io.exr import write, write_exr
+from ngpt.io.exr import read, with_channels, write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
@@ -49,12 +49,28 @@ def test_images_of_two_renderers_on_one_page(tmp_path, image, capfd):
 
 def test_without_a_reference_there_is_nothing_to_measure(tmp_path, image, capfd):
     write(tmp_path / "a.exr", image)
-    assert main(["report", "-q", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]) == 0
+    write(tmp_path / "b.exr", image)
+    words = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
+    assert main(["report", "-q", *words, "-o", str(tmp_path / "page.html")]) == 0
     shown = facts(tmp_path / "page.html")
-    assert shown["pictures"] == ["a"] and not shown["reference"] and shown["maps"] == []
+    assert shown["pictures"] == ["a", "b"] and not shown["reference"] and shown["maps"] == []
     text = (tmp_path / "page.html").read_text()
     assert "no reference: with --ref" in text and "<h3>Measurements</h3>" not in text
     assert capfd.readouterr() == ("", "")
+
+
+def test_of_one_file_all_layers_are_shown(tmp_path, image, rng):
+    stack = GradientStack.from_arrays(primal=image, dx=image, albedo=image / 9, motion=image[..., :2])
+    stack = with_channels(stack, {"diagnostics.discarded": image[..., 0]})
+    write(tmp_path / "stack.exr", stack)
+    write(tmp_path / "result.exr", image / 2, like=read(tmp_path / "stack.exr"))
+    expected = {"stack": ["stack"], "result": ["result", "primal"]}
+    for name, pictures in expected.items():
+        assert main(["report", "-q", str(tmp_path / f"{name}.exr"), "-o", str(tmp_path / f"{name}.html")]) == 0
+        shown = facts(tmp_path / f"{name}.html")
+        assert shown["pictures"] == pictures
+        assert shown["layers"] == ["dx", "albedo", "motion", "diagnostics.discarded"]
+    assert (shown["a"], shown["b"]) == ("primal", "result")
 
 
 def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):

@@ -31,6 +31,15 @@ CONTRAST = """(() => {
 })()"""
 
 
+# Chromium warns of canvases that are read again and again, but not of these.
+COPY = """var copyOf = canvas => {
+  const size = {width: canvas.width, height: canvas.height};
+  const copy = Object.assign(document.createElement("canvas"), size).getContext("2d", {willReadFrequently: true});
+  copy.drawImage(canvas, 0, 0);
+  return copy;
+};"""
+
+
 def scene(height=24, width=36, maps=(), reference=True) -> Scene:
     rng = np.random.default_rng(0)
     image = rng.gamma(1.0, 1.0, (height, width, 3)).astype(np.float32)
@@ -69,7 +78,7 @@ def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(opened):
     assert len(found) > 40
     assert [text for text in found if text[0] < 4.5] == []
     for group in ("tabs", "exposures", "zooms", "layouts", "maps"):
-        buttons = f"[...document.querySelectorAll('#{group} button:enabled')]"
+        buttons = f"[...document.querySelectorAll('#{group} button:enabled:not([hidden])')]"
         for index in range(session.ask(f"{buttons}.length")):
             x, y = session.ask(
                 f"(b => [b.x + b.width / 2, b.y + b.height / 2])({buttons}[{index}].getBoundingClientRect())"
@@ -118,10 +127,51 @@ def test_stored_maps_show_in_the_colours_of_their_scale(opened):
     session.ask("document.querySelectorAll('[role=tab]')[1].click()")
     assert session.view()["map"] == ""
     disabled = session.ask("[...$('maps').children].map(button => [button.value, button.disabled])")
-    assert disabled == [["error", False], ["signed", False], ["FLIP", True]]
-    for expected in ("error", "signed", "", "error"):
+    assert disabled == [["error", False], ["signed", False], ["stops", False], ["FLIP", True]]
+    for expected in ("error", "signed", "stops", "", "error"):
         session.key("m")
         assert session.view()["map"] == expected
+
+
+def test_false_colour_shows_stops_from_middle_grey(opened):
+    grey = np.full((24, 36, 3), 0.18, np.float32)
+    grey[:, :12] *= 8  # three stops up
+    grey[:2, 24:] = np.nan
+    session = opened(Scene("s", "", None, [Entry("grey", grey), Entry("dark", grey / 4)]), map="stops")
+    stops = session.ask("page.scenes[0].stops")
+    session.ask(COPY)
+    pixel = "[...copyOf($('canvas-a')).getImageData({}, {}, 1, 1).data].slice(0, 3)"
+    for x, above in ((4, 3), (30, 0)):
+        place = round(255 * (0.5 + (above + stops) / 12))
+        found = np.array(session.ask(pixel.format(x, 9)))
+        assert np.abs(found - display.heat_table()[place - 1 : place + 2].astype(int)).sum(axis=1).min() == 0
+    assert session.ask(pixel.format(30, 1)) == list(display.MAGENTA)
+    assert session.ask("$('ticks').textContent") == "≤ \N{MINUS SIGN}6\N{MINUS SIGN}30+3≥ +6"
+    session.key("f")
+    assert session.view()["map"] == ""
+
+
+def test_the_histogram_has_both_pictures_where_their_light_is(opened):
+    grey = np.full((24, 36, 3), 0.18, np.float32)
+    session = opened(Scene("s", "", None, [Entry("grey", grey), Entry("dark", grey / 4)]))
+    # Columns, in stops from middle grey, where a line of this colour goes up.
+    peak = (
+        COPY
+        + """(colour => {
+        const c = $('histogram'), d = copyOf(c).getImageData(0, 0, c.width, c.height / 2).data, found = [];
+        for (let i = 0; i < d.length; i += 4)
+          if (colour.every((v, k) => Math.abs(d[i + k] - v) < 40))
+            found.push(((i / 4) % c.width + 0.5) / c.width * 16 - 8);
+        return found.length ? found.reduce((a, b) => a + b) / found.length : null;
+    })"""
+    )
+    amber, blue = [0xE3, 0xB2, 0x65], [0x7D, 0xB9, 0xDE]
+    for exposure in (0, 2):
+        session.ask(f"change({{exposure: {exposure}}})")
+        session.settle()
+        stops = session.ask("page.scenes[0].stops") + exposure
+        assert session.ask(f"{peak}({amber})") == pytest.approx(stops, abs=0.2)
+        assert session.ask(f"{peak}({blue})") == pytest.approx(stops - 2, abs=0.2)
 
 
 def test_pages_above_their_size_say_so(tmp_path, monkeypatch):

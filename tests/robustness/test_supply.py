@@ -102,6 +102,8 @@ def test_vulnerabilities(supply, capsys, monkeypatch):
 def test_no_code_unpickles_or_reaches_out():
     """What SECURITY.md promises, of our own code."""
     suspect = {"pickle", "marshal", "shelve", "urllib", "http", "requests", "socket", "ftplib"}
+    # What `ngpt render --live` and `--view` ask for: a page on the loopback address, and a viewer that is named.
+    asked_for = {"ngpt/report/live.py": {"http"}, "ngpt/report/tev.py": {"socket"}}
     files = [ROOT / "train.py", ROOT / "eval.py"]
     for folder in ("ngpt", "data_gen"):
         files += (ROOT / folder).rglob("*.py")
@@ -120,7 +122,8 @@ def test_no_code_unpickles_or_reaches_out():
                 continue
             else:
                 continue
-            assert not names & suspect, f"{path}: {names & suspect}"
+            found = (names & suspect) - asked_for.get(path.relative_to(ROOT).as_posix(), set())
+            assert not found, f"{path}: {found}"
 
 
 def test_the_page_tells_every_campaign(tmp_path):

@@ -1,0 +1,114 @@
+"""``ngpt render --live`` and ``--view``: who looks on while a render goes on, and how little that may cost."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+from ngpt.errors import NgptError, WrongUse
+from ngpt.report.live import LivePage
+from ngpt.report.preview import preview
+from ngpt.report.tev import Tev
+from ngpt.stack import GradientStack
+from ngpt.system.console import Console
+
+# Of the render's time, what making and sending images may take; the first may take half of what all may.
+SHARE, _AHEAD = 0.02, 0.5
+_CAUTION = 1.5
+# Seconds that the first image is expected to take: to load the method, and for a pixel.
+_LOAD, _PIXEL = 0.1, 3e-6
+
+
+class Onlookers:
+    """The page and the viewer of a render, those of them that are there; none costs nothing.
+
+    ``newest`` is what ``data_gen.render_scene`` calls after each pass, ``progress`` what it tells of it.
+    """
+
+    def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
+        self.page, self.viewer, self.say, self.unit = page, viewer, say, unit
+        self.line, self.shown = "ended without an image", False
+        self.start, self.spent, self.expected, self.left = time.perf_counter(), 0.0, 0.0, 0.0
+
+    @property
+    def enough(self) -> bool:
+        return self.page is not None and self.page.enough
+
+    def progress(self, done: int, total: int) -> None:
+        """How far the render is: (samples done, samples), or whole (seconds gone, seconds)."""
+        gone = time.perf_counter() - self.start
+        self.left = gone * (total - done) / done if done else 0.0
+        if self.page is not None and not self.page.ended:
+            left = f", about {self.left:.0f} s left" if self.left >= 1 else ""
+            far = (
+                f"{gone:.0f} of {total} s" if self.unit == "s" else f"{done} of {total} samples per pixel, {gone:.0f} s"
+            )
+            self.page.tell(far + left)
+
+    def newest(self, stack: Callable[[], GradientStack]) -> None:
+        """Shows the samples done by now, if somebody looks on and that costs little enough."""
+        if not self._watched():
+            return
+        begin = time.perf_counter()
+        made = None
+        if not self.expected:
+            made = stack()
+            self.expected = _LOAD + _PIXEL * made.width * made.height
+        if self._affordable(begin - self.start):
+            self._show(made or stack())
+            self.shown = True
+            # On a busy machine the next may well take longer.
+            self.expected = _CAUTION * (time.perf_counter() - begin)
+        self.spent += time.perf_counter() - begin
+
+    def last(self, stack: GradientStack, line: str) -> None:
+        """Shows the stack that is written by now, and tells a last line."""
+        self.line = line
+        if self._watched():
+            self._show(stack)
+
+    def close(self) -> None:
+        if self.viewer is not None:
+            self.viewer.close()
+        if self.page is not None:
+            self.page.close(self.line)
+
+    def _watched(self) -> bool:
+        return self.viewer is not None or (self.page is not None and self.page.watched)
+
+    def _affordable(self, gone: float) -> bool:
+        if not self.shown:
+            # Of what the whole render may cost: how long it takes is not known well yet.
+            gone = max(gone, _AHEAD * (gone + self.left))
+        return self.spent + self.expected <= SHARE * gone
+
+    def _show(self, stack: GradientStack) -> None:
+        shown = preview(stack)
+        if self.page is not None and self.page.watched:
+            spp, seconds = stack.attributes["ngpt:spp"], stack.attributes["ngpt:seconds"]
+            size = f"{stack.width}x{stack.height}"
+            self.page.show(shown, f"{size}, {spp} samples per pixel, {seconds:.3g} s")
+        if self.viewer is not None:
+            try:
+                self.viewer.show(shown.images)
+            except NgptError as error:
+                self.say(f"{error}; the render goes on")
+                self.viewer = None
+
+
+def onlookers(live: bool, view: str | None, scene: str, command: str, console: Console, unit: str) -> Onlookers:
+    """Those that were asked for, as far as they are there: who is not is told of in a line, and the render goes on."""
+    page = viewer = None
+    try:
+        viewer = Tev(view, scene) if view else None
+    except WrongUse:
+        raise
+    except NgptError as error:
+        console.error(f"{error}; the render goes on")
+    try:
+        page = LivePage(f"{scene}, live", command) if live else None
+    except NgptError as error:
+        console.error(f"{error}; the render goes on")
+    if page is not None:
+        console.say(f"live: {page.url}")
+    return Onlookers(page, viewer, console.say, unit)

@@ -1,0 +1,94 @@
+"""``ngpt picture``: PNG, JPEG and WebP of images, and films of shots, by a view transform."""
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.cli.arguments import add_force, add_look, exposed, frames_a_second
+from ngpt.errors import NgptError, WrongUse
+from ngpt.io.exr import read_image
+from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
+from ngpt.report.transforms import shown
+from ngpt.system.console import Console
+from ngpt.system.files import check_output
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = (
+        "Of a stack the noisy image is shown, of a result the result. All frames of a folder have one exposure."
+    )
+    parser.add_argument("image", metavar="IMAGE.exr", help="an image of any renderer, or a folder of frames")
+    parser.add_argument(
+        "-o",
+        "--output",
+        required=True,
+        metavar="FILE",
+        help=f"picture to write ({' '.join(PICTURES)}); of a folder a film ({' '.join(SHOTS)}), or a folder for PNGs",
+    )
+    add_look(parser)
+    parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
+    add_force(parser)
+
+
+def run(args: argparse.Namespace, console: Console) -> int:
+    source, target = Path(args.image), Path(args.output)
+    if source.is_dir():
+        return shot(args, source, target, console)
+    check_kind(target, PICTURES)
+    check_output(target, args.force)
+    image = read_image(source)
+    write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
+    console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
+    return 0
+
+
+def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console) -> int:
+    """A film of a folder's frames, or a picture of each."""
+    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
+    if not files:
+        raise NgptError(f"{folder}: no .exr files there")
+    film = bool(target.suffix)
+    if film:
+        check_kind(target, SHOTS)
+        check_output(target, args.force)
+    elif target.exists() and not target.is_dir():
+        raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
+    stops = exposed(args.exposure, read_image(files[0]))
+
+    def pictures():
+        for done, file in enumerate(files):
+            progress(done, len(files))
+            yield file, shown(read_image(file), args.transform, stops)
+        progress(len(files), len(files))
+
+    with console.progress("pictures", "frames") as progress:
+        if film:
+            write_shot(target, (pixels for _, pixels in pictures()), args.fps, args.force)
+        else:
+            write_each(target, pictures(), args.force)
+    console.say(f"{folder} -> {target}: {len(files)} frames")
+    return 0
+
+
+def write_each(folder: Path, pictures, overwrite: bool) -> None:
+    """A PNG of each (file, pixels) in a folder, which is made if there is none."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
+    pixels: np.ndarray
+    for file, pixels in pictures:
+        write_picture(folder / f"{file.stem}.png", pixels, overwrite)
+
+
+def check_picture(target: Path, args: argparse.Namespace) -> None:
+    """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
+    if target.suffix.lower() not in PICTURES:
+        raise WrongUse(f"{target}: results are OpenEXR, or pictures; let the name end in .exr or {' '.join(PICTURES)}")
+    for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
+        if given:
+            raise WrongUse(f"{option} makes layers, which a picture has none of; let {target} end in .exr")
+    if args.skip_existing:
+        raise WrongUse("--skip-existing knows whole files of OpenEXR alone; leave it out for a picture")
+    check_kind(target, PICTURES)

@@ -1,0 +1,84 @@
+"""Which red, green and blue a file means: its header's ``chromaticities``; and linear Rec. 709, in which it is shown.
+
+By OpenEXR's rule a file without the attribute is of Rec. 709: https://openexr.com/en/latest/TechnicalIntroduction.html
+"""
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ngpt.stack import GradientStack
+
+_LOG = logging.getLogger(__name__)
+
+ATTRIBUTE = "chromaticities"
+# x, y of red, green, blue and white.
+REC709 = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+REC2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+ACES_AP0 = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+ACES_AP1 = (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, 0.32168, 0.33767)
+# Cone responses of Bradford, in which a white is adapted to another.
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+_BEYOND = 0.01  # of the pixels
+_SAME = 1e-4  # of a coordinate; files hold 32-bit floats, and standards four digits
+
+
+def to_rec709(attributes: Mapping[str, Any]) -> np.ndarray | None:
+    """The matrix (3, 3) that takes colours of a file with such header attributes to linear Rec. 709.
+
+    None where it is of Rec. 709 already, where it does not say what it is of, and where what it says is nonsense, of
+    which the log has a warning. White becomes white: where the two differ, by Bradford's adaptation.
+    """
+    found = attributes.get(ATTRIBUTE)
+    if found is None:
+        return None
+    try:
+        values = np.asarray(found, np.float64).ravel()
+        if values.shape != (8,) or not np.isfinite(values).all():
+            raise ValueError("they are no eight numbers")
+        if np.abs(values - REC709).max() <= _SAME:
+            return None
+        return _conversion(values)
+    except (ValueError, TypeError, np.linalg.LinAlgError) as error:
+        _LOG.warning("chromaticities %s are left out of account: %s", found, error)
+        return None
+
+
+def inside_rec709(stack: GradientStack) -> np.ndarray | None:
+    """``to_rec709`` of a stack, where nearly all of its light is within Rec. 709, else None.
+
+    What is beyond has negative components there, which OIDN takes for 0 (docs/use/from-your-renderer.md has the price).
+    """
+    matrix = to_rec709(stack.attributes)
+    if matrix is None:
+        return None
+    beyond = (converted(stack["primal"], matrix) < 0).any(axis=-1) & (stack["primal"] >= 0).all(axis=-1)
+    return matrix if beyond.mean() <= _BEYOND else None
+
+
+def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
+    """(H, W, 3) by a matrix; the image itself where there is none. Pixels that are not finite spoil no others."""
+    if matrix is None:
+        return image
+    with np.errstate(over="ignore", invalid="ignore"):
+        return np.ascontiguousarray(image @ matrix.T.astype(image.dtype))
+
+
+def _conversion(chromaticities: np.ndarray) -> np.ndarray:
+    theirs, ours = _to_xyz(chromaticities), _to_xyz(np.array(REC709))
+    white, aim = (_BRADFORD @ matrix.sum(axis=1) for matrix in (theirs, ours))
+    if (white <= 0).any():
+        raise ValueError("their white is none")
+    adapted = np.linalg.solve(_BRADFORD, np.diag(aim / white) @ _BRADFORD)
+    return np.linalg.solve(ours, adapted @ theirs)
+
+
+def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:
+    """Columns: red, green and blue in CIE XYZ, of such brightness that together they are white of Y = 1."""
+    x, y = chromaticities.reshape(4, 2).T
+    if (np.abs(y[3]) < 1e-6) or abs(np.linalg.det(np.stack([x, y, 1 - x - y])[:, :3])) < 1e-6:
+        raise ValueError("they span no colours")
+    columns = np.stack([x, y, 1 - x - y])
+    return columns[:, :3] * np.linalg.solve(columns[:, :3], columns[:, 3] / y[3])

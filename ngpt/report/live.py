@@ -1,0 +1,151 @@
+"""The page of a render that goes on: a small web server on the loopback address, which nobody beyond this machine sees.
+
+    GET  /         the page of the newest images; the report's, with a script that asks for more
+    GET  /status   {"number": of those images, "text": how far the render is, "ended": whether it is over}
+    POST /enough   ends the render, as Ctrl-C does; only from the page itself
+
+Nothing else is answered, and nothing that a browser sends is kept. A page that another site makes a browser open is
+told nothing: requests by another name than ours are refused, and so is an ``enough`` of another origin.
+"""
+
+import json
+import os
+import threading
+import time
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+from ngpt.errors import NgptError
+from ngpt.report.page import auto_exposure, page_text
+from ngpt.report.preview import Preview
+from ngpt.version import __version__
+
+ADDRESS, PORT = "127.0.0.1", 8642
+# Seconds after which somebody who asked no more has gone; and that those who look on are waited for at the end.
+_GONE, _FAREWELL = 5.0, 2.5
+_FIRST = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="1">
+<meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="dark">
+<title>ngpt render</title><p>Rendering. The first image comes after the first passes.</p></html>"""
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "X-Frame-Options": "DENY",  # lest a page lay itself over the button
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+class LivePage:
+    """Serves until ``close``; ``enough`` says whether its button was pressed.
+
+    Listens on ``port``, or where that is in use on any that is free. Raises NgptError where there is none.
+    """
+
+    def __init__(self, title: str, command: str, port: int = PORT):
+        self.title, self.command = title, command
+        self.enough, self.ended = False, False
+        self.number, self.text, self.line = 0, _FIRST, "rendering"
+        self.exposure: float | None = None
+        self._asked, self._told_end = -_GONE, threading.Event()
+        try:
+            self.server = _listening(port, self)
+        except OSError as error:
+            raise NgptError(f"--live: no port of {ADDRESS} can be had for it ({error.strerror})") from None
+        self.thread = threading.Thread(target=self.server.serve_forever, kwargs={"poll_interval": 0.1}, daemon=True)
+        self.thread.start()
+
+    @property
+    def url(self) -> str:
+        return f"http://{ADDRESS}:{self.server.server_port}/"
+
+    @property
+    def watched(self) -> bool:
+        """Whether somebody looks on: has asked in the last seconds."""
+        return time.monotonic() - self._asked < _GONE
+
+    def show(self, preview: Preview, caption: str) -> None:
+        """Puts images in place of those before, at the exposure of the first."""
+        scene = preview.scene("newest", caption)
+        if self.exposure is None:
+            self.exposure = auto_exposure(scene)
+        number = self.number + 1
+        facts = {"ngpt": __version__}
+        text = page_text(self.title, [scene], [self.exposure], command=self.command, footer=facts, live=number)
+        self.text, self.number = text, number
+
+    def tell(self, line: str) -> None:
+        """How far the render is, in one line."""
+        self.line = line
+
+    def close(self, line: str) -> None:
+        """Says the last word to those who look on, and stops serving."""
+        self.line, self.ended = line, True
+        if self.watched:
+            self._told_end.wait(_FAREWELL)
+            time.sleep(0.2)  # Who was told asks for the last images.
+        self.server.shutdown()
+        self.server.server_close()
+
+    def answer(self, path: str) -> tuple[str, str] | None:
+        """Type and text of what there is at ``path``, None if there is nothing."""
+        if path == "/":
+            self._asked = time.monotonic()
+            return "text/html", self.text
+        if path == "/status":
+            self._asked = time.monotonic()
+            news = {"number": self.number, "text": self.line, "ended": self.ended}
+            if self.ended:
+                self._told_end.set()
+            return "application/json", json.dumps(news)
+        return None
+
+
+def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
+    handler = type("Handler", (_Handler,), {"page": page})
+    try:
+        return _Server((ADDRESS, port), handler)
+    except OSError:
+        return _Server((ADDRESS, 0), handler)
+
+
+class _Server(ThreadingHTTPServer):
+    daemon_threads = True
+    allow_reuse_address = os.name != "nt"  # There two could listen on one port.
+
+
+class _Handler(BaseHTTPRequestHandler):
+    page: LivePage
+    server: _Server
+    timeout = 10
+
+    def do_GET(self) -> None:
+        if not self._meant():
+            return self._send(HTTPStatus.FORBIDDEN)
+        if self.path == "/favicon.ico":  # which browsers ask for, and complain about
+            return self._send(HTTPStatus.NO_CONTENT)
+        found = self.page.answer(self.path)
+        return self._send(HTTPStatus.OK, *found) if found else self._send(HTTPStatus.NOT_FOUND)
+
+    def do_POST(self) -> None:
+        if not (self._meant() and self.headers.get("Origin") == f"http://{self.headers['Host']}"):
+            return self._send(HTTPStatus.FORBIDDEN)
+        if self.path != "/enough":
+            return self._send(HTTPStatus.NOT_FOUND)
+        self.page.enough = True
+        return self._send(HTTPStatus.NO_CONTENT)
+
+    def _meant(self) -> bool:
+        """Whether the browser meant us, and not a name of somebody else that leads here."""
+        return self.headers.get("Host") in {f"{host}:{self.server.server_port}" for host in (ADDRESS, "localhost")}
+
+    def _send(self, status: HTTPStatus, kind: str = "text/plain", text: str = "") -> None:
+        data = text.encode()
+        self.send_response(status)
+        for name, value in {**_HEADERS, "Content-Type": f"{kind}; charset=utf-8"}.items():
+            self.send_header(name, value)
+        if status != HTTPStatus.NO_CONTENT:
+            self.send_header("Content-Length", str(len(data)))
+        self.end_headers()
+        self.wfile.write(data)
+
+    def log_message(self, format: str, *args) -> None:
+        """Nothing: the terminal belongs to the render."""

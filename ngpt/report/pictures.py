@@ -1,0 +1,111 @@
+"""Pictures and films of 8-bit sRGB: PNG by ourselves, JPEG and WebP by Pillow, MP4 by FFmpeg.
+
+A shot is an animated WebP, without loss, or an MP4 (H.264 where FFmpeg has it). FFmpeg is the program of that name, or
+that of the package imageio-ffmpeg.
+"""
+
+import os
+import shutil
+import subprocess
+from collections.abc import Iterable, Iterator
+from importlib.util import find_spec
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.report.png import encode_png
+from ngpt.system.files import atomic_output
+from ngpt.system.install import package_command
+
+PICTURES = (".png", ".jpg", ".jpeg", ".webp")
+SHOTS = (".webp", ".mp4")
+_QUALITY = 95  # of JPEG; no colour is stored at half the size
+
+
+def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
+    """Raises NgptError for files that are not of these kinds, or that cannot be made on this machine."""
+    kind = path.suffix.lower()
+    if kind not in kinds:
+        raise NgptError(f"{path}: is of no kind that is made here; let the name end in one of {' '.join(kinds)}")
+    if kind not in (".png", ".mp4") and find_spec("PIL") is None:
+        raise NgptError(f"{path}: JPEG and WebP need Pillow: {package_command('pillow')}")
+    if kind == ".mp4":
+        _ffmpeg(path)
+
+
+def write_picture(path: Path, pixels: np.ndarray, overwrite: bool = False) -> None:
+    """Writes (H, W, 3) uint8 of sRGB as PNG, JPEG or WebP (without loss), by the name's end."""
+    check_kind(path, PICTURES)
+    with atomic_output(path, overwrite) as temporary:
+        if path.suffix.lower() == ".png":
+            temporary.write_bytes(encode_png(pixels))
+            return
+        from PIL import Image
+
+        webp: dict[str, Any] = {"lossless": True}
+        jpeg: dict[str, Any] = {"quality": _QUALITY, "subsampling": 0}
+        Image.fromarray(pixels).save(temporary, **(webp if path.suffix.lower() == ".webp" else jpeg))
+
+
+def write_shot(path: Path, frames: Iterable[np.ndarray], fps: float, overwrite: bool = False) -> None:
+    """Writes frames (H, W, 3) uint8 of sRGB, all of one size, as an animated WebP or an MP4, by the name's end."""
+    check_kind(path, SHOTS)
+    one_size = _of_one_size(path, frames)
+    first = next(one_size)
+    with atomic_output(path, overwrite) as temporary:
+        if path.suffix.lower() == ".mp4":
+            _write_mp4(path, temporary, chain([first], one_size), first.shape[1::-1], fps)
+            return
+        from PIL import Image
+
+        rest = (Image.fromarray(frame) for frame in one_size)
+        # Durations are whole milliseconds.
+        options: dict[str, Any] = {"save_all": True, "lossless": True, "duration": max(round(1000 / fps), 1), "loop": 0}
+        Image.fromarray(first).save(temporary, append_images=rest, **options)
+
+
+def _of_one_size(path: Path, frames: Iterable[np.ndarray]) -> Iterator[np.ndarray]:
+    shape = None
+    for number, frame in enumerate(frames):
+        shape = shape or frame.shape
+        if frame.shape != shape:
+            sizes = [f"{width}x{height}" for height, width, _ in (frame.shape, shape)]
+            raise NgptError(f"{path}: frame {number} is {sizes[0]} and the first {sizes[1]}; all must be of one size")
+        yield frame
+
+
+def _ffmpeg(path: Path) -> str:
+    if found := shutil.which("ffmpeg"):
+        return found
+    if find_spec("imageio_ffmpeg"):
+        import imageio_ffmpeg
+
+        return imageio_ffmpeg.get_ffmpeg_exe()
+    raise NgptError(f"{path}: MP4 needs FFmpeg: {package_command('imageio-ffmpeg')}; or take .webp")
+
+
+def _write_mp4(path: Path, temporary: Path, frames: Iterable[np.ndarray], size: tuple[int, int], fps: float) -> None:
+    command = [_ffmpeg(path), "-loglevel", "error", "-nostdin", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"]
+    command += ["-s", f"{size[0]}x{size[1]}", "-r", f"{fps:g}", "-i", "-", "-an"]
+    # Players want even sides, and are told which colours these are.
+    command += ["-vf", "pad=ceil(iw/2)*2:ceil(ih/2)*2,scale=out_color_matrix=bt709:out_range=tv", "-pix_fmt", "yuv420p"]
+    command += ["-colorspace", "bt709", "-color_primaries", "bt709", "-color_trc", "iec61966-2-1", "-f", "mp4"]
+    # As it would be without: a name that begins with a dash, or like a protocol, is a file's all the same.
+    command += ["-q:v", "2", "-movflags", "+faststart", f"file:{os.path.abspath(temporary)}"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as process:
+        assert process.stdin is not None and process.stderr is not None
+        try:
+            for frame in frames:
+                process.stdin.write(np.ascontiguousarray(frame).tobytes())
+            process.stdin.close()
+        except BrokenPipeError:
+            pass  # What it says of that follows.
+        except BaseException:
+            process.kill()
+            raise
+        said = process.stderr.read().decode(errors="replace").strip().splitlines()
+    if process.returncode:
+        raise NgptError(f"{path}: FFmpeg failed: {said[-1] if said else f'status {process.returncode}'}")

@@ -1,0 +1,71 @@
+"""View transforms: from scene-linear light of Rec. 709 to 8-bit sRGB, as pictures for people have it.
+
+standard  the sRGB curve (IEC 61966-2-1); what is above 1 is white
+filmic    AgX: highlights roll off and lose their colour, as on film
+aces      ACES 1.3, "ACES 1.0 - SDR Video", by OpenColorIO's built-in configuration; needs its package
+"""
+
+from collections.abc import Callable
+from functools import lru_cache
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.report.display import encoded_srgb, to_display8
+from ngpt.system.install import package_command
+
+# AgX (Troy Sobotka) in the form of B. Wrensch, "Minimal AgX implementation" (iolite-engine.com, 2023): primaries drawn
+# toward grey, stops from 2^-12.47393 to 2^4.026069, a polynomial for the curve, primaries drawn back.
+_INSET = np.array(
+    [
+        [0.842479062253094, 0.0784335999999992, 0.0792237451477643],
+        [0.0423282422610123, 0.878468636469772, 0.0791661274605434],
+        [0.0423756549057051, 0.0784336, 0.879142973793104],
+    ]
+)
+_DARKEST, _BRIGHTEST = -12.47393, 4.026069
+_CURVE = (-17.86, 78.01, -126.7, 92.06, -28.72, 4.361, -0.1718, 0.002857)  # highest power first
+_CONFIGURATION = "ocio://cg-config-v2.1.0_aces-v1.3_ocio-v2.3"
+
+
+def filmic(light: np.ndarray) -> np.ndarray:
+    """(H, W, 3) from 0 on -> display values of sRGB, by AgX."""
+    stops = np.log2(np.maximum(light @ _INSET.T, 2.0**_DARKEST))
+    place = np.clip((stops - _DARKEST) / (_BRIGHTEST - _DARKEST), 0.0, 1.0)
+    return np.polyval(_CURVE, place) @ np.linalg.inv(_INSET).T
+
+
+def aces(light: np.ndarray) -> np.ndarray:
+    """(H, W, 3) from 0 on -> display values of sRGB, by OpenColorIO."""
+    image = np.ascontiguousarray(light, np.float32)
+    _aces().applyRGB(image)
+    return image
+
+
+@lru_cache(maxsize=1)
+def _aces() -> Any:
+    if find_spec("PyOpenColorIO") is None:
+        raise NgptError(f"--transform aces needs OpenColorIO: {package_command('opencolorio>=2.3')}")
+    import PyOpenColorIO as ocio
+
+    config = ocio.Config.CreateFromFile(_CONFIGURATION)
+    view = ("Linear Rec.709 (sRGB)", "sRGB - Display", "ACES 1.0 - SDR Video", ocio.TRANSFORM_DIR_FORWARD)
+    return config.getProcessor(*view).getDefaultCPUProcessor()
+
+
+TRANSFORMS: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "standard": encoded_srgb,
+    "filmic": filmic,
+    "aces": aces,
+}
+
+
+def shown(image: np.ndarray, transform: str = "standard", stops: float = 0.0) -> np.ndarray:
+    """(H, W, 3) scene-linear of Rec. 709 -> uint8 sRGB, after multiplication by 2**stops.
+
+    Negative values show as 0, a pixel with +Inf as white, a pixel with NaN as magenta. Raises NgptError where the
+    transform needs a package that is not installed.
+    """
+    return to_display8(image, TRANSFORMS[transform], stops)

@@ -1,0 +1,148 @@
+"""The page of a render that goes on: what its server answers to whom, and what a browser makes of it."""
+
+import http.client
+import json
+import socket
+import time
+
+import numpy as np
+import pytest
+from browser import Session
+
+from ngpt.report.live import LivePage
+from ngpt.report.preview import preview
+from ngpt.stack import GradientStack
+
+
+def stack(level, seed=0):
+    rng = np.random.default_rng(seed)
+    image = rng.gamma(20.0, level / 20, (24, 36, 3)).astype(np.float32)
+    layers = {"primal": image, "albedo": np.full_like(image, 0.5), "normal": np.full_like(image, 0.577)}
+    variance = np.full_like(image, level**2 / 20)
+    return GradientStack.from_arrays(**layers, primal_var=variance, samples=np.full((24, 36, 1), 16.0))
+
+
+@pytest.fixture
+def page():
+    served = LivePage("a scene, live", "ngpt render a --live", port=0)
+    yield served
+    if served.thread.is_alive():
+        served._asked = -1e9  # Nobody looks on any more.
+        served.close("ended")
+
+
+def asked(page, method, path, **headers):
+    """Status, headers and text of an answer."""
+    connection = http.client.HTTPConnection("127.0.0.1", page.server.server_port, timeout=10)
+    try:
+        connection.request(method, path, headers=headers)
+        answer = connection.getresponse()
+        return answer.status, answer.headers, answer.read().decode()
+    finally:
+        connection.close()
+
+
+def test_nobody_but_this_machine_is_served_and_nothing_but_three_paths(page):
+    assert page.server.server_address[0] == "127.0.0.1" and page.url.startswith("http://127.0.0.1:")
+    assert not page.watched
+    status, headers, text = asked(page, "GET", "/")
+    assert status == 200 and "first image" in text and page.watched
+    assert headers["Cache-Control"] == "no-store" and headers["X-Frame-Options"] == "DENY"
+    page.tell("64 of 256 <b>")
+    assert json.loads(asked(page, "GET", "/status")[2]) == {"number": 0, "text": "64 of 256 <b>", "ended": False}
+    for method, path in (("GET", "/etc/passwd"), ("GET", "/../live.py"), ("GET", "/enough"), ("POST", "/")):
+        origin = {"Origin": page.url.rstrip("/")}
+        assert asked(page, method, path, **origin)[0] == 404, path
+    for method in ("PUT", "DELETE", "OPTIONS"):
+        assert asked(page, method, "/enough")[0] == 501
+    assert page.enough is False
+
+
+def test_only_the_page_itself_ends_the_render(page):
+    port = page.server.server_port
+    for headers in (
+        {},
+        {"Origin": "null"},
+        {"Origin": "http://evil.example"},
+        {"Origin": f"https://127.0.0.1:{port}"},
+        {"Origin": f"http://evil.example:{port}", "Host": f"evil.example:{port}"},  # a name that was bound anew
+    ):
+        assert asked(page, "POST", "/enough", **headers)[0] == 403
+        assert not page.enough
+    assert asked(page, "GET", "/", Host="evil.example")[0] == 403
+    assert asked(page, "POST", "/enough", Origin=f"http://127.0.0.1:{port}")[0] == 204
+    assert page.enough
+
+
+def test_a_port_in_use_is_no_obstacle(page):
+    other = LivePage("t", "c", page.server.server_port)
+    assert other.server.server_port != page.server.server_port
+    other.close("ended")
+    with pytest.raises(ConnectionRefusedError):
+        socket.create_connection(("127.0.0.1", other.server.server_port), 5)
+
+
+def test_a_browser_sees_newer_images_and_ends_the_render(page, tmp_path):
+    first = stack(0.25)
+    del first.layers["samples"]
+    page.show(preview(first), "the first")
+    session = Session(tmp_path / "profile", page.url)
+    try:
+        names = session.ask("page.scenes[0].pictures.join()").split(",")
+        assert names[0] == "noisy" and len(names) == 2
+        value = "+document.querySelectorAll('#value-a td')[1].textContent"
+        assert session.ask(value) == pytest.approx(0.25, rel=1)
+        maps = "[...$('maps').children].filter(b => !b.disabled).map(b => b.value).join()"
+        assert session.ask(maps) == "stops,std. error"
+        session.ask("document.querySelector('#maps button[value=\"std. error\"]').click()")
+        session.settle()
+        assert "relative to the light" in session.ask("$('meaning').textContent")
+        session.ask("change({map: '', exposure: 1, split: 30})")
+        session.settle()
+        page.tell("32 of 64")
+        page.show(preview(stack(8.0, 1)), "the second")
+        end = time.monotonic() + 20
+        while session.ask("page.live") < 2 and time.monotonic() < end:
+            time.sleep(0.05)
+        session.settle()
+        assert session.ask("document.querySelector('.caption').textContent") == "the second"
+        assert session.ask(maps) == "stops,std. error,samples"
+        assert session.ask(value) == pytest.approx(8, rel=1) and session.ask("told.textContent") == "32 of 64"
+        # What was chosen stays.
+        assert session.view().items() >= {"exposure": "1", "split": "30", "a": "noisy", "map": ""}.items()
+        session.resize(420, 860)
+        assert session.ask("document.documentElement.scrollWidth") == 420
+        session.ask("enough.click()")
+        while not page.enough and time.monotonic() < end:
+            time.sleep(0.05)
+        assert page.enough
+        page.close("ended: it is written")
+        assert session.ask("told.textContent") == "ended: it is written" and session.ask("enough.hidden") is True
+        assert session.complaints == []
+    finally:
+        session.close()
+
+
+def test_a_browser_says_when_the_render_was_killed(page, tmp_path):
+    page.show(preview(stack(0.25)), "the first")
+    session = Session(tmp_path / "profile", page.url)
+    try:
+        page.server.shutdown()
+        page.server.server_close()
+        end = time.monotonic() + 20
+        while session.ask("told.textContent") != "the render is gone" and time.monotonic() < end:
+            time.sleep(0.05)
+        assert session.ask("told.textContent") == "the render is gone"
+        assert session.ask("document.documentElement.dataset.error ?? null") is None
+    finally:
+        session.close()
+
+
+def test_what_is_shown_of_a_stack_follows_its_layers():
+    bare = GradientStack.from_arrays(primal=np.full((16, 20, 3), 0.5))
+    shown = preview(bare)
+    assert next(iter(shown.images)) == "noisy" and all(not maps for maps in shown.maps.values())
+    full = preview(stack(1.0))
+    assert full.most == 16 and all(set(maps) == {"std. error", "samples"} for maps in full.maps.values())
+    # A standard error of 22 % is two thirds of the way from 1 % to 100 %.
+    assert np.median(full.maps["noisy"]["std. error"]) == pytest.approx(np.log10(22.4) / 2, abs=0.1)
