@@ -18,6 +18,8 @@ from ngpt.system.interrupts import Interrupt
 
 def test_frames_are_ranges_lists_and_steps():
     assert frames("0:3") == [0, 1, 2] and frames("0:10:4") == [0, 4, 8] and frames("7") == [7]
+    assert frames("1-3") == [1, 2, 3] and frames("1-9x4,20") == [1, 5, 9, 20] and frames("-2--1") == [-2, -1]
+    assert frames("7-7:2") == [7] and frames("3-1:-1") == [3, 2, 1]
     assert frames("1,5:7,5") == [1, 5, 6] and frames("-2:1") == [-2, -1, 0] and frames("3:0:-1") == [3, 2, 1]
 
 
