@@ -210,7 +210,7 @@ def _pictures(run: Run) -> str:
     for row, view in enumerate(told["views"]):
         text = f"{escape(str(view['scene']))}, {view['spp']} spp"
         given, made = (_number(view.get(name, math.nan)) for name in ("relMSE primal", "relMSE"))
-        errors = f"relMSE of the input {given}, of the result {made}"
+        errors = f"relMSE {given} &rarr; {made}"
         strip = f'<div class="strip {_key(run)} row{row}"></div>'
         strips.append(
             f'<figure class="wide"><div class="{_key(run)}-box">{heads}{strip}</div>'
