@@ -6,6 +6,8 @@ from pathlib import Path
 from ngpt.cli.arguments import add_config, part
 from ngpt.system import configs
 from ngpt.system.console import Console
+from ngpt.system.files import exclusive
+from ngpt.training.dataset import Dataset
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,6 +19,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--workers", type=int, default=1, help="processes (default: 1, which uses all cores by threads)"
     )
     parser.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to run on")
+    parser.add_argument(
+        "--layout",
+        choices=("oidn",),
+        help="when all of the set is made, write it once more as images: DIR/oidn/train and DIR/oidn/valid, for the "
+        "training of Open Image Denoise",
+    )
     parser.add_argument("--variant", default="llvm_ad_rgb", help="Mitsuba variant (default: llvm_ad_rgb)")
 
 
@@ -32,4 +40,22 @@ def run(args: argparse.Namespace, console: Console) -> int:
     with executor as workers, console.progress(str(args.out), "crops") as progress:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
     write_card(args.out)
+    if args.layout:
+        write_oidn(args.out, console)
     return 0
+
+
+def write_oidn(out: Path, console: Console) -> None:
+    """The set once more as images, once it is whole: of several parts the last one to end writes it."""
+    from data_gen.dataset.oidn import write_layout
+
+    data, target = Dataset(out), out / "oidn"
+    made = sum(len(entry["crops"]) + len(entry["failures"]) for entry in data.manifest["shards"])
+    if made < data.manifest["planned"]:
+        console.say(f"{target}: is written when all crops are made; {made} of {data.manifest['planned']} are")
+        return
+    with exclusive(out, wait=True), console.progress(str(target), "crops") as progress:
+        left_out = write_layout(data, target, progress)
+    if left_out:
+        console.say(f"{target}: without {left_out} inputs that have as many samples as another of their crop")
+    console.say(f"{target}: python preprocess.py hdr alb nrm --filter RT -D {target.resolve()} -t train -v valid")

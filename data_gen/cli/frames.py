@@ -12,20 +12,34 @@ _MOST = 1_000_000
 
 
 def frames(text: str) -> list[int]:
-    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order."""
+    """``0:120`` (120 is not in it), ``0:120:2``, ``7``, or several of them with commas between; in order.
+
+    And as farms write them, with the last one in it: ``1-10``, ``1-9x2``, ``1-9:2``.
+    """
     numbers: dict[int, None] = {}
     for part in text.split(","):
         try:
-            values = [int(number) for number in part.split(":")]
+            values = _of_a_farm(part) or [int(number) for number in part.split(":")]
         except ValueError:
             values = []
         if len(values) not in (1, 2, 3):
-            raise argparse.ArgumentTypeError(f"'{part}' is no frame; write 7, 0:120 (120 is not in it) or 0:120:2")
+            raise argparse.ArgumentTypeError(
+                f"'{part}' is no frame; write 7, 0:120 (120 is not in it), 0:120:2, or 0-119 (119 is in it)"
+            )
         found = range(values[0], values[0] + 1) if len(values) == 1 else range(*values) if 0 not in values[2:] else ()
         if not found or len(found) > _MOST:
             raise argparse.ArgumentTypeError(f"'{part}' are {len(found)} frames; write START:END or START:END:STEP")
         numbers.update(dict.fromkeys(found))
     return list(numbers)
+
+
+def _of_a_farm(part: str) -> list[int]:
+    """First, end and step of ``1-10``, whose end is in it; [] for anything else."""
+    match = re.fullmatch(r"(-?\d+)-(-?\d+)(?:[x:](-?\d+))?", part)
+    if not match:
+        return []
+    step = int(match[3] or 1)
+    return [int(match[1]), int(match[2]) + (1 if step > 0 else -1), step]
 
 
 def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Path]:

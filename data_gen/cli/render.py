@@ -15,6 +15,7 @@ from data_gen.shot_files import Written, report_of, write_frames, write_frames_o
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.errors import WrongUse
 from ngpt.io.exr import write
+from ngpt.io.whole import finished
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.interrupts import Interrupt
@@ -103,7 +104,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames",
         type=frames,
         metavar="FRAMES",
-        help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9",
+        help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9; "
+        "or as farms write them: 1-10 (10 is in it), 1-9x2",
     )
     shot.add_argument(
         "--camera",
@@ -126,7 +128,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing = parser.add_mutually_exclusive_group()
     add_force(existing)
     existing.add_argument(
-        "--skip-existing", action="store_true", help="leave frames out whose stacks are there: goes on with a shot"
+        "--skip-existing",
+        action="store_true",
+        help="leave out what is there: goes on with a shot, or a queue of images",
     )
     add_json(parser)
 
@@ -147,15 +151,18 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 def image(args: argparse.Namespace, console: Console) -> int:
     """One stack."""
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
-    for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
+    for option, given in apart.items():
         if given:
             raise WrongUse(f"{option} belongs to a shot; name its frames: --frames 0:120")
     for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
             raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
-    target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force)
+    target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force or args.skip_existing)
     if target.suffix.lower() != ".exr":
         raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+    if args.skip_existing and finished(target):
+        console.say(f"{target}: skipped: the stack is there")
+        return 0
 
     def chosen(plan) -> None:
         how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
@@ -189,7 +196,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
             **asked(args),
         )
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
-        write(target, stack, overwrite=args.force)
+        write(target, stack, overwrite=args.force or args.skip_existing)
         looking.last(stack, f"ended: {target} is written")
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")

@@ -16,7 +16,9 @@ from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
 from ngpt.system.console import Console, tell
-from ngpt.system.files import check_output
+from ngpt.system.files import atomic_output, check_output
+from ngpt.training.run_page import page, read_run
+from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
 
 # Denoising moves the mean by a fraction of this.
@@ -32,10 +34,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
         "Of one file alone all layers are shown. Folders are shots: the page plays them, and with a folder of "
-        "references there is a table of errors and flicker."
+        "references there is a table of errors and flicker. Folders of training runs are compared: curves, pictures, "
+        "settings that differ."
     )
     parser.add_argument(
-        "images", nargs="+", metavar="IMAGE.exr", help="images of one size, of any renderer; or folders of frames"
+        "images",
+        nargs="+",
+        metavar="IMAGE.exr",
+        help="images of one size, of any renderer; or folders of frames, or of training runs",
     )
     parser.add_argument(
         "--ref",
@@ -52,6 +58,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
     if target.suffix.lower() not in (".html", ".htm"):
         raise WrongUse(f"{target}: browsers know a page by its name; let it end in .html")
+    if any(is_run(Path(path)) for path in args.images):
+        return run_trainings(args, target, console)
     names = labels(args.images)
     if any(os.path.isdir(path) for path in args.images):
         return run_shots(args, names, target, console)
@@ -90,6 +98,18 @@ def run(args: argparse.Namespace, console: Console) -> int:
     write_report(target, title, [scene], command=args.command, footer=facts, overview=overview, overwrite=args.force)
     if large := oversize(target):
         console.say(large)
+    console.say(f"{target}: open it in a browser")
+    return 0
+
+
+def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> int:
+    """Folders of training runs: the page of one, or a comparison of several."""
+    if args.ref:
+        raise WrongUse("--ref is for images; leave it out for training runs")
+    names = [Path(name).as_posix() for name in labels(args.images)]
+    text = page([read_run(path, name) for path, name in zip(args.images, names, strict=True)], args.command)
+    with atomic_output(target, args.force) as temporary:
+        temporary.write_text(text, encoding="utf-8", newline="\n")
     console.say(f"{target}: open it in a browser")
     return 0
 

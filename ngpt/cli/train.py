@@ -39,6 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.training.examples import Mixture, split
     from ngpt.training.folders import open_crops
     from ngpt.training.loss import make_loss
+    from ngpt.training.run_page import PAGE
+    from ngpt.training.run_record import write_record
     from ngpt.training.settings import read_settings
     from ngpt.training.trainer import Trainer, show
 
@@ -83,10 +85,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if processes.rank == 0:
             with atomic_output(out / "settings.json", overwrite=True) as temporary:
                 temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
+            write_record(out, settings, config, trainer.model, trainer.device)
         # Of several processes one is enough to listen to.
         listener = console if processes.rank == 0 else Console(quiet=True)
         with listener.progress("train", "steps", rate=True) as progress:
             finished = trainer.run(progress)
     processes.close()
     say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
+    if processes.rank == 0:
+        say(f"{out / PAGE}: open it in a browser")
     return 0 if finished or not trainer.signal else 128 + trainer.signal

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from html import escape
 
-from ngpt.evaluation.axes import Axes
+from ngpt.report.axes import Axes
 
 # Of the samplers of one method.
 DASHES = ("", "7 3", "2 3", "7 3 2 3", "12 4", "1 5")

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.evaluation.axes import Axes
 from ngpt.evaluation.frontier import COLORS, DASHES
 from ngpt.evaluation.gradientmap import COLOURS
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relative_squared_error
+from ngpt.report.axes import Axes
 from ngpt.report.display import coloured
 from ngpt.system.writing import write_text
 

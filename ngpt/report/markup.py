@@ -111,21 +111,27 @@ def _spread(values: float | Sequence[float]) -> str:
 
 def overview_html(overview: Overview) -> str:
     """Plots, tables and formulas, each under its title."""
-    parts = []
-    for title, svg in overview.plots.items():
-        # As a picture of its own, so that no script or link in it does anything.
-        data = base64.b64encode(svg.encode()).decode()
-        image = f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{data}">'
-        parts.append(f'<figure class="plot">{image}<figcaption><b>{escape(title)}</b></figcaption></figure>')
-    plots = '<h3>Plots</h3><div class="plots">' + "".join(parts) + "</div>" if parts else ""
-    tables = "".join(f"<h3>{escape(title)}</h3>{_plain_table(rows)}" for title, rows in overview.tables.items())
+    plots = f"<h3>Plots</h3>{plots_html(overview.plots)}" if overview.plots else ""
+    tables = "".join(f"<h3>{escape(title)}</h3>{plain_table(rows)}" for title, rows in overview.tables.items())
     formulas = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in overview.formulas.items())
     formulas = f'<h3>Metrics</h3><dl class="formulas">{formulas}</dl>' if formulas else ""
     body = tables + plots + formulas
     return f'<details id="overview" open><summary>Overview</summary>{body}</details>' if body else ""
 
 
-def _plain_table(rows: list[list[str]]) -> str:
+def plots_html(plots: Mapping[str, str]) -> str:
+    """SVG documents by their titles, side by side as far as there is room."""
+    parts = []
+    for title, svg in plots.items():
+        # As a picture of its own, so that no script or link in it does anything.
+        data = base64.b64encode(svg.encode()).decode()
+        image = f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{data}">'
+        parts.append(f'<figure class="plot">{image}<figcaption><b>{escape(title)}</b></figcaption></figure>')
+    return '<div class="plots">' + "".join(parts) + "</div>"
+
+
+def plain_table(rows: list[list[str]]) -> str:
+    """Rows of text, the first is the head."""
     head, *body = [[escape(cell) for cell in row] for row in rows]
     lines = [f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{c}</td>" for c in row[1:]) + "</tr>" for row in body]
     heads = "".join(f'<th scope="col">{cell}</th>' for cell in head)

@@ -28,7 +28,7 @@ def summary(folder: Path) -> dict[str, Any]:
 
     Raises NgptError for a checkpoint, settings or a log that cannot be read.
     """
-    entries = _entries(folder / LOG) if (folder / LOG).is_file() else []
+    entries = entries_of(folder / LOG) if (folder / LOG).is_file() else []
     report: dict[str, Any] = {"training run": str(folder)}
     settings: Any = read_json(folder / SETTINGS) if (folder / SETTINGS).is_file() else {}
     if (folder / CHECKPOINT).is_file():
@@ -55,7 +55,7 @@ def summary(folder: Path) -> dict[str, Any]:
     return report
 
 
-def _entries(path: Path) -> list[dict[str, float]]:
+def entries_of(path: Path) -> list[dict[str, float]]:
     """The lines of a log; the last one may be cut short, as it is while it is written."""
     lines = read_text(path).splitlines()
     entries = []

@@ -11,6 +11,7 @@ from ngpt.network.features import PARTS
 from ngpt.network.model import ModelConfig
 from ngpt.system.records import from_table, read_toml
 from ngpt.training.augment import Augmentation
+from ngpt.training.settings_text import difference, flat
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,7 @@ class RunSettings:
     ``minutes``    wall-clock budget of one call; 0 is none. A run that it stops can be resumed
     ``log``, ``save``, ``validate``  every so many steps
     ``views``      validation inputs looked at each time, spread over all of them
+    ``wandb``      project of Weights & Biases that the log is sent to as well; "" sends nothing
     """
 
     steps: int = 600_000
@@ -81,6 +83,7 @@ class RunSettings:
     save: int = 1000
     validate: int = 1000
     views: int = 64
+    wandb: str = ""
 
 
 @dataclass(frozen=True)
@@ -123,17 +126,17 @@ def from_dict(values: dict[str, Any], path: str) -> Settings:
 
 def changed(before: Settings, now: Settings) -> list[str]:
     """What differs, a text "table.key: before -> now" each."""
-    one, other = _flat(before.to_dict()), _flat(now.to_dict())
-    names = dict.fromkeys([*one, *other])
-    return [f"{name}: {one.get(name)} -> {other.get(name)}" for name in names if one.get(name) != other.get(name)]
+    one, other = flat(before.to_dict()), flat(now.to_dict())
+    return [f"{name}: {one.get(name)} -> {other.get(name)}" for name in difference(one, other)]
 
 
-def _flat(values: dict[str, Any]) -> dict[str, Any]:
-    """Of "table.key" their value."""
-    found: dict[str, Any] = {}
-    for table, value in values.items():
-        found |= {f"{table}.{key}": one for key, one in value.items()} if isinstance(value, dict) else {table: value}
-    return found
+def published(settings: Settings) -> dict[str, Any]:
+    """The settings as they go into files that are given away: names of folders and files, not where they lie."""
+    values = settings.to_dict()
+    values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
+    values["initial"] = Path(settings.initial).name
+    values["loss"] = {k: Path(v).name if k in ("backbone", "weights") else v for k, v in settings.loss.items()}
+    return values
 
 
 def _check(settings: Settings, path: str) -> None:

@@ -28,8 +28,10 @@ from ngpt.system.files import atomic_output
 from ngpt.system.records import check
 from ngpt.training.distributed import Processes
 from ngpt.training.examples import JITTER, OTHER, Examples, collated
+from ngpt.training.loggers import Logger, Meter, loggers
+from ngpt.training.run_page import write_run
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
-from ngpt.training.settings import Settings, changed, from_dict
+from ngpt.training.settings import Settings, changed, from_dict, published
 from ngpt.training.validation import validate, views
 from ngpt.version import __version__
 
@@ -49,9 +51,10 @@ class Trainer:
 
     ``crops`` and ``held_out`` are for training and validation, ``loss`` takes scene-linear prediction and target
     (N, 3, H, W) and a generator of the step's random numbers; where there are pairs, what judges them too, and the
-    target is that of the others, None without. Files in ``out``: ``checkpoint.safetensors``,
-    ``weights.safetensors`` (for inference), ``log.jsonl``, ``tensorboard/``, ``validation-STEP.png``.
-    Where crops are rendered meanwhile, as in a stream, no two runs are alike.
+    target is that of the others, None without. Files in ``out``: ``checkpoint.safetensors``, ``weights.safetensors``
+    (for inference), ``best.safetensors`` (those of the validation with the least error), ``log.jsonl``, ``log.csv``,
+    ``run.html``, ``tensorboard/``, ``validation-STEP.png``. Where crops are rendered meanwhile, as in a stream, no two
+    runs are alike.
     """
 
     def __init__(
@@ -99,6 +102,9 @@ class Trainer:
         if warmup < settings.optimizer.warmup:
             say(f"the run's {steps} steps would end within its warm-up of {settings.optimizer.warmup}: taking {warmup}")
         self._stop = False
+        # The least error of a validation so far.
+        self.best = math.inf
+        self._loggers: list[Logger] = []
         # The number of the signal that ended it, if one did.
         self.signal: int | None = None
 
@@ -133,7 +139,8 @@ class Trainer:
         for change in changed(before, self.settings):
             self.say(f"changed since the checkpoint: {change}")
         # What was logged after the checkpoint will be logged again.
-        _keep_lines(self.out / "log.jsonl", self.step)
+        log = _keep_lines(self.out / "log.jsonl", self.step)
+        self.best = min((entry["relMSE"] for entry in log if "relMSE" in entry), default=math.inf)
 
     def run(self, progress: Callable[[int, int], None] = lambda done, total: None) -> bool:
         """Trains until the last step, the wall-clock budget or a signal; True if the last step was reached.
@@ -142,7 +149,9 @@ class Trainer:
         NgptError when the loss or its gradient is not finite any more; the batch is saved then.
         """
         run, start, before = self.settings.run, time.monotonic(), self.seconds
-        batches = self._batches()
+        batches, meter = self._batches(), Meter(self.step, self.device)
+        if self.processes.rank == 0:
+            self._loggers = loggers(self.out, self.step + 1, self.settings)
         previous = {s: signal.signal(s, self._interrupt) for s in (signal.SIGINT, signal.SIGTERM)}
         progress(self.step, run.steps)
         try:
@@ -153,7 +162,7 @@ class Trainer:
                 progress(self.step, run.steps)
                 last = self.step == run.steps
                 if self.step % run.log == 0 or last:
-                    self._log(entry | {"seconds": round(self.seconds, 1)})
+                    self._log(entry | {"seconds": round(self.seconds, 1)} | meter.read(self.step))
                 if (self.step % run.validate == 0 or last) and self.held_out:
                     self.validate()
                 if self.step % run.save == 0 and not last:
@@ -178,6 +187,11 @@ class Trainer:
             tensors |= {f"adam1/{name}": state["exp_avg"], f"adam2/{name}": state["exp_avg_sq"]}
         header = {"kind": "checkpoint", "step": self.step, "seconds": self.seconds, "version": __version__}
         weights.write_tensors(self.checkpoint, tensors, header | {"settings": self.settings.to_dict()}, overwrite=True)
+        self._save_weights("weights.safetensors")
+        write_run(self.out)
+
+    def _save_weights(self, name: str) -> None:
+        """For inference: the average, and how it came about."""
         provenance = {
             "step": self.step,
             "hours": round(self.seconds / 3600, 3),
@@ -187,14 +201,18 @@ class Trainer:
             "torch": torch.__version__,
             "settings": published(self.settings),
         }
-        weights.save_weights(self.out / "weights.safetensors", self.average, provenance, overwrite=True)
+        weights.save_weights(self.out / name, self.average, provenance, overwrite=True)
 
     def validate(self) -> None:
-        """Logs the scores of the averaged weights on the views held out, and draws some."""
+        """Logs the scores of the averaged weights on the views held out, draws some, and keeps the best weights."""
         if self.processes.rank == 0:
             picture = self.out / f"validation-{self.step:07d}.png"
             scores = validate(self.average, self.held_out, picture, self.settings.run.precision)
             self._log({"relMSE": scores.network, "relMSE primal": scores.primal, "relMSE base": scores.base})
+            if scores.network < self.best:
+                self.best = scores.network
+                self._save_weights("best.safetensors")
+            write_run(self.out)
         self.model.train()
 
     def _train(self, batch: dict[str, Tensor]) -> dict[str, float]:
@@ -279,42 +297,21 @@ class Trainer:
                 f"{path}: cannot be written: {error.strerror}; the same command continues from the last checkpoint"
             ) from error
         self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
-        self._board(values)
-
-    def _board(self, values: dict[str, float]) -> None:
-        """The same for TensorBoard, where it is installed."""
-        if not hasattr(self, "_writer"):
-            try:
-                from torch.utils.tensorboard import SummaryWriter
-            except ImportError:
-                self._writer = None
-            else:
-                self._writer = SummaryWriter(str(self.out / "tensorboard"), purge_step=self.step)
-        if self._writer is not None:
-            for name, value in values.items():
-                if name != "step":
-                    self._writer.add_scalar(name, value, self.step)
+        for logger in self._loggers:
+            logger.log(self.step, {name: value for name, value in values.items() if name != "step"})
 
 
-def published(settings: Settings) -> dict[str, Any]:
-    """The settings as they go into files that are given away: names of folders and files, not where they lie."""
-    values = settings.to_dict()
-    values["data"]["folders"] = [Path(folder).name for folder in settings.data.folders]
-    values["initial"] = Path(settings.initial).name
-    values["loss"] = {k: Path(v).name if k in ("backbone", "weights") else v for k, v in settings.loss.items()}
-    return values
-
-
-def _keep_lines(path: Path, step: int) -> None:
-    """Drops what a log says of steps after ``step``, and a last line that was cut short."""
+def _keep_lines(path: Path, step: int) -> list[dict[str, float]]:
+    """Drops what a log says of steps after ``step``, and a last line that was cut short; returns what is left."""
     if not path.is_file():
-        return
-    lines = []
+        return []
+    entries = []
     for line in path.read_text(encoding="utf-8").splitlines():
         try:
-            if json.loads(line)["step"] <= step:
-                lines.append(line)
+            if (entry := json.loads(line))["step"] <= step:
+                entries.append(entry)
         except ValueError:
             continue
     with atomic_output(path, overwrite=True) as temporary:
-        temporary.write_text("".join(f"{line}\n" for line in lines))
+        temporary.write_text("".join(f"{json.dumps(entry)}\n" for entry in entries))
+    return entries

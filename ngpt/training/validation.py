@@ -1,5 +1,6 @@
 """How good a network is on views it does not train on, in numbers and pictures."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +18,7 @@ from ngpt.repair import repair
 from ngpt.report.display import auto_exposure, to_srgb8
 from ngpt.report.png import encode_png
 from ngpt.system.files import atomic_output
+from ngpt.system.writing import write_json
 from ngpt.training.examples import judges_of
 
 # Rows of the picture of a validation.
@@ -50,10 +52,11 @@ def views(crops: Sequence[Any], count: int) -> list[tuple[Any, int]]:
 def validate(
     model: Reconstructor, views: Sequence[tuple[Any, int]], picture: str | Path = "", precision: str = "float32"
 ) -> Scores:
-    """Scores over views (crop, input); with ``picture``, rows of input, result and reference of some, as a PNG."""
+    """Scores over views (crop, input); with ``picture``, rows of input, result and reference of some, as a PNG, and
+    beside it what they are, as JSON: the size of one picture, and of each row scene, samples and errors."""
     model.eval()
     device = next(model.parameters()).device
-    primal, base, network, rows = [], [], [], []
+    primal, base, network, rows, told = [], [], [], [], []
     shown = {int(i * len(views) / _PICTURES) for i in range(_PICTURES)}
     for index, (crop, k) in enumerate(views):
         data = repair(crop.stack(k), model.config.reads_gradients)
@@ -70,11 +73,17 @@ def validate(
         if picture and index in shown:
             stops = auto_exposure(reference)
             rows.append(np.hstack([to_srgb8(i, stops) for i in (given, image, reference)]))
+            errors = {"relMSE primal": float(primal[-1]), "relMSE": float(network[-1])}
+            finite = {name: error for name, error in errors.items() if math.isfinite(error)}
+            told.append({"scene": crop.scene, "spp": int(crop.spp[k]), **finite})
     if picture and rows:
         # Folders of stacks may hold views of different sizes; those that do not fit are left out.
-        rows = [row for row in rows if row.shape == rows[0].shape]
+        fit = [i for i, row in enumerate(rows) if row.shape == rows[0].shape]
+        rows, told = [rows[i] for i in fit], [told[i] for i in fit]
         with atomic_output(picture, overwrite=True) as temporary:
             temporary.write_bytes(encode_png(np.ascontiguousarray(np.vstack(rows))))
+        size = [rows[0].shape[1] // 3, rows[0].shape[0]]
+        write_json(Path(picture).with_suffix(".json"), {"size": size, "views": told})
     return Scores(_mean(primal), _mean(base), _mean(network))
 
 

@@ -3,6 +3,9 @@
 import argparse
 import json
 import signal
+import socket
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -18,6 +21,8 @@ from ngpt.system.interrupts import Interrupt
 
 def test_frames_are_ranges_lists_and_steps():
     assert frames("0:3") == [0, 1, 2] and frames("0:10:4") == [0, 4, 8] and frames("7") == [7]
+    assert frames("1-3") == [1, 2, 3] and frames("1-9x4,20") == [1, 5, 9, 20] and frames("-2--1") == [-2, -1]
+    assert frames("7-7:2") == [7] and frames("3-1:-1") == [3, 2, 1]
     assert frames("1,5:7,5") == [1, 5, 6] and frames("-2:1") == [-2, -1, 0] and frames("3:0:-1") == [3, 2, 1]
 
 
@@ -189,3 +194,52 @@ def parser_of(words):
     parser = argparse.ArgumentParser()
     render.add_arguments(parser)
     return parser.parse_args(words[1:])
+
+
+def test_one_image_that_is_there_is_left_out(renderer, tmp_path, capsys):
+    """So that a queue of parts with seeds of their own can be started again."""
+    target = tmp_path / "part.1.exr"
+    words = ["render", "diffuse", "--size", "16x12", "--spp", "1", "--sampler", "primal", "-o", str(target)]
+    assert main([*words, "--skip-existing"]) == 0
+    whole = target.read_bytes()
+    assert main([*words, "--skip-existing", "--seed", "5"]) == 0
+    assert "part.1.exr: skipped: the stack is there" in capsys.readouterr().err
+    assert target.read_bytes() == whole
+    target.write_bytes(whole[: len(whole) // 2])
+    assert main([*words, "--skip-existing"]) == 0
+    assert len(target.read_bytes()) == len(whole)
+
+
+@pytest.mark.slow
+def test_the_example_of_dask_with_two_workers(renderer, tmp_path):
+    """As docs/use/farm.md has it: scheduler, workers and `ngpt render` are programs of their own. Bits are those of
+    one process."""
+    pytest.importorskip("distributed")
+    port, started = free_port(), []
+
+    def dask(*words):
+        command = [sys.executable, "-m", "distributed.cli.dask_" + words[0], *words[1:]]
+        started.append(subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL))
+
+    scheduler = f"tcp://127.0.0.1:{port}"
+    words = ["diffuse", "--frames", "0:17", "--size", "16x12", "--spp", "2", "--sampler", "gpt"]
+    try:
+        dask("scheduler", "--host", "127.0.0.1", "--port", str(port), "--no-dashboard")
+        dask("worker", scheduler, "--nworkers", "2", "--nthreads", "1", "--no-dashboard")
+        command = [sys.executable, "-m", "ngpt", "render", *words, "-o", "farm", "--cluster", scheduler]
+        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=400, check=False)
+        assert done.returncode == 0, done.stderr
+    finally:
+        for process in reversed(started):
+            process.terminate()
+            process.wait(60)
+    assert main(["render", *words, "-o", str(tmp_path / "alone")]) == 0
+    for frame in range(17):
+        ours, theirs = (ngpt.read(tmp_path / f / f"diffuse.{frame:04d}.exr") for f in ("farm", "alone"))
+        assert all(np.array_equal(ours[name], theirs[name], equal_nan=True) for name in theirs.names)
+
+
+def free_port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return one.getsockname()[1]

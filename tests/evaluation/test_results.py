@@ -4,10 +4,10 @@ import xml.etree.ElementTree as ElementTree
 
 import pytest
 
-from ngpt.evaluation.axes import Axes, ticks
 from ngpt.evaluation.frontier import Point, draw, pareto
 from ngpt.evaluation.results import as_csv, summarised
 from ngpt.evaluation.tables import tables
+from ngpt.report.axes import Axes, ticks
 
 
 def method_entry(name: str) -> dict:

@@ -1,4 +1,4 @@
-"""Logarithmic axes of a picture drawn by hand as SVG."""
+"""Axes of a picture drawn by hand as SVG: logarithmic, or linear from left to right."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from html import escape
 
 @dataclass(frozen=True)
 class Axes:
-    """Two logarithmic axes with the ranges they show, in a picture of ``width`` x ``height``."""
+    """Two logarithmic axes with the ranges they show, in a picture of ``width`` x ``height``; ``even``: x is linear."""
 
     x_range: tuple[float, float]
     y_range: tuple[float, float]
@@ -17,6 +17,7 @@ class Axes:
     height: int = 420
     left: int = 70
     margin: int = 160  # at the right, for names
+    even: bool = False
 
     @property
     def right(self) -> int:
@@ -27,7 +28,9 @@ class Axes:
         return self.height - 46
 
     def x(self, value: float) -> float:
-        return self.left + _share(value, self.x_range) * (self.right - self.left)
+        low, high = self.x_range
+        share = (value - low) / (high - low) if self.even else _share(value, self.x_range)
+        return self.left + share * (self.right - self.left)
 
     def y(self, value: float) -> float:
         return self.bottom - _share(value, self.y_range) * (self.bottom - 30)
@@ -43,11 +46,9 @@ class Axes:
         for value in ticks(*self.y_range):
             parts.append(f'<path d="M{self.left} {self.y(value):.1f}H{self.right}" stroke="#e4e4e4"/>')
             parts.append(f'<text x="{self.left - 6}" y="{self.y(value) + 4:.1f}" text-anchor="end">{value:.3g}</text>')
-        for value in ticks(*self.x_range):
+        for value in (even_ticks if self.even else ticks)(*self.x_range):
             parts.append(f'<path d="M{self.x(value):.1f} 30V{self.bottom}" stroke="#e4e4e4"/>')
-            parts.append(
-                f'<text x="{self.x(value):.1f}" y="{self.bottom + 16}" text-anchor="middle">{value:.3g}</text>'
-            )
+            parts.append(f'<text x="{self.x(value):.1f}" y="{self.bottom + 16}" text-anchor="middle">{value:g}</text>')
         middle = (self.left + self.right) / 2
         parts.append(f'<text x="{middle}" y="{self.height - 10}" text-anchor="middle">{escape(x_label)}</text>')
         parts.append(
@@ -76,10 +77,19 @@ class Axes:
 
 
 def ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 times powers of ten between the two; powers alone where that would be many."""
+    """1, 2 and 5 times powers of ten between the two; powers alone where that would be many, and numbers evenly
+    apart where there would be fewer than two."""
     powers = range(math.floor(math.log10(low)), math.ceil(math.log10(high)) + 1)
     steps = (1, 2, 5) if math.log10(high / low) < 3.5 else (1,)
-    return [value for p in powers for m in steps if low <= (value := m * 10.0**p) <= high]
+    found = [value for p in powers for m in steps if low <= (value := m * 10.0**p) <= high]
+    return found if len(found) > 1 or low == high else even_ticks(low, high)
+
+
+def even_ticks(low: float, high: float) -> list[float]:
+    """Four to ten numbers between the two, 1, 2 or 5 times a power of ten apart; ``low`` < ``high``."""
+    power = 10.0 ** math.floor(math.log10((high - low) / 4))
+    step = next(m * power for m in (5, 2, 1) if m * power <= (high - low) / 4)
+    return [round(n * step, 12) for n in range(math.ceil(low / step), math.floor(high / step) + 1)]
 
 
 def _share(value: float, limits: tuple[float, float]) -> float:

@@ -1,0 +1,81 @@
+"""A training set as Open Image Denoise's own training reads it: a file of OpenEXR for each feature of each image.
+
+    FOLDER/train/SCENE/crop0003_0016spp.hdr.exr     an input of 16 samples per pixel: light,
+                        crop0003_0016spp.alb.exr    albedo, 0 to 1,
+                        crop0003_0016spp.nrm.exr    normal, -1 to 1
+                        crop0003_ref.hdr.exr        and the same of the reference
+    FOLDER/valid/...                                scenes kept apart, whole
+
+Source of the layout: "Datasets" in the README of Open Image Denoise 2.4, and training/dataset.py there.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.io.openexr import ExrImage, ExrPart, write_exr
+from ngpt.training.dataset import Crop, Dataset
+
+# One scene in so many is for validation, at least one where there are two.
+VALIDATION = 10
+
+
+def write_layout(data: Dataset, folder: Path, progress: Callable[[int, int], None] = lambda done, total: None) -> int:
+    """Writes the crops of ``data`` into ``folder``, but for files that are there, and returns how many inputs were left
+    out: those with as many samples as another of their crop, which would have its name.
+
+    Raises NgptError for sets of shots or without references, and where a file cannot be written.
+    """
+    if data.shots:
+        raise NgptError(f"{data.folder}: is a set of shots, and Open Image Denoise trains on single images")
+    held = set(data.scenes[::-VALIDATION][: len(data.scenes) // 2])
+    digits = max([4, *(len(str(n)) for crop in data for n in crop.spp)])
+    left_out = 0
+    progress(0, len(data))
+    for done, (name, crop) in enumerate(_named(data), 1):
+        place = folder / ("valid" if crop.scene in held else "train") / crop.scene
+        place.mkdir(parents=True, exist_ok=True)
+        for label, images in _images(crop, digits):
+            for feature, image in images.items():
+                path = place / f"{name}_{label}.{feature}.exr"
+                if not path.exists():
+                    write_exr(path, _file(image, half=feature != "hdr"))
+        left_out += crop.inputs - len(set(crop.spp))
+        progress(done, len(data))
+    return left_out
+
+
+def _named(data: Dataset) -> Iterator[tuple[str, Crop]]:
+    """The crops, each with its name in its scene."""
+    counts: dict[str, int] = {}
+    for crop in data:
+        number = counts.get(crop.scene, 0)
+        counts[crop.scene] = number + 1
+        yield f"crop{number:04d}", crop
+
+
+def _images(crop: Crop, digits: int) -> Iterator[tuple[str, dict[str, np.ndarray]]]:
+    """The inputs and the reference by what their names end in. The features of the reference are the means over all
+    inputs, by their samples, which are as many as the set has."""
+    if "reference_indirect" not in crop.shard.names:
+        raise NgptError(f"{crop.shard.path}: has no references, without which Open Image Denoise does not train")
+    stacks = [crop.stack(k) for k in range(crop.inputs)]
+    for k in sorted({n: k for k, n in reversed(list(enumerate(crop.spp)))}.values()):
+        label = f"{crop.spp[k]:0{digits}d}spp"
+        yield label, {"hdr": stacks[k]["primal"], "alb": stacks[k]["albedo"], "nrm": stacks[k]["normal"]}
+    means = {
+        short: np.average([stack[layer] for stack in stacks], axis=0, weights=crop.spp)
+        for short, layer in (("alb", "albedo"), ("nrm", "normal"))
+    }
+    yield "ref", {"hdr": crop.reference, **means}
+
+
+def _file(image: np.ndarray, half: bool) -> ExrImage:
+    """Three channels that it reads as they are."""
+    kind = np.float16 if half else np.float32
+    channels = {name: np.ascontiguousarray(image[..., i], kind) for i, name in enumerate("RGB")}
+    return ExrImage([ExrPart("", {}, channels)])

@@ -1,0 +1,25 @@
+"""A page of text, tables and plots without a script, in the style of the viewer's: one file, nothing from elsewhere."""
+
+import base64
+import hashlib
+from html import escape
+from importlib.resources import files as package_files
+
+
+def document(title: str, body: str, *, command: str = "", style: str = "", refresh: int = 0) -> str:
+    """The HTML of a page; ``body`` is markup, ``style`` more rules. With ``refresh`` it is read anew every so many
+    seconds, as long as it is open."""
+    sheet = (package_files("ngpt.report") / "report.html").read_text(encoding="utf-8")
+    sheet = sheet.split("<style>")[1].split("</style>")[0] + style
+    allowed = "sha256-" + base64.b64encode(hashlib.sha256(sheet.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src '{allowed}'; base-uri 'none'; form-action 'none'"
+    again = f'<meta http-equiv="refresh" content="{refresh}">\n' if refresh else ""
+    return (
+        f'<!DOCTYPE html>\n<html lang="en" data-ready="true">\n<head>\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
+        f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
+        f'<meta name="color-scheme" content="dark">\n{again}<title>{escape(title)}</title>\n'
+        f"<style>{sheet}</style>\n</head>\n<body>\n<header><h1>{escape(title)}</h1></header>\n"
+        f"<main>\n{body}\n</main>\n"
+        f"<footer><code>{escape(command)}</code></footer>\n</body>\n</html>\n"
+    )

@@ -1,0 +1,297 @@
+"""The page of a training run, written while it goes on, and the page that compares several. Needs no PyTorch.
+
+Of a folder it reads ``log.jsonl``, and as far as they are there ``settings.json``, ``run.json`` and the last
+``validation-STEP``: a page can be made of any run, at any time.
+"""
+
+import base64
+import csv
+import io
+import json
+import math
+from dataclasses import dataclass, field
+from html import escape
+from pathlib import Path
+from typing import Any
+
+from ngpt.errors import NgptError
+from ngpt.report.curves import curves
+from ngpt.report.document import document
+from ngpt.report.markup import plain_table, plots_html
+from ngpt.system.files import atomic_output
+from ngpt.system.records import read_json
+from ngpt.training.run_summary import LOG, SETTINGS, entries_of
+from ngpt.training.settings_text import difference, flat
+
+PAGE, TABLE, RECORD = "run.html", "log.csv", "run.json"
+# Seconds after which an open page of a run that goes on is read again.
+REFRESH = 30
+COLUMNS = ("input", "result", "reference")
+
+STYLE = """
+.views { display: grid; grid-template-columns: repeat(auto-fill, minmax(min(400px, 100%), 1fr)); gap: 12px; }
+.strip { background-repeat: no-repeat; background-size: 100% auto; image-rendering: pixelated; width: 100%; }
+.heads { display: grid; grid-template-columns: repeat(3, 1fr); color: var(--soft); font-size: 12px; }
+.heads span { padding: 3px 8px; }
+.wide figcaption { display: block; } main h3:first-child { margin-top: 8px; } td { vertical-align: top; }
+.settings table { width: auto; } .settings .scroll { width: fit-content; max-width: 100%; }
+.settings th, .settings td { text-align: left; white-space: normal; overflow-wrap: anywhere; }
+"""
+
+
+@dataclass(frozen=True)
+class Run:
+    """What a run's folder tells: ``entries`` of its log, ``settings`` and ``record`` ({} where there are none)."""
+
+    folder: Path
+    name: str
+    entries: list[dict[str, float]]
+    settings: dict[str, Any] = field(default_factory=dict)
+    record: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def steps(self) -> int:
+        """Those that it is to make; 0 where that is not known."""
+        return int(self.settings.get("run", {}).get("steps", 0))
+
+    @property
+    def done(self) -> int:
+        return int(self.entries[-1]["step"]) if self.entries else 0
+
+    @property
+    def scores(self) -> list[dict[str, float]]:
+        """The entries of validations."""
+        return [entry for entry in self.entries if "relMSE" in entry]
+
+    @property
+    def best(self) -> dict[str, float]:
+        """The entry of the validation with the least error, {} before the first."""
+        return min(self.scores, key=lambda entry: entry["relMSE"], default={})
+
+    def line(self, name: str) -> list[tuple[float, float]]:
+        """The curve of an entry's number over the steps."""
+        return [(entry["step"], entry[name]) for entry in self.entries if name in entry]
+
+    def last(self, name: str) -> float:
+        """The newest number of that name, NaN where there is none."""
+        return next((entry[name] for entry in reversed(self.entries) if name in entry), math.nan)
+
+
+def read_run(folder: str | Path, name: str = "") -> Run:
+    """Raises NgptError where there is no log, and for files that cannot be read."""
+    folder = Path(folder)
+    if not (folder / LOG).is_file():
+        raise NgptError(f"{folder}: holds no {LOG}; name the folder that `ngpt train --out` wrote")
+    others = [read_json(folder / file) if (folder / file).is_file() else {} for file in (SETTINGS, RECORD)]
+    for file, value in zip((SETTINGS, RECORD), others, strict=True):
+        if not isinstance(value, dict):
+            raise NgptError(f"{folder / file}: is no record of a training run")
+    return Run(folder, name or folder.absolute().name, entries_of(folder / LOG), *others)
+
+
+def write_run(folder: str | Path) -> None:
+    """Writes ``run.html`` and ``log.csv`` into the folder of a run; nothing where it has no log yet."""
+    folder = Path(folder)
+    if not (folder / LOG).is_file():
+        return
+    run = read_run(folder)
+    for name, text in ((PAGE, page([run])), (TABLE, table(run.entries))):
+        with atomic_output(folder / name, overwrite=True) as temporary:
+            temporary.write_text(text, encoding="utf-8", newline="")
+
+
+def table(entries: list[dict[str, float]]) -> str:
+    """The log as comma-separated values: a column for each number, empty where a line of the log has none."""
+    names = list(dict.fromkeys(name for entry in entries for name in entry))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, names, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(entries)
+    return text.getvalue()
+
+
+def page(runs: list[Run], command: str = "") -> str:
+    """One run, or a comparison of several, as HTML."""
+    alone = runs[0] if len(runs) == 1 else None
+    going = alone is not None and alone.done < alone.steps
+    parts = ["<h3>Runs</h3>", plain_table(_overview(runs))]
+    parts += [f'<p class="hint">{escape(_state(alone))}</p>' if alone else ""]
+    parts += [_pictures(run) for run in runs]
+    parts += ["<h3>Curves</h3>", plots_html(_plots(runs))]
+    parts += [_settings("Settings that differ", _differing(runs))] if len(runs) > 1 else []
+    for run in runs:
+        parts.append(_settings(f"{run.name}: what differs from {run.record.get('base', '?')}", _own(run)))
+    parts.append(_settings("System", _system(runs)))
+    if alone:
+        rows = [["setting", "value"], *([key, _text(value)] for key, value in flat(alone.settings).items())]
+        parts.append(f"<details><summary>All settings</summary>{_settings('', rows)}</details>")
+    title = f"Training run {alone.name}" if alone else f"{len(runs)} training runs"
+    return document(title, "\n".join(parts), command=command, style=_style(runs), refresh=REFRESH if going else 0)
+
+
+def _overview(runs: list[Run]) -> list[list[str]]:
+    """A row for each run: how far, how good, how fast."""
+    head = ["run", "steps", "best relMSE", "at step", "over the input's", "over the base's", "last relMSE", "hours"]
+    rows = [[*head, "steps/s", "memory, MiB", "parameters"]]
+    least = min((run.best["relMSE"] for run in runs if run.best), default=math.nan)
+    for run in runs:
+        best, score = run.best, run.best.get("relMSE", math.nan)
+        mark = " (least)" if len(runs) > 1 and score == least else ""
+        row = [run.name, f"{run.done:,} of {run.steps:,}" if run.steps else f"{run.done:,}"]
+        row += [_number(score) + mark, _number(best.get("step", math.nan))]
+        row += [_number(score / best[f"relMSE {of}"]) if best.get(f"relMSE {of}") else "-" for of in ("primal", "base")]
+        row += [_number(run.last("relMSE")), _number(run.last("seconds") / 3600)]
+        row += [_number(run.last("steps/s")), _number(run.last("memory MiB"))]
+        rows.append([*row, f"{run.record['parameters']:,}" if "parameters" in run.record else "-"])
+    return rows
+
+
+def _state(run: Run) -> str:
+    """How much is left, at the rate of late."""
+    if not run.steps:
+        return ""
+    if run.done >= run.steps:
+        return "Finished. The weights with the least error are in best.safetensors, the last in weights.safetensors."
+    left, rate = run.steps - run.done, run.last("steps/s")
+    time = f", about {left / rate / 3600:.2g} hours at {rate:.3g} steps/s" if rate > 0 else ""
+    return f"{left:,} steps to go{time}. This page is read again every {REFRESH} seconds while it is open."
+
+
+def _plots(runs: list[Run]) -> dict[str, str]:
+    """Curves over the steps: of one run those of all its numbers, of several a line each."""
+    if len(runs) == 1:
+        run = runs[0]
+        error = {"network": run.line("relMSE"), "base": run.line("relMSE base"), "input": run.line("relMSE primal")}
+        plots = {"relMSE of the views held out": curves("steps", error)}
+    else:
+        plots = {"relMSE of the views held out": curves("steps", {run.name: run.line("relMSE") for run in runs})}
+        plots["the same over hours"] = curves("hours", {run.name: _over_hours(run) for run in runs})
+    for title, name in (
+        ("loss", "loss"),
+        ("norm of the gradient", "gradient norm"),
+        ("learning rate", "learning rate"),
+        ("steps a second", "steps/s"),
+        ("memory, MiB", "memory MiB"),
+    ):
+        plots[title] = curves("steps", {run.name: run.line(name) for run in runs})
+    return {title: svg for title, svg in plots.items() if svg}
+
+
+def _over_hours(run: Run) -> list[tuple[float, float]]:
+    """relMSE over the hours that the run took until then."""
+    hours, points = 0.0, []
+    for entry in run.entries:
+        hours = entry.get("seconds", 3600 * hours) / 3600
+        if "relMSE" in entry:
+            points.append((hours, entry["relMSE"]))
+    return points
+
+
+# --- pictures --------------------------------------------------------------------------------------------------------
+
+
+def _drawn(run: Run) -> tuple[Path, dict[str, Any]] | None:
+    """The picture of the last validation that has captions, and these."""
+    for path in sorted(run.folder.glob("validation-*.json"), reverse=True):
+        told = read_json(path)
+        if path.with_suffix(".png").is_file() and isinstance(told, dict) and told.get("views"):
+            return path.with_suffix(".png"), told
+    return None
+
+
+def _pictures(run: Run) -> str:
+    """Views held out, a strip of three pictures each, with what they are and their errors."""
+    found = _drawn(run)
+    if found is None:
+        return ""
+    path, told = found
+    heads = '<div class="heads">' + "".join(f"<span>{name}</span>" for name in COLUMNS) + "</div>"
+    strips = []
+    for row, view in enumerate(told["views"]):
+        text = f"{escape(str(view['scene']))}, {view['spp']} spp"
+        given, made = (_number(view.get(name, math.nan)) for name in ("relMSE primal", "relMSE"))
+        errors = f"relMSE {given} &rarr; {made}"
+        strip = f'<div class="strip {_key(run)} row{row}"></div>'
+        strips.append(
+            f'<figure class="wide"><div class="{_key(run)}-box">{heads}{strip}</div>'
+            f"<figcaption><b>{text}</b> <small>{errors}</small></figcaption></figure>"
+        )
+    step = int(path.stem.rpartition("-")[2])
+    return f'<h3>{escape(run.name)}, step {step:,}: views held out</h3><div class="views">{"".join(strips)}</div>'
+
+
+def _key(run: Run) -> str:
+    """The name of a run's pictures in the style sheet."""
+    return "of-" + run.folder.absolute().as_posix().encode().hex()[-48:]
+
+
+def _style(runs: list[Run]) -> str:
+    """Each picture once, as a background of which a strip shows one row."""
+    rules = [STYLE]
+    for run in runs:
+        if (found := _drawn(run)) is not None:
+            path, told = found
+            data = base64.b64encode(path.read_bytes()).decode()
+            width, height = told["size"]
+            # At twice the size of a pixel, where there is room.
+            rules.append(f".{_key(run)}-box {{ max-width: {6 * width}px; }}")
+            rules.append(
+                f".{_key(run)} {{ background-image: url(data:image/png;base64,{data}); "
+                f"aspect-ratio: {3 * width} / {height}; }}"
+            )
+            count = len(told["views"])
+            rules += [f".{_key(run)}.row{i} {{ background-position-y: {_share(i, count)}%; }}" for i in range(count)]
+    return "\n".join(rules)
+
+
+def _share(row: int, count: int) -> float:
+    """Where a row of so many lies, in per cent as CSS counts."""
+    return round(100 * row / max(count - 1, 1), 4)
+
+
+# --- settings --------------------------------------------------------------------------------------------------------
+
+
+def _settings(title: str, rows: list[list[str]]) -> str:
+    """A table under its title, "" where it has no row but its head."""
+    head = f"<h3>{escape(title)}</h3>" if title else ""
+    return f'{head}<div class="settings">{plain_table(rows)}</div>' if len(rows) > 1 else ""
+
+
+def _own(run: Run) -> list[list[str]]:
+    """What the settings of a run change in the configuration that it began with."""
+    changed = run.record.get("changed", {})
+    rows = [[name, *map(_text, values)] for name, values in changed.items()]
+    return [["setting", str(run.record.get("base", "?")), "this run"], *rows]
+
+
+def _differing(runs: list[Run]) -> list[list[str]]:
+    """Settings in which not all runs are alike."""
+    values = [flat(run.settings) for run in runs]
+    names = difference(*values)
+    return [
+        ["setting", *(run.name for run in runs)],
+        *([name, *(_text(v.get(name)) for v in values)] for name in names),
+    ]
+
+
+def _system(runs: list[Run]) -> list[list[str]]:
+    """What the runs run on."""
+    facts = [flat(run.record.get("system", {})) for run in runs]
+    return _side_by_side("system", runs, facts, list(dict.fromkeys(name for fact in facts for name in fact)))
+
+
+def _side_by_side(title: str, runs: list[Run], values: list[dict[str, Any]], names: list[str]) -> list[list[str]]:
+    """A column for each run, a row for each name."""
+    head = [title, *(run.name for run in runs)]
+    return [head, *([name, *(_text(value.get(name)) for value in values)] for name in names)]
+
+
+def _text(value: Any) -> str:
+    if value is None:
+        return "-"
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _number(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "-"

@@ -1,0 +1,17 @@
+"""Settings as text: flat names, and what differs. Needs no PyTorch."""
+
+from typing import Any
+
+
+def flat(values: dict[str, Any]) -> dict[str, Any]:
+    """Of "table.key" their value."""
+    found: dict[str, Any] = {}
+    for table, value in values.items():
+        found |= {f"{table}.{key}": one for key, one in value.items()} if isinstance(value, dict) else {table: value}
+    return found
+
+
+def difference(*several: dict[str, Any]) -> list[str]:
+    """The names of flat settings that are not alike in all."""
+    names = dict.fromkeys(name for values in several for name in values)
+    return [name for name in names if any(v.get(name) != several[0].get(name) for v in several)]

@@ -1,0 +1,181 @@
+"""The page of a run and the comparison of several, the best weights, and where else the numbers of a run go."""
+
+import csv
+import json
+import re
+import sys
+from types import SimpleNamespace
+from urllib.parse import quote
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from browser import Session  # noqa: E402
+from crops import SyntheticCrop  # noqa: E402
+
+from ngpt.cli import main  # noqa: E402
+from ngpt.errors import NgptError  # noqa: E402
+from ngpt.network import weights  # noqa: E402
+from ngpt.report.axes import even_ticks, ticks  # noqa: E402
+from ngpt.report.curves import MOST, curves  # noqa: E402
+from ngpt.system import configs  # noqa: E402
+from ngpt.training import trainer as trainers  # noqa: E402
+from ngpt.training.run_page import page, read_run, write_run  # noqa: E402
+from ngpt.training.run_record import nearest, write_record  # noqa: E402
+from ngpt.training.settings import from_dict, read_settings  # noqa: E402
+from ngpt.training.trainer import Trainer  # noqa: E402
+from ngpt.training.validation import Scores  # noqa: E402
+
+CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
+MODEL = {"network": "dense", "channels": [4], "units": [1], "inputs": ["primal"]}
+
+
+def loss(prediction, target, generator):
+    value = (prediction - target).abs().mean()
+    return value, {"l1": value}
+
+
+def made(out, steps=6, rate=1e-2, wandb=""):
+    """A run of a few steps, with a validation after each second."""
+    out.mkdir(exist_ok=True)
+    run = {"steps": steps, "batch": 1, "log": 1, "save": 2, "validate": 2, "wandb": wandb}
+    values = {"model": MODEL, "data": {"crop": 32}, "optimizer": {"learning_rate": rate, "warmup": 1}, "run": run}
+    settings = from_dict(values, "test")
+    (out / "settings.json").write_text(json.dumps(settings.to_dict()))
+    trainer = Trainer(settings, CROPS[:2], CROPS[2:], loss, out, say=lambda text: None)
+    write_record(out, settings, configs.FOLDER / "tiny.toml", trainer.model, trainer.device)
+    return trainer
+
+
+def test_a_run_writes_its_page_while_it_goes_on(tmp_path):
+    run = made(tmp_path / "mine")
+    seen = []
+
+    def progress(done, total):
+        file = tmp_path / "mine" / "run.html"
+        seen.append(file.read_text() if file.exists() else "")
+
+    assert run.run(progress)
+    assert not seen[1] and "4 steps to go" in seen[3] and 'http-equiv="refresh"' in seen[3]
+    text = (tmp_path / "mine" / "run.html").read_text()
+    assert "Finished" in text and 'http-equiv="refresh"' not in text
+    # Of what crops are called nothing is markup, nothing is fetched, nothing runs.
+    assert "&lt;scene&gt; 3, 32 spp" in text and "<scene>" not in text
+    assert "<script" not in text and not re.findall(r"(?:src|href)=\"(?!data:)|url\((?!data:)", text)
+    for told in ("what differs from tiny", "optimizer.learning_rate", "memory, MiB", "steps a second", "AMD|Intel|cpu"):
+        assert re.search(told, text), told
+    rows = list(csv.DictReader((tmp_path / "mine" / "log.csv").open()))
+    log = [json.loads(line) for line in (tmp_path / "mine" / "log.jsonl").read_text().splitlines()]
+    assert len(rows) == len(log) == 9
+    for row, entry in zip(rows, log, strict=True):
+        assert {name: float(value) for name, value in row.items() if value} == entry
+    assert all(entry["steps/s"] > 0 and entry["memory MiB"] > 50 for entry in log if "loss" in entry)
+
+
+def test_the_best_weights_are_kept_and_outlive_a_stop(tmp_path, monkeypatch):
+    errors = iter([0.5, 0.2, 0.3, 0.25, 0.1])
+    monkeypatch.setattr(trainers, "validate", lambda *_: Scores(1.0, float("nan"), next(errors)))
+
+    def best():
+        return weights.load_weights(tmp_path / "best.safetensors")[1]["training"]["step"]
+
+    made(tmp_path, steps=6).run()
+    assert best() == 4
+    again = made(tmp_path, steps=8)
+    again.resume()
+    assert again.best == 0.2
+    again.run()
+    assert best() == 4
+    third = made(tmp_path, steps=10)
+    third.resume()
+    third.run()
+    assert best() == 10
+
+
+def test_runs_are_compared(tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    for name, rate in (("slow", 1e-4), ("fast", 1e-2)):
+        made(tmp_path / name, rate=rate).run()
+    assert main(["report", "slow", "fast", "-o", "both.html"]) == 0
+    text = (tmp_path / "both.html").read_text()
+    assert "2 training runs" in text and "the same over hours" in text
+    differ = text.partition("Settings that differ")[2].partition("</table>")[0]
+    assert re.findall(r'scope="row">([^<]*)', differ) == ["optimizer.learning_rate"]
+    assert text.count("(least)") == 1
+    # One alone gives the page that the run wrote itself; files among runs are told.
+    assert main(["report", "fast", "-o", "one.html"]) == 0
+    assert "Training run fast" in (tmp_path / "one.html").read_text()
+    (tmp_path / "no").mkdir()
+    assert main(["report", "fast", "no", "-o", "x.html"]) == 1
+    assert "no: holds no log.jsonl" in capsys.readouterr().err
+    assert main(["report", "fast", "--ref", "slow", "-o", "x.html"]) == 2
+
+
+def test_the_page_fits_a_telephone_and_no_rule_is_broken(tmp_path):
+    made(tmp_path / "mine").run()
+    session = Session(tmp_path / "profile", f"file://{quote(str(tmp_path / 'mine' / 'run.html'))}")
+    session.call("Emulation.setDeviceMetricsOverride", width=420, height=900, deviceScaleFactor=1, mobile=False)
+    width = session.ask("document.documentElement.scrollWidth")
+    strip = session.ask("(s => [s.clientWidth, s.clientHeight])(document.querySelector('.strip'))")
+    shown = session.ask("getComputedStyle(document.querySelector('.strip')).backgroundImage.slice(0, 14)")
+    complaints = session.complaints
+    session.close()
+    assert width <= 420 and complaints == []
+    # 32 pixels a side, at twice their size
+    assert strip == [192, 64] and shown == 'url("data:imag'
+
+
+def test_numbers_go_to_weights_and_biases_where_that_is_asked_for(tmp_path, monkeypatch):
+    calls, sent = [], []
+
+    def init(**given):
+        calls.append(given)
+        return SimpleNamespace(log=lambda values, step: sent.append((step, values)))
+
+    fake = SimpleNamespace(init=init, Settings=lambda **given: given)
+    monkeypatch.setitem(sys.modules, "wandb", fake)
+    made(tmp_path / "without").run()
+    assert calls == [] and sent == []
+    made(tmp_path / "mine", steps=2, wandb="kitchens").run()
+    assert calls[0]["project"] == "kitchens" and calls[0]["name"] == "mine"
+    assert calls[0]["settings"] == {"disable_git": True, "disable_code": True, "console": "off"}
+    assert [step for step, _ in sent] == [1, 2, 2] and "loss" in sent[0][1] and "relMSE" in sent[2][1]
+    # Going on, it is the same run to them.
+    more = made(tmp_path / "mine", steps=3, wandb="kitchens")
+    more.resume()
+    more.run()
+    assert calls[1]["id"] == calls[0]["id"] and len(calls[0]["id"]) == 16
+    # What is not installed is said before the first step.
+    monkeypatch.setitem(sys.modules, "wandb", None)
+    with pytest.raises(NgptError, match=r"run\.wandb = 'kitchens': wandb is not installed; pip install wandb"):
+        made(tmp_path / "lacking", wandb="kitchens").run()
+    assert not (tmp_path / "lacking" / "log.jsonl").exists()
+
+
+def test_the_base_of_a_run_is_its_configuration_or_the_nearest(tmp_path):
+    changed = read_settings(configs.FOLDER / "fast.toml", ["run.seed=7"])
+    assert nearest(changed, configs.FOLDER / "tiny.toml")[0] == "tiny"
+    own = tmp_path / "my.toml"
+    own.write_text((configs.FOLDER / "fast.toml").read_text())
+    assert nearest(changed, own) == ("fast", {"run.seed": [0, 7]})
+
+
+def test_pages_of_old_and_of_young_runs(tmp_path):
+    """Without a record, settings, pictures or a validation."""
+    write_run(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "log.jsonl").write_text('{"step": 10, "loss": 0.5}\n{"step": 20, "lo')
+    run = read_run(tmp_path)
+    assert run.done == 10 and run.best == {} and "10" in page([run])
+    (tmp_path / "run.json").write_text("[]")
+    with pytest.raises(NgptError, match=r"run\.json: is no record"):
+        read_run(tmp_path)
+
+
+def test_curves():
+    assert curves("steps", {"a": [(1, float("nan")), (2, 0.0)]}) == ""
+    long = curves("steps", {"a": [(i, 1.0 + i % 2) for i in range(1, 10 * MOST)]})
+    assert long.count("L") <= MOST and "<circle" in long
+    assert even_ticks(0, 60) == [0, 10, 20, 30, 40, 50, 60]
+    assert ticks(310, 420) == [320, 340, 360, 380, 400, 420]
