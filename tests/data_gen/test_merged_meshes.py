@@ -91,6 +91,23 @@ def test_it_is_the_same_scene(renderer, scene_file):
     assert np.allclose(*images, atol=1e-5)
 
 
+def test_a_scene_of_nothing_else_has_its_bounds(renderer, tmp_path):
+    """Of rectangles that Mitsuba merges by itself they are lost, and with them the sky's sphere."""
+    from data_gen.scenes.load import load_scene
+
+    for i, name in enumerate("abc"):
+        (tmp_path / f"{name}.ply").write_text(quad(1.2 * i))
+    shapes = "".join(shape(name, '<ref id="red"/>') for name in "abc")
+    path = tmp_path / "scene.xml"
+    path.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><emitter type="constant"/><sensor type="perspective"/>'
+        f"{bsdf('red', '.7,.2,.2')}{shapes}</scene>"
+    )
+    scene = load_scene(str(path))
+    assert len(scene.shapes()) == 1
+    assert np.allclose(scene.bbox().min, (0, -0.5, 0)) and np.allclose(scene.bbox().max, (3.4, 0.5, 0))
+
+
 def test_the_order_is_that_of_the_file_in_every_process(scene_file):
     code = (
         "from data_gen.backend import use_variant; use_variant('llvm_ad_rgb')\n"
