@@ -3,17 +3,18 @@
     python -m bench.merged SCENE.xml ... -o bench/results/merged.json
 
 Seconds of renders of one sample at 64x36 pixels, which is what it takes to begin one, and of 16 samples at 320x180; in
-turns, the median of five and their spread (largest over least).
+turns, the median of six and their spread (largest over least).
 """
 
 import argparse
+import gc
 import statistics
 import time
 from pathlib import Path
 
 from bench.common import metadata, save
 
-TIMES = 5
+ROUNDS, TIMES = 2, 3
 RENDERS = {"begin": ((64, 36), 1), "render": ((320, 180), 16)}
 
 
@@ -37,31 +38,41 @@ def main() -> None:
 
 def measured(path: str, samplers: list[str]):
     """A row for each sampler."""
+    found: dict = {}
+    # In turns, one at a time: a kernel knows the shapes of all scenes in memory.
+    for _ in range(ROUNDS):
+        for kind in ("merged", "apart"):
+            shapes, seconds = times(path, kind == "merged", samplers)
+            for key, took in seconds.items():
+                found.setdefault(key, {}).setdefault(kind, []).extend(took)
+            found[kind] = shapes
+    for sampler in samplers:
+        row = {"scene": Path(path).parent.name, "meshes": found["apart"], "merged": found["merged"], "sampler": sampler}
+        for name in RENDERS:
+            row[name] = {
+                kind: {"median": round(statistics.median(took), 3), "spread": round(max(took) / min(took), 2)}
+                for kind, took in found[sampler, name].items()
+            }
+        yield row
+
+
+def times(path: str, merged: bool, samplers: list[str]) -> tuple[int, dict[tuple[str, str], list[float]]]:
+    """How many shapes the scene has, and seconds by sampler and kind of render."""
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene, set_film_size
 
-    scenes = {merged: load_scene(path, merged=merged) for merged in (True, False)}
-    shapes = {merged: len(scene.shapes()) for merged, scene in scenes.items()}
+    gc.collect()
+    scene = load_scene(path, merged=merged)
+    seconds: dict = {}
     for sampler in samplers:
-        row = {"scene": Path(path).parent.name, "meshes": shapes[False], "merged": shapes[True], "sampler": sampler}
         for name, (size, spp) in RENDERS.items():
-            took: dict[bool, list[float]] = {True: [], False: []}
-            for scene in scenes.values():
-                set_film_size(scene, size)
+            set_film_size(scene, size)
             for turn in range(TIMES + 1):
-                for merged, scene in scenes.items():
-                    start = time.perf_counter()
-                    render_stack(scene, spp, 1, sampler)
-                    if turn:  # The first compiles.
-                        took[merged].append(time.perf_counter() - start)
-            row[name] = {
-                "merged" if merged else "apart": {
-                    "median": round(statistics.median(seconds), 3),
-                    "spread": round(max(seconds) / min(seconds), 2),
-                }
-                for merged, seconds in took.items()
-            }
-        yield row
+                start = time.perf_counter()
+                render_stack(scene, spp, 1, sampler)
+                if turn:  # The first compiles.
+                    seconds.setdefault((sampler, name), []).append(time.perf_counter() - start)
+    return len(scene.shapes()), seconds
 
 
 def line(row: dict) -> str:
