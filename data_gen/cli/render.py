@@ -200,8 +200,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
     wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
     if interrupted := ended() and done != wanted:
-        how = "interrupted" if stop() else "enough"
-        console.error(f"{how}: {target} holds the {done} samples per pixel done by then")
+        tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
+        tell(f"{how}: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if args.time is not None and took > _LATE * args.time and done <= _FEW:
         console.say(
