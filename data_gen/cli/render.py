@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.cli.frames import frames, targets
-from data_gen.cli.onlook import onlookers
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
@@ -146,6 +145,8 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 
 def image(args: argparse.Namespace, console: Console) -> int:
     """One stack."""
+    from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
+
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in (apart | {"--skip-existing": args.skip_existing}).items():
         if given:
