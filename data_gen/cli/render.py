@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from data_gen.cli.frames import frames, targets
-from data_gen.cli.onlook import onlookers
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
@@ -150,6 +149,8 @@ def asked(args: argparse.Namespace) -> dict[str, Any]:
 
 def image(args: argparse.Namespace, console: Console) -> int:
     """One stack."""
+    from data_gen.cli.onlook import onlookers  # takes as long as all else that help needs
+
     apart = {"--camera": args.camera, "--dt": args.dt, "--shard": args.shard, "--cluster": args.cluster}
     for option, given in apart.items():
         if given:
@@ -207,8 +208,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
     wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
     if interrupted := ended() and done != wanted:
-        how = "interrupted" if stop() else "enough"
-        console.error(f"{how}: {target} holds the {done} samples per pixel done by then")
+        tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
+        tell(f"{how}: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
     if args.time is not None and took > _LATE * args.time and done <= _FEW:
         console.say(

@@ -3,16 +3,11 @@
 import argparse
 import glob
 import json
-import math
 import re
 from pathlib import Path
 
-import numpy as np
-
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
-from ngpt.report.display import auto_exposure
-from ngpt.report.transforms import TRANSFORMS
 from ngpt.system import configs
 
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
@@ -34,19 +29,6 @@ def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
 
 def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print the result as JSON on standard output")
-
-
-def add_look(parser: argparse.ArgumentParser) -> None:
-    """Options of how a picture shows light; ``ngpt.report.transforms``."""
-    parser.add_argument(
-        "--transform",
-        default="standard",
-        choices=TRANSFORMS,
-        help="view transform of a picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
-    )
-    parser.add_argument(
-        "--exposure", type=stops, default=0.0, metavar="STOPS", help="of a picture: a number (default: 0), or auto"
-    )
 
 
 def add_untrusted(parser: argparse.ArgumentParser) -> None:
@@ -115,32 +97,6 @@ def duration(text: str) -> float:
     if not 0 < seconds < float("inf"):
         raise argparse.ArgumentTypeError(f"'{text}' is not a positive number of seconds")
     return seconds
-
-
-def stops(text: str) -> float | str:
-    """A number of stops, or "auto"."""
-    try:
-        number = 0.0 if text == "auto" else float(text)
-    except ValueError:
-        number = math.nan
-    if not abs(number) <= 100:
-        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of stops, from -100 to 100, nor auto")
-    return text if text == "auto" else number
-
-
-def exposed(asked: float | str, image: np.ndarray) -> float:
-    """The exposure of a picture of (H, W, 3), in stops."""
-    return auto_exposure(image) if isinstance(asked, str) else asked
-
-
-def frames_a_second(text: str) -> float:
-    try:
-        rate = float(text)
-    except ValueError:
-        rate = 0.0
-    if not 0 < rate <= 1000:
-        raise argparse.ArgumentTypeError(f"'{text}' is not a number of frames a second, up to 1000")
-    return rate
 
 
 def stack_files(names: list[str]) -> list[Path]:

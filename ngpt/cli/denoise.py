@@ -20,16 +20,14 @@ from ngpt.cli.arguments import (
     add_force,
     add_json,
     add_layers,
-    add_look,
     add_untrusted,
     assignment,
-    exposed,
     given_files,
     print_json,
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
-from ngpt.cli.picture import check_picture
+from ngpt.cli.picture import add_look, check_picture, exposed
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write

@@ -1,15 +1,17 @@
 """``ngpt picture``: PNG, JPEG and WebP of images, and films of shots, by a view transform."""
 
 import argparse
+import math
 from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force, add_look, exposed, frames_a_second
+from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_image
+from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
-from ngpt.report.transforms import shown
+from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 
@@ -92,3 +94,42 @@ def check_picture(target: Path, args: argparse.Namespace) -> None:
     if args.skip_existing:
         raise WrongUse("--skip-existing knows whole files of OpenEXR alone; leave it out for a picture")
     check_kind(target, PICTURES)
+
+
+def add_look(parser: argparse.ArgumentParser) -> None:
+    """Options of how a picture shows light; ``ngpt.report.transforms``."""
+    parser.add_argument(
+        "--transform",
+        default="standard",
+        choices=TRANSFORMS,
+        help="view transform of a picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
+    )
+    parser.add_argument(
+        "--exposure", type=stops, default=0.0, metavar="STOPS", help="of a picture: a number (default: 0), or auto"
+    )
+
+
+def stops(text: str) -> float | str:
+    """A number of stops, or "auto"."""
+    try:
+        number = 0.0 if text == "auto" else float(text)
+    except ValueError:
+        number = math.nan
+    if not abs(number) <= 100:
+        raise argparse.ArgumentTypeError(f"'{text}' is neither a number of stops, from -100 to 100, nor auto")
+    return text if text == "auto" else number
+
+
+def exposed(asked: float | str, image: np.ndarray) -> float:
+    """The exposure of a picture of (H, W, 3), in stops."""
+    return auto_exposure(image) if isinstance(asked, str) else asked
+
+
+def frames_a_second(text: str) -> float:
+    try:
+        rate = float(text)
+    except ValueError:
+        rate = 0.0
+    if not 0 < rate <= 1000:
+        raise argparse.ArgumentTypeError(f"'{text}' is not a number of frames a second, up to 1000")
+    return rate

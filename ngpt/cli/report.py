@@ -28,6 +28,11 @@ FLICKER = (
     "m the mean of r^2 in both frames"
 )
 CHANGE = "map of the root of d^2 / (m + 0.001), with the mean m of the squared picture in both frames"
+_MARKS = ["0", "0.25", "0.5", "0.75", "≥ 1"]
+MEANINGS = {
+    "change": ("change from the frame before, relative to the light", _MARKS),
+    "flicker": ("flicker, relative to the light", _MARKS),
+}
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -138,7 +143,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
                     add_errors(entry, metrics, reference, path, paths[-1])
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             size = f"{first.shape[1]}x{first.shape[0]}"
-            scenes.append(Scene(Path(frame).stem, f"{frame}, {size}", reference, entries, rising=rising))
+            caption = f"{frame}, {size}"
+            scenes.append(Scene(Path(frame).stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
     tables = {}
     for place in range(len(names)):

@@ -34,6 +34,7 @@ __all__ = [
     "ExrImage",
     "ExrPart",
     "StackSource",
+    "channels_alone",
     "layers_in",
     "layers_of_light",
     "pass_through",
@@ -236,6 +237,12 @@ def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
         for name, channel in part.channels.items()
         if (i, name) not in known
     }
+
+
+def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
+    """Of what ``pass_through`` gives, the channels that are in none of the ``layers_of_light``."""
+    light = {id(part.channels[name]) for part, names in _light(stack).values() for name in names}
+    return {name: channel for name, channel in pass_through(stack).items() if id(channel) not in light}
 
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:

@@ -72,7 +72,10 @@ def _conversion(chromaticities: np.ndarray) -> np.ndarray:
     if (white <= 0).any():
         raise ValueError("their white is none")
     adapted = np.linalg.solve(_BRADFORD, np.diag(aim / white) @ _BRADFORD)
-    return np.linalg.solve(ours, adapted @ theirs)
+    matrix = np.linalg.solve(ours, adapted @ theirs)
+    if not np.linalg.cond(matrix) < 1e4:
+        raise ValueError("they are next to each other")
+    return matrix
 
 
 def _to_xyz(chromaticities: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from ngpt.io.exr import layers_of_light, pass_through
+from ngpt.io.exr import channels_alone, layers_of_light
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.report.content import Entry
 from ngpt.stack import GradientStack
@@ -28,10 +28,8 @@ def of_stack(stack: GradientStack, shown: np.ndarray, name: str) -> tuple[list[E
             entries.append(Entry(layer if layer != name else f"{layer} (layer)", image))
     taken = {entry.name for entry in entries}
     layers = {layer: _three(stack[layer]) for layer in stack.names if layer not in light}
-    root, result = {"R", "G", "B"}, {"primal.R", "primal.G", "primal.B"}
-    of_light = {f"{layer}.{channel}" for layer in light for channel in "RGB"}
-    for channel, values in pass_through(stack).items():
-        if channel not in root | result | of_light and channel not in taken:
+    for channel, values in channels_alone(stack).items():
+        if channel not in "RGB":  # the root, which is shown
             layers[channel] = np.asarray(values, np.float32)[..., None]
     return entries, {layer: values for layer, values in layers.items() if layer not in taken}
 

@@ -44,7 +44,14 @@ def test_what_says_nothing_or_nonsense_is_left_as_it_is(caplog):
     assert to_rec709({}) is None and to_rec709({"chromaticities": REC709}) is None
     assert to_rec709({"chromaticities": tuple(np.float32(REC709))}) is None
     assert not caplog.records
-    for wrong in ((1, 2, 3), "sRGB", (np.nan,) * 8, (0.3,) * 8, (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3, 0.0)):
+    for wrong in (
+        (1, 2, 3),
+        "sRGB",
+        (np.nan,) * 8,
+        (0.3,) * 8,
+        (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3, 0.0),
+        (3e38,) * 8,
+    ):
         assert to_rec709({"chromaticities": wrong}) is None
         assert "left out of account" in caplog.text
         caplog.clear()
