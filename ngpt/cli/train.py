@@ -39,8 +39,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.training.examples import Mixture, split
     from ngpt.training.folders import open_crops
     from ngpt.training.loss import make_loss
-    from ngpt.training.run_page import PAGE
     from ngpt.training.run_record import write_record
+    from ngpt.training.run_summary import PAGE
     from ngpt.training.settings import read_settings
     from ngpt.training.trainer import Trainer, show
 

@@ -20,10 +20,10 @@ from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.files import atomic_output
 from ngpt.system.records import read_json
-from ngpt.training.run_summary import LOG, SETTINGS, entries_of
+from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
 from ngpt.training.settings_text import difference, flat
 
-PAGE, TABLE, RECORD = "run.html", "log.csv", "run.json"
+TABLE, RECORD = "log.csv", "run.json"
 # Seconds after which an open page of a run that goes on is read again.
 REFRESH = 30
 COLUMNS = ("input", "result", "reference")

@@ -13,6 +13,7 @@ from ngpt.system.reading import read_text, regular_file
 from ngpt.system.records import check, parse_json, read_json
 
 CHECKPOINT, LOG, SETTINGS, WEIGHTS = "checkpoint.safetensors", "log.jsonl", "settings.json", "weights.safetensors"
+PAGE = "run.html"
 # Entries of the log that the loss is averaged over: one batch says little.
 _RECENT = 10
 # Bytes; far above what names and shapes of tensors take.
@@ -50,6 +51,8 @@ def summary(folder: Path) -> dict[str, Any]:
         report |= {"validations": len(scores), "validation": {"best": best, "last": scores[-1]}}
     if (folder / WEIGHTS).is_file():
         report["weights"] = str(identify(folder / WEIGHTS))
+    if (folder / PAGE).is_file():
+        report["page"] = str(folder / PAGE)
     if bad := sorted(path.name for path in folder.glob("bad-batch-*.safetensors")):
         report["batches whose loss was not finite"] = bad
     return report
