@@ -7,7 +7,7 @@ those of the commit run in a process of their own, which takes its turn like the
 
     wcv, ngpt-fast, ngpt-combine   as ``ngpt denoise`` runs them
     oidn            Open Image Denoise with albedo and normal as they are
-    oidn-small, oidn-default   networks of that shape, with weights at random, on wcv: ``ngpt denoise --weights NET.tza``
+    oidn-small, oidn-default   networks of that shape, weights at random, on wcv: ``ngpt denoise --weights NET.tza``
     before: ...     the same at the commit
 
 Seconds by the clock and of the processor, and each row's over those of "oidn" in the same turn: medians and quartiles.
