@@ -7,10 +7,11 @@ those of the commit run in a process of their own, which takes its turn like the
 
     wcv, ngpt-fast, ngpt-combine   as ``ngpt denoise`` runs them
     oidn            Open Image Denoise with albedo and normal as they are
-    oidn-small, oidn-default   networks of that shape, with weights at random, on wcv: ``ngpt denoise --weights NET.tza``
+    oidn-small, oidn-default   networks of that shape, weights at random, on wcv: ``ngpt denoise --weights NET.tza``
     before: ...     the same at the commit
 
-Seconds by the clock and of the processor, and each row's over those of "oidn" in the same turn: medians and quartiles.
+Seconds by the clock and of processors, and the latter over those of "oidn" in the same turn: medians and quartiles. On
+a busy machine only processor time means anything.
 """
 
 import argparse
@@ -55,7 +56,7 @@ def main() -> None:
         finally:
             git("worktree", "remove", "--force", str(old))
     for name, row in result["rows"].items():
-        clock, cpu, ratio = (row[key]["median"] for key in ("clock", "processor", "over oidn"))
+        clock, cpu, ratio = (row[key]["median"] for key in ("clock", "processors", "over oidn"))
         print(f"{name:22}{clock:8.3f} s by the clock {cpu:8.3f} s of processors {ratio:8.2f} times oidn")
     save(args.output, result)
 
@@ -96,8 +97,8 @@ def measured(calls: dict[str, Callable[[], tuple[float, float]]], repeats: int) 
     return {
         name: {
             "clock": summary([clock for clock, _ in told]),
-            "processor": summary([cpu for _, cpu in told]),
-            "over oidn": summary([a / b for (a, _), (b, _) in zip(told, runs["oidn"], strict=True)]),
+            "processors": summary([cpu for _, cpu in told]),
+            "over oidn": summary([a / b for (_, a), (_, b) in zip(told, runs["oidn"], strict=True)]),
         }
         for name, told in runs.items()
     }

@@ -250,6 +250,9 @@ def _made(path: str, _modified: int, device: str, threads: int):
     # The plan of which buffers to use again takes most of the start, six times as long as all else, and gains neither
     # time nor memory: the arena has the same buffers again.
     options.enable_mem_reuse = False
+    # Threads that wait for each other would keep their cores busy: a fifth of the processor time of ngpt-fast, which
+    # whatever works beside it lacks.
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     # What goes wrong comes as an exception; in the log it would stand a second time.
     options.log_severity_level = 4
     try:
