@@ -31,8 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time",
         type=duration,
         metavar="SECONDS",
-        help="render for this long, kernel compilation included, instead of a number of paths; with both: until the "
-        "first of them is reached",
+        help="render for this long, kernel compilation included; with --spp: until the first is reached",
     )
     parser.add_argument(
         "--adaptive",
@@ -51,8 +50,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         dest="method",
         metavar="METHOD",
         help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv). With "
-        "--time alone: what a pilot chooses the sampler for, and whether samples are adaptive, by the error that it "
-        "expects of the result; with `auto` it chooses the method too. --time is then that of pilot, render and method",
+        "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
+        "too. --time is then that of pilot, render and method",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
     first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
@@ -74,7 +73,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument(
-        "--memory", type=positive, metavar="MIB", help="memory for paths and film, beside the scene (default: 6144)"
+        "--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)"
     )
     parser.add_argument(
         "--diagnostics",
@@ -84,11 +83,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live",
         action="store_true",
-        help="serve a page on this machine's loopback address that shows the render while it goes on, denoised quickly "
-        "beside the noisy image, with a button that ends it",
+        help="serve a page on 127.0.0.1 that shows the render, noisy and denoised, while it goes on",
     )
     parser.add_argument(
-        "--view", metavar="HOST:PORT", help="send the same images to the viewer tev, which listens on 127.0.0.1:14158"
+        "--view", metavar="HOST:PORT", help="send the same to the viewer tev (its own: 127.0.0.1:14158)"
     )
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
@@ -104,7 +102,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=frames,
         metavar="FRAMES",
         help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9; "
-        "or as farms write them: 1-10 (10 is in it), 1-9x2",
+        "as farms write them: 1-10 (10 is in it), 1-9x2",
     )
     shot.add_argument(
         "--camera",
@@ -116,8 +114,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=positive,
         default=0,
         metavar="PAIRS",
-        help="write differences to the frame before too, of so many pairs of paths a pixel (2 or more), for "
-        "`ngpt denoise --temporal -m wcv`: a quarter of --spp is enough",
+        help="differences to the frame before too, of so many pairs of paths a pixel (2 or more; a quarter of --spp "
+        "is enough), for `ngpt denoise --temporal -m wcv`",
     )
     shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
     shot.add_argument(
@@ -129,7 +127,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing.add_argument(
         "--skip-existing",
         action="store_true",
-        help="leave out what is there: goes on with a shot, or a queue of images",
+        help="leave out what is there already",
     )
     add_json(parser)
 

@@ -13,6 +13,7 @@ from typing import Protocol
 import torch
 
 from ngpt.errors import NgptError
+from ngpt.system.install import package_command
 from ngpt.system.records import read_json
 from ngpt.training.run_page import RECORD
 from ngpt.training.settings import Settings, published
@@ -46,7 +47,8 @@ class WeightsAndBiases:
             import wandb
         except ModuleNotFoundError as error:
             raise NgptError(
-                f"run.wandb = '{settings.run.wandb}': wandb is not installed; pip install wandb, or leave it out"
+                f"run.wandb = '{settings.run.wandb}': wandb is not installed; leave it out, or "
+                f"`{package_command('wandb')}`"
             ) from error
         record = read_json(out / RECORD) if (out / RECORD).is_file() else {}
         self._run = wandb.init(

@@ -105,7 +105,7 @@ def test_a_set_of_shots(renderer, around, tmp_path, monkeypatch):
     from ngpt.training.dataset import Dataset, problems
 
     monkeypatch.setattr(cameras, "Surroundings", lambda scene, box: around)
-    monkeypatch.setattr(load, "load_scene", lambda *arguments: None)
+    monkeypatch.setattr(load, "load_scene", lambda *arguments, merged: None)
     monkeypatch.setattr(crops, "made_scene", lambda *arguments: None)
     jobs.generate(config_of(size=16, crops=2), tmp_path, jobs.Serial())
     data = Dataset(tmp_path)

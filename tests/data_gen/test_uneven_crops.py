@@ -77,7 +77,7 @@ def test_a_set_of_both_kinds(renderer, around, tmp_path, monkeypatch):
     from data_gen.scenes import load
 
     monkeypatch.setattr(cameras, "Surroundings", lambda scene, box: around)
-    monkeypatch.setattr(load, "load_scene", lambda *arguments: None)
+    monkeypatch.setattr(load, "load_scene", lambda *arguments, merged: None)
     monkeypatch.setattr(crops, "made_scene", lambda *arguments: None)
     monkeypatch.setattr(crops, "uneven_inputs", lambda config, name, crop, counts: [False, crop == 1])
     jobs.generate(config_of(adaptive=0.5, crops=2), tmp_path, jobs.Serial())

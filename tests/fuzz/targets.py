@@ -114,7 +114,7 @@ SETTINGS = {
 
 
 class _Crop:
-    scene, inputs, spp = "a", 1, (4,)
+    scene, inputs, spp, paired = "a", 1, (4,), False
 
     def stack(self, k: int) -> ngpt.GradientStack:
         return full_stack(16, 16)
