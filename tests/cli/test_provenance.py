@@ -104,7 +104,7 @@ def test_errors_of_a_network_of_ones_own_name_its_file(stack, own):
     with pytest.raises(ngpt.NgptError) as caught:
         ngpt.reconstruct(stack.replace(dx=np.full_like(stack["dx"], 3e38)), weights=str(own))
     message = str(caught.value)
-    assert "own network ngpt-fast sha256:" in message and "method 'ngpt" not in message
+    assert f"own network {own} sha256:" in message and "method 'ngpt" not in message
 
 
 def test_info_on_our_network(capsys):
