@@ -31,8 +31,8 @@ SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain
 LEAST_SECONDS = 45.0
-# What a method takes that no pilot has measured: to begin, and for a million pixels
-_METHOD_BEGINS, _METHOD_SECONDS = 0.5, 3.0
+# What a method takes that no pilot has measured: for its process to begin, and for a million pixels
+_METHOD_BEGINS, _METHOD_SECONDS = 1.0, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
 # Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
