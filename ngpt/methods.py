@@ -295,7 +295,9 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
     lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
     if lost:
-        what = f"method '{name}'" if weights is None or weights.shipped else f"own network {own} sha256:{weights.sha256[:12]}"
+        what = f"method '{name}'"
+        if weights is not None and not weights.shipped:
+            what = f"own network {own} sha256:{weights.sha256[:12]}"
         raise NgptError(
             f"{stack.path}: {what} gave {lost} non-finite pixels; the largest input value is "
             f"{enlarged(np.abs(data.image).max(), power):.3g}: scale the stack down, or use another method"
