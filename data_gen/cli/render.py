@@ -72,9 +72,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="an option of the sampler; may be repeated. See `ngpt info SAMPLER`",
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
-    parser.add_argument(
-        "--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)"
-    )
+    parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
     parser.add_argument(
         "--diagnostics",
         action="store_true",
