@@ -14,15 +14,15 @@ from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 from ngpt.training.halves import halves
 
-KINDS = (*perceptual.KINDS, "l1")
+KINDS = (*perceptual.KINDS, "pu", "l1")
 
 
 @dataclass(frozen=True)
 class LossSettings:
     """The table [loss] of a configuration.
 
-    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg", or
-                     "l1" for none
+    ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg",
+                     "pu" (OIDN's), or "l1" for none
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
@@ -88,6 +88,9 @@ class Loss:
         if self._distance is not None:
             parts["perceptual"] = self._distance(prediction, target, generator)
             total = total + parts["perceptual"]
+        if s.kind == "pu":
+            parts["pu"] = pixelwise.pu(prediction, target)
+            total = total + parts["pu"]
         for name, weight, function in (
             # Alone, L1 is the loss, and its weight would only scale the learning rate.
             ("l1", s.l1 if s.kind != "l1" else 1.0, pixelwise.l1),

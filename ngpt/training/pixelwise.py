@@ -6,12 +6,16 @@ from torch.nn.functional import avg_pool2d
 
 from ngpt.measure.distances import flip as _flip
 from ngpt.measure.distances.perceptual import tone_mapped
+from ngpt.measure.distances.structural import ms_ssim
+from ngpt.network import oidnet
 from ngpt.network.transfer import signed_log, srgb
 
 # Resolutions of ``pyramid``, and the exposures at which a viewer may look at them.
 _SCALES, _EXPOSURES = 4, (0.25, 1.0, 4.0)
 # Of ``flip``: the typical radiance over the exposure is 4, white at the first; at the last 32 times as much is.
 _WHITES = (0.25, 0.0078)
+# The parts of ``pu``.
+_PU_L1, _PU_STRUCTURE = 0.16, 0.84
 
 
 def l1(prediction: Tensor, target: Tensor) -> Tensor:
@@ -75,3 +79,16 @@ def flip(prediction: Tensor, target: Tensor) -> Tensor:
     It sees what the eye resolves, and weighs it as Lab does [Andersson et al. 2020 and 2021].
     """
     return _flip.flip(prediction, target, _WHITES)
+
+
+def pu(prediction: Tensor, target: Tensor) -> Tensor:
+    """0.16 mean |p' - t'| + 0.84 (1 - MS-SSIM(p', t')): what OIDN is trained by, at the exposure it would give t.
+
+    x' are codes of its perceptual curve, in which equal steps look alike over all brightnesses that displays may have.
+    [Open Image Denoise 2.4.1, training/loss.py; its windows are Gaussians of 11 pixels, these are boxes of 7.]
+    """
+    scale = oidnet.exposure(target)
+    a, b = (oidnet.perceptual(scale * image.clamp(min=0)) for image in (prediction, target))
+    # Below 0 the curve has no slope: what is there must find the way back.
+    black = scale * prediction.clamp(max=0).abs()
+    return _PU_L1 * ((a - b).abs() + black).mean() + _PU_STRUCTURE * (1 - ms_ssim(a, b)).mean()

@@ -11,7 +11,7 @@ from skimage.metrics import structural_similarity
 
 from ngpt.errors import NgptError
 from ngpt.measure.distances import backbones, elpips, ensemble
-from ngpt.measure.distances.structural import ssim_parts, structural_distance
+from ngpt.measure.distances.structural import ms_ssim, ssim_parts, structural_distance
 from ngpt.training import pixelwise
 from ngpt.training.loss import make_loss
 
@@ -407,3 +407,48 @@ def test_the_pyramid_takes_any_size_and_any_radiance(size):
     value.backward()
     assert 0 < value.item() < 1 and torch.isfinite(prediction.grad).all()
     assert make_loss({"kind": "l1", "pyramid": 1.0})(prediction, prediction.detach(), generator())[0].item() == 0
+
+
+def windows_of_7(image):
+    """Windows of 7x7 pixels, every third, (N, 49)."""
+    starts = range(0, image.shape[0] - 6, 3)
+    return np.array([image[y : y + 7, x : x + 7].ravel() for y in starts for x in starts])
+
+
+def test_ms_ssim_is_the_product_over_the_scales_by_brute_force():
+    rng = np.random.default_rng(4)
+    a = rng.random((14, 14))
+    b = np.clip(a + 0.1 * rng.standard_normal(a.shape), 0, 1)
+    images_at = [(a, b), tuple(image.reshape(7, 2, 7, 2).mean((1, 3)) for image in (a, b))]
+    expected, weights = 1.0, np.array([0.0448, 0.2856]) / (0.0448 + 0.2856)
+    for scale, weight in enumerate(weights):
+        x, y = (windows_of_7(image) for image in images_at[scale])
+        covariance = (x * y).mean(1) - x.mean(1) * y.mean(1)
+        similarity = (2 * covariance + 0.03**2) / (x.var(1) + y.var(1) + 0.03**2)
+        if scale == 1:
+            mx, my = x.mean(1), y.mean(1)
+            similarity *= (2 * mx * my + 0.01**2) / (mx**2 + my**2 + 0.01**2)
+        expected *= similarity.mean() ** weight
+    value = ms_ssim(*(torch.tensor(image)[None, None] for image in (a, b)))
+    assert value.shape == (1, 1) and value.item() == pytest.approx(expected, rel=1e-5)
+
+
+def test_the_loss_of_oidn_is_zero_for_equal_images_and_looks_at_them_at_their_own_exposure():
+    a, b = 8 * images(2, 3, 48, 40), 8 * images(2, 3, 48, 40, seed=1)
+    loss = make_loss({"kind": "pu", "l1": 0.0, "gradient": 0.0})
+    assert loss(a, a, generator())[0].item() == pytest.approx(0, abs=1e-5)
+    value = loss(a, b, generator())[0].item()
+    assert 0.1 < value < 1
+    # The exposure is that of the target: an image a hundred times as bright looks the same.
+    assert loss(100 * a, 100 * b, generator())[0].item() == pytest.approx(value, rel=1e-4)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (7, 13), (48, 40)])
+def test_the_loss_of_oidn_takes_any_radiance_and_black_finds_the_way_back(size):
+    prediction = torch.full((2, 3, *size), -0.5)
+    prediction[0], prediction[1, 0] = 1e12, 0
+    prediction.requires_grad_()
+    value = pixelwise.pu(prediction, images(2, 3, *size) + 0.1)
+    value.backward()
+    assert torch.isfinite(value) and torch.isfinite(prediction.grad).all()
+    assert (prediction.grad[1, 1:] < 0).all()

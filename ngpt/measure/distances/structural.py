@@ -23,11 +23,7 @@ def structural_distance(a: Tensor, b: Tensor) -> Tensor:
     gradient magnitudes [Xue et al. 2014, eq. 4].
     """
     a, b = a.float(), b.float()
-    scales = 1
-    while scales < len(_WEIGHTS) and min(a.shape[-2:]) >> scales >= _WINDOW:
-        scales += 1
-    weights = torch.tensor(_WEIGHTS[:scales], device=a.device)
-    weights = weights / weights.sum()
+    weights = _weights(a)
     total = a.new_zeros(())
     for scale, weight in enumerate(weights):
         if scale:
@@ -35,6 +31,35 @@ def structural_distance(a: Tensor, b: Tensor) -> Tensor:
         luminance, structure = ssim_parts(a, b)
         total = total + weight * ((1 - structure).mean() + (1 - gradient_similarity(a, b)).mean())
     return total + weights[-1] * (1 - luminance).mean()
+
+
+def ms_ssim(a: Tensor, b: Tensor) -> Tensor:
+    """MS-SSIM of images (N, C, H, W) of range 1, (N, C) each, 1 for equal ones [Wang et al. 2003].
+
+        L_S^w_S  Π_s CS_s^w_s
+
+    L and CS are means over the image. Those below 1e-4 count as that, so that the product has a slope.
+    """
+    a, b = a.float(), b.float()
+    weights = _weights(a)
+    product = a.new_ones(a.shape[:2])
+    for scale, weight in enumerate(weights):
+        if scale:
+            a, b = avg_pool2d(a, 2), avg_pool2d(b, 2)
+        luminance, structure = ssim_parts(a, b)
+        last = scale == len(weights) - 1
+        similarity = (luminance * structure if last else structure).mean((-2, -1))
+        product = product * similarity.clamp(min=1e-4) ** weight
+    return product
+
+
+def _weights(image: Tensor) -> Tensor:
+    """Of the scales that the image has room for; their sum is 1."""
+    scales = 1
+    while scales < len(_WEIGHTS) and min(image.shape[-2:]) >> scales >= _WINDOW:
+        scales += 1
+    weights = torch.tensor(_WEIGHTS[:scales], device=image.device)
+    return weights / weights.sum()
 
 
 def ssim_parts(a: Tensor, b: Tensor, stride: int = _STRIDE) -> tuple[Tensor, Tensor]:
