@@ -46,7 +46,7 @@ VERBS = {
         extra="train",
         interrupted="interrupted; the same command goes on from here",
     ),
-    "export": Verb("write a reconstruction as an ONNX file", extra="export"),
+    "export": Verb("write a reconstruction as an ONNX file, or weights in 16 bits", extra="export"),
 }
 
 

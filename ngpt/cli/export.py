@@ -1,4 +1,4 @@
-"""``ngpt export``: writes a reconstruction as an ONNX file, or a network of OIDN's shape for OIDN's runtime."""
+"""``ngpt export``: writes a reconstruction as an ONNX file, a network for OIDN's runtime, or weights in 16 bits."""
 
 import argparse
 from pathlib import Path
@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
     parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
     parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
-    what = "model to write: .onnx, or .tza for OIDN"
+    what = "model to write: .onnx, .tza for OIDN, or .safetensors: weights in 16 bits"
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=what)
     add_force(parser)
 
@@ -31,8 +31,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
             check_output(path, args.force)
     if not args.weights and (args.statistics or args.vector):
         raise WrongUse("--statistics and --vector belong to networks; leave them out for a classical method")
-    if args.output.suffix == ".tza" and (not args.weights or args.statistics or args.vector):
-        raise WrongUse(f"{args.output}: a file for OIDN holds a network and no more; give it --weights alone")
+    if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.statistics or args.vector):
+        raise WrongUse(f"{args.output}: a file of this kind holds a network and no more; give it --weights alone")
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
     return 0
@@ -46,6 +46,11 @@ def write(args: argparse.Namespace) -> list[Path]:
         data = oidn_weights(args.weights)
         with atomic_output(args.output, args.force) as temporary:
             temporary.write_bytes(data)
+        return [args.output]
+    if args.output.suffix == ".safetensors":
+        from ngpt.export.halves import write_halves
+
+        write_halves(args.weights, args.output, args.force)
         return [args.output]
     if not args.weights:
         from ngpt.export.poisson import l2_model

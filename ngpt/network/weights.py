@@ -103,6 +103,23 @@ def check_fit(own: Mapping[str, Tensor], tensors: Mapping[str, Tensor], path: st
             raise NgptError(f"{path}: tensor '{name}' holds values that are not finite; the file is damaged")
 
 
+def in_halves(tensors: Mapping[str, Tensor], path: str) -> dict[str, Tensor]:
+    """The tensors in 16 bits; ``path`` is for messages.
+
+    Raises NgptError for numbers beyond 65504, and where the weights of one output are so small that 16 bits change
+    them by more than rounding. Their scale may be a parameter of its own, so that small ones count. Biases do not.
+    """
+    halves = {name: tensor.half() for name, tensor in tensors.items()}
+    for name, tensor in tensors.items():
+        if not torch.isfinite(halves[name]).all():
+            raise NgptError(f"{path}: tensor '{name}' holds numbers beyond 65504, which 16 bits cannot")
+        if tensor.ndim > 1:
+            change = (halves[name].float() - tensor.float()).flatten(1).norm(dim=1)
+            if (change > 2**-10 * tensor.float().flatten(1).norm(dim=1)).any():
+                raise NgptError(f"{path}: tensor '{name}' holds weights too small for 16 bits")
+    return halves
+
+
 def random_state(seed: int, step: int) -> int:
     """A seed for everything random that belongs to one training step."""
     return int(np.random.SeedSequence((seed, step)).generate_state(1, np.uint64)[0] >> 1)

@@ -379,6 +379,11 @@ def test_fine_tuning_starts_from_weights(tmp_path):
     second = Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b", say=lambda text: None)
     for a, b in zip(first.average.parameters(), second.model.parameters(), strict=True):
         assert torch.equal(a, b)
+    tensors, header = weights.read_tensors(values["initial"])
+    weights.write_tensors(values["initial"], weights.in_halves(tensors, ""), header, overwrite=True)
+    third = Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b", say=lambda text: None)
+    for a, b in zip(first.average.parameters(), third.model.parameters(), strict=True):
+        assert b.dtype == torch.float32 and torch.equal(a.half().float(), b)
     values["model"]["units"] = [2, 2]
     with pytest.raises(NgptError, match=r"another \[model\]"):
         Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b")

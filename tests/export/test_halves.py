@@ -1,0 +1,113 @@
+"""Weights in 16 bits: what they hold, what is refused, and that what reads them computes in 32."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("onnxscript")
+torch = pytest.importorskip("torch")
+
+# ruff: noqa: E402
+import onnx
+from full_stack import full_stack
+
+import ngpt
+from ngpt.cli import main
+from ngpt.export.halves import POINTS
+from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.weights import load_weights, read_tensors, save_weights, write_tensors
+from ngpt.sequence.network import INPUTS
+from ngpt.sequence.train import WIDTHS, network
+
+CONFIG = ModelConfig("dense", (4, 6), (1, 1), ("primal", "base", "primal_se", "dx_se"), "wcv", start=("primal", "base"))
+STEPS = 1000
+
+
+def export(weights, output, *options):
+    return main(["export", "--weights", str(weights), "-o", str(output), *map(str, options)])
+
+
+@pytest.fixture
+def model():
+    torch.manual_seed(1)
+    return Reconstructor(CONFIG).eval()
+
+
+@pytest.fixture
+def run(tmp_path, model):
+    """The weights of a run, after so many steps of those that its log tells of."""
+    save_weights(tmp_path / "weights.safetensors", model, {"step": STEPS, "hours": 2})
+    entries = [{"step": n, "loss": 1 / n} for n in range(1, 2 * STEPS)] + [{"step": 2 * STEPS, "relMSE": 0.1}]
+    (tmp_path / "log.jsonl").write_text("".join(f"{json.dumps(entry)}\n" for entry in entries))
+    return tmp_path / "weights.safetensors"
+
+
+def test_half_the_bytes_the_same_model_and_the_curve_until_its_step(run, tmp_path):
+    assert export(run, tmp_path / "half.safetensors") == 0
+    tensors, header = read_tensors(tmp_path / "half.safetensors")
+    own, told = read_tensors(run)
+    assert {tensor.dtype for tensor in tensors.values()} == {torch.float16}
+    assert (
+        all(torch.equal(tensors[name], tensor.half()) for name, tensor in own.items()) and tensors.keys() == own.keys()
+    )
+    curve = header.pop("curve")
+    assert header == told
+    steps, losses = curve["steps"], curve["losses"]
+    assert len(steps) == len(losses) == POINTS and steps[-1] == STEPS and steps == sorted(set(steps))
+    # The mean of the losses of steps 1 to 10, then the next.
+    assert losses[0] == pytest.approx(np.mean(1 / np.arange(1, 11)), rel=1e-3) and losses[0] > losses[1]
+
+
+def test_a_curve_once_kept_stays(run, tmp_path):
+    (tmp_path / "elsewhere").mkdir()
+    assert export(run, tmp_path / "elsewhere/a.safetensors") == 0
+    assert export(tmp_path / "elsewhere/a.safetensors", tmp_path / "elsewhere/b.safetensors") == 0
+    assert (tmp_path / "elsewhere/a.safetensors").read_bytes() == (tmp_path / "elsewhere/b.safetensors").read_bytes()
+
+
+def test_what_reads_them_computes_in_32_bits(run, tmp_path):
+    half, onnx = tmp_path / "half.safetensors", tmp_path / "half.onnx"
+    assert export(run, half) == 0 and export(half, onnx) == 0
+    loaded, _ = load_weights(half)
+    assert {parameter.dtype for parameter in loaded.parameters()} == {torch.float32}
+    stack = full_stack(20, 26)
+    ours, theirs = (ngpt.denoise(stack, "ngpt", weights=str(path)) for path in (half, run))
+    assert ours.dtype == np.float32
+    np.testing.assert_allclose(ours, theirs, rtol=2e-3, atol=1e-4 * theirs.max())
+    np.testing.assert_allclose(ngpt.denoise(stack, "ngpt", weights=str(onnx)), ours, rtol=1e-4, atol=1e-5 * ours.max())
+
+
+def test_networks_that_blend_frames(tmp_path):
+    torch.manual_seed(2)
+    header = {"kind": "temporal", "inputs": list(INPUTS), "widths": list(WIDTHS), "training": {}}
+    write_tensors(tmp_path / "t.safetensors", network().state_dict(), header)
+    assert export(tmp_path / "t.safetensors", tmp_path / "half.safetensors") == 0
+    assert export(tmp_path / "half.safetensors", tmp_path / "t.onnx") == 0
+    kinds = {tensor.data_type for tensor in onnx.load(tmp_path / "t.onnx").graph.initializer}
+    assert onnx.TensorProto.FLOAT in kinds and onnx.TensorProto.FLOAT16 not in kinds
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [(lambda v: v[0, 0].fill_(1e6), "beyond 65504"), (lambda v: v[1].mul_(1e-6), "too small for 16 bits")],
+)
+def test_numbers_that_16_bits_cannot_hold_are_refused(model, tmp_path, capsys, change, message):
+    change(next(tensor for tensor in model.state_dict().values() if tensor.ndim > 1))
+    save_weights(tmp_path / "w.safetensors", model, {})
+    assert export(tmp_path / "w.safetensors", tmp_path / "half.safetensors") == 1
+    assert message in capsys.readouterr().err and not (tmp_path / "half.safetensors").exists()
+
+
+def test_other_files_and_other_outputs_are_refused(run, tmp_path, capsys):
+    write_tensors(tmp_path / "c.safetensors", {"a": torch.zeros(1)}, {"kind": "checkpoint"})
+    assert export(tmp_path / "c.safetensors", tmp_path / "half.safetensors") == 1
+    assert "holds a checkpoint, not weights" in capsys.readouterr().err
+    assert export(run, tmp_path / "half.safetensors", "--vector", tmp_path / "vector") == 2
+    assert main(["export", "-o", str(tmp_path / "half.safetensors")]) == 2
+
+
+@pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "export" / "weights").glob("*.safetensors")))
+def test_the_repository_keeps_weights_in_16_bits(path):
+    assert {tensor.dtype for tensor in read_tensors(path)[0].values()} == {torch.float16}
