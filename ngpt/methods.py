@@ -223,7 +223,7 @@ def by_standing(*standings: str) -> dict[str, Method]:
 
 
 # The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
-# OIDN's mean error it leaves 0.79 to 0.94 times in rooms, but up to 1.16 times elsewhere, and single scenes more.
+# OIDN's mean error it leaves 0.78 to 0.84 times in rooms, but 1.13 to 1.49 times in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 
 
