@@ -17,7 +17,6 @@ from typing import Any
 import torch
 
 from bench.common import metadata, save
-from bench.scaling import train
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import scores
 from ngpt.network.model import Reconstructor, parameters
@@ -28,7 +27,9 @@ from ngpt.system import configs
 from ngpt.training.cost import per_pixel
 from ngpt.training.examples import judges_of, split
 from ngpt.training.folders import open_crops
-from ngpt.training.settings import read_settings
+from ngpt.training.loss import make_loss
+from ngpt.training.settings import Settings, read_settings
+from ngpt.training.trainer import Trainer
 
 # What is changed of the configuration; the plain network has as many parameters.
 VARIANTS: dict[str, list[str]] = {
@@ -42,6 +43,16 @@ VARIANTS: dict[str, list[str]] = {
 }
 METRICS = ("relMSE trimmed", "FLIP")
 FEW = 16  # samples; fewer are apart from as many or more
+
+
+def train(settings: Settings, crops: Sequence[Any], held_out: Sequence[Any], out: Path) -> None:
+    """Trains to the last step of the run in ``out``, or continues it."""
+    out.mkdir(parents=True, exist_ok=True)
+    trainer = Trainer(settings, crops, held_out, make_loss(settings.loss), out)
+    if trainer.checkpoint.exists():
+        trainer.resume()
+    if trainer.step < settings.run.steps and not trainer.run():
+        raise NgptError(f"{out}: stopped at step {trainer.step}; the same command goes on")
 
 
 @torch.no_grad()

@@ -9,7 +9,6 @@ the geometric means over scenes, and the table of slopes into the page.
 """
 
 import argparse
-import math
 import os
 import statistics
 from collections.abc import Iterator
@@ -100,7 +99,7 @@ def picture(rows: list[dict], counts: list[int]) -> str:
                 )
             ]
             means = np.exp(np.mean(np.log(of_scenes), axis=0))
-            found[f"{points}, {area}"] = list(zip(counts, means, strict=True)), math.nan
+            found[f"{points}, {area}"] = list(zip(counts, means, strict=True))
     return curves.draw(found, "samples per pixel", "RMSE over pixels of 1 sample")
 
 

@@ -23,7 +23,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from bench.before import git
 from bench.common import metadata, save, summary
 
 WORKER = "--worker"
@@ -59,6 +58,11 @@ def main() -> None:
         clock, cpu, ratio = (row[key]["median"] for key in ("clock", "processors", "over oidn"))
         print(f"{name:22}{clock:8.3f} s by the clock {cpu:8.3f} s of processors {ratio:8.2f} times oidn")
     save(args.output, result)
+
+
+def git(*arguments: str) -> None:
+    root = Path(__file__).parents[1]
+    subprocess.run(["git", *arguments], cwd=root, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
 
 def rows(size: str, folder: Path) -> dict[str, Callable[[], object]]:

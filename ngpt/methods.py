@@ -22,7 +22,6 @@ from ngpt.network.run import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack
-from ngpt.studies import bcd, guided, norms, patches
 
 _LOG = logging.getLogger(__name__)
 
@@ -102,15 +101,6 @@ def _nfor(data: Repaired) -> np.ndarray:
     return nfor.nfor(data.image, noise, [data.features[name] for name in _FEATURES if name in data.features])
 
 
-def _bcd(data: Repaired) -> np.ndarray:
-    assert data.noise is not None
-    return bcd.collaborative(data.image, data.noise)
-
-
-def _study(summary: str, needs: tuple[str, ...], run: Callable[..., np.ndarray]) -> Method:
-    return Method(summary, needs, run, {}, "study")
-
-
 def _classical(name: str, summary: str, standing: str = "niche") -> Method:
     entry = CLASSICAL[name]
     return Method(summary, entry.needs, entry.solve, entry.options, standing)
@@ -136,8 +126,6 @@ def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method
 
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
-_VARIANCES = (*_GRADIENTS, "primal_var", "dx_var", "dy_var")
-_ALL = (*_VARIANCES, *_FEATURES)
 
 METHODS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
@@ -191,18 +179,6 @@ METHODS = {
         uses=("albedo", "normal"),
         rec709=True,
     ),
-}
-# Section 5 of the survey: docs/methods/reconstructions.md
-METHODS |= {
-    "irls": _study("least norms by reweighting: what l1 solves", _GRADIENTS, norms.irls),
-    "wl1": _study("least norms in units of standard deviations", _VARIANCES, norms.wl1),
-    "patches": _study("wl2 and windows that are linear in features", _ALL, patches.patches),
-    "nfor-wcv": _study("nfor, wcv one feature more", _ALL, guided.nfor_with("wcv", _FEATURES)),
-    "nfor-l1": _study("nfor, l1 one feature more", _ALL, guided.nfor_with("l1", _FEATURES)),
-    "nfor-wcv-alone": _study("nfor, wcv its only feature", _VARIANCES, guided.nfor_with("wcv", ())),
-    "bcd": _study("collaborative denoising of the primal", ("primal", "primal_var"), _bcd),
-    "bcd-wl2": _study("wl2 of denoised gradients", _VARIANCES, guided.of_denoised_gradients("wl2")),
-    "bcd-l1": _study("l1 of denoised gradients", _VARIANCES, guided.of_denoised_gradients("l1")),
 }
 METHODS |= {
     "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),

@@ -24,7 +24,6 @@ ngpt.renderer ngpt.repair ngpt.magnitude ngpt.io
 ngpt.merging
 ngpt.classical
 ngpt.denoisers ngpt.sequence.wcv_frames
-ngpt.studies
 ngpt.network
 ngpt.methods
 ngpt.sequence.evidence

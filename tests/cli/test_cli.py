@@ -376,7 +376,7 @@ def test_demo(renderer, tmp_path, capsys):
     assert main([*arguments, "--size", "48x32", "-q"]) == 0
     written = {path.name for path in folder.iterdir()}
     assert {"report.html", "diffuse_stack.exr", "diffuse_ref.exr", "diffuse_l1.exr", "diffuse_l2.exr"} <= written
-    assert "diffuse_bcd.exr" not in written  # a study
+    assert "diffuse_nlm.exr" not in written  # a study
     html = (folder / "report.html").read_text()
     assert "diffuse" in html and "relMSE" in html
     rows = {line.split()[1]: float(line.split()[2]) for line in capsys.readouterr().out.splitlines()[1:]}

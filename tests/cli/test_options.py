@@ -68,7 +68,7 @@ def test_help_and_lists_have_methods_by_standing(source, capsys):
     words = " ".join(capsys.readouterr().out.split())
     assert all(f"{name}: {' '.join(entry.summary.split())}" in words for name, entry in by_standing("use").items())
     assert all(f"{name}, " in words for name in ("primal", "l2", "cv", "wl2"))
-    assert "oidn-clean" not in words and "bcd" not in words
+    assert "oidn-clean" not in words and "nlm" not in words
     assert main(["info", "l1", "--json"]) == 0
     about = json.loads(capsys.readouterr().out)
     assert about["standing"] == "use" and "a number from 1e-15 to 1e+15, or auto" in about["options"]["alpha"]

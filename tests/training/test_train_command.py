@@ -67,9 +67,7 @@ def test_defaults_of_the_page_are_what_an_empty_configuration_gives():
 
 def test_sizes():
     sizes = {path.stem: parameters(Reconstructor(read_settings(path).model)) for path in CONFIGS}
-    assert sizes["paper"] == sizes["paper-l1"] == 4_358_534
-    assert sizes["paper-no-gradients"] == 4_350_836
-    assert abs(sizes["plain-unet"] / sizes["paper"] - 1) < 0.01
+    assert sizes["paper"] == 4_358_534
 
 
 def test_a_dry_run_says_what_it_would_cost(train):

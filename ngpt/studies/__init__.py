@@ -1,1 +1,0 @@
-"""Reconstructions that were measured and lost: kept to be compared with, not to be used."""
