@@ -6,7 +6,8 @@ before and after, an image keeps the energy of the primal, which is unbiased; da
 of it.
 """
 
-from ngpt.classical.arrays import Array, cast, module, over_colours
+from ngpt.classical.arrays import Array, by_rows, cast, empty, module, over_colours
+from ngpt.classical.arrays import image as as_image
 from ngpt.classical.leastsquares import solve
 
 # Pixels over which energy is compared: the screened Poisson equation's length. 16 and 64 pixels are as good.
@@ -22,13 +23,17 @@ def keep_energy(image: Array, primal: Array) -> Array:
     The factor is one for all colours, smooth, and 1 where the two agree. f(k image, k primal) = k f(image, primal).
     """
     xp = module(image)
-    before, after = (_local(over_colours(x)) for x in (primal, image))
-    lit = (before > 0) & (after > 0)
-    factor = xp.where(lit, before / xp.where(lit, after, 1), 1).clip(1 / MOST, MOST)
-    return cast(factor, image.dtype)[..., None] * image
+    double = empty(image[..., 0], 2, dtype=xp.float64)
+    brightness, _ = by_rows(lambda i, j: (xp.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
+    # Averaged over REACH pixels but for a factor, which the ratio does not know; sums stay.
+    local = solve(brightness, 1 / REACH**2)
 
+    def rows(first: int, last: int) -> tuple:
+        before, after = local[:, first:last]
+        lit = (before > 0) & (after > 0)
+        factor = xp.where(lit, before / xp.where(lit, after, 1), 1).clip(1 / MOST, MOST)
+        factor = cast(factor, image.dtype)
+        return (xp.stack([factor * image[first:last, :, channel] for channel in range(image.shape[-1])]),)
 
-def _local(brightness: Array) -> Array:
-    """(H, W) averaged over ``REACH`` pixels; the sum stays."""
-    screen = 1 / REACH**2
-    return screen * solve(1.0 * brightness[None], screen)[0]
+    out = empty(image[..., 0], image.shape[-1], channels_last=True, dtype=image.dtype)
+    return as_image(by_rows(rows, out)[0])

@@ -5,6 +5,8 @@ NumPy alone, and faster than its expressions over bands of an image (docs/lab/lo
 - The image is cut into strips of rows, which threads work on. A strip has ``DEPTH`` rows more on both sides, copies of
   its neighbours', so that so many sweeps need no word from them: what is wrong at its ends moves in by a row a sweep.
 - Within a strip, sweeps follow each other a row apart, on some rows at a time. What they read stays in the cache.
+- Few calls do much each: x and y, and all colours, in one. Each call of NumPy takes Python's lock at its end, and a
+  thread that finds it taken sleeps; of short calls, two threads take longer than one.
 - Rows are padded to whole vectors and laid end to end, so that operations see one long aligned array. What the last
   pixel of a row says of the first of the next has weight 0.
 """
@@ -22,7 +24,7 @@ DEPTH = 5
 # Rows of a strip without those of its neighbours; fewer make more of these, more leave threads without work.
 _STRIP = 180
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
-_PIXELS = 20480
+_PIXELS = 30720
 # Bytes of the widest vectors: operations on addresses that are no multiples take twice as long.
 _VECTOR = 64
 
@@ -68,10 +70,11 @@ class _Strip:
         size = self.rows * self.pitch
         # One row more on top, to which the first one has no difference, and below.
         self.u = _aligned((channels, size + 2 * self.pitch), dtype, 0)
-        self.x, self.y = _aligned((2, channels, size), dtype, 0)
+        self.r = _aligned((2, channels, size), dtype, 0)
+        # Of each pixel the one to its right, and the one below.
+        self.neighbours = _pair(self.u[:, self.pitch + 1 :], self.u[:, 2 * self.pitch :], size)
         self.ratio = _aligned((4, size), dtype, np.inf)
-        for flat, values in ((self.x, r[0]), (self.y, r[1])):
-            self._grid(flat)[:, strip, :width] = values[:, image]
+        self._grid(self.r)[:, :, strip, :width] = r[:, :, image]
         right, below, left, above = self._grid(self.ratio)[:, strip, :width]
         v, (vx, vy) = v[image], differences[:, image]
         np.divide(vx, v, out=right)
@@ -93,7 +96,7 @@ class _Strip:
         """One sweep for each factor, each one row behind the one before."""
         rows = max(1, _PIXELS // self.pitch)
         scratch = _Scratch(self, rows)
-        numbers = [self.x.dtype.type(factor) for factor in factors]
+        numbers = [self.u.dtype.type(factor) for factor in factors]
         for bottom in range(rows, self.rows + len(factors) + rows - 1, rows):
             for late, factor in enumerate(numbers):
                 top, end = max(bottom - rows - late, 0), min(bottom - late, self.rows)
@@ -105,58 +108,55 @@ class _Strip:
 
         ``above`` (C, pitch) is what the last row of those before said of this sweep's first, and will be of the next.
         """
-        lead, pitch = self.lead, self.pitch
-        first, last = top * pitch, end * pitch
-        here = slice(first + pitch, last + pitch)
-        weight = scratch.weights[:, : last - first]
-        said, product = (a[:, : last - first] for a in (scratch.said, scratch.product))
-        np.add(self.ratio[:, first:last], factor, out=weight)
-        np.divide(factor, weight, out=weight)
-        right, below, left, over = weight
-        share = scratch.share[: last - first]
-        np.add(right, below, out=share)
-        share += left
-        share += over
-        share += 1
-        np.reciprocal(share, out=share)
-        u = self.u[:, here]
-        # Of dx, one vector more to the left.
-        d = scratch.difference[:, : lead + last - first]
-        before = slice(here.start - lead, here.stop)
-        np.subtract(self.u[:, here.start - lead + 1 : here.stop + 1], self.u[:, before], out=d)
-        d[:, lead:] -= self.x[:, first:last]
-        if first:
-            d[:, :lead] -= self.x[:, first - lead : first]
-        np.multiply(right, d[:, lead:], out=said)
-        np.multiply(left, d[:, lead - 1 : -1], out=product)
-        said -= product
+        pitch, first, last = self.pitch, top * self.pitch, end * self.pitch
+        size = last - first
+        weights, share, d, before, said = (a[..., :size] for a in scratch.arrays)
+        u = self.u[:, first + pitch : last + pitch]
+        np.add(self.ratio[:, first:last], factor, out=weights)
+        np.divide(factor, weights, out=weights)
+        np.add.reduce(weights, axis=0, initial=1, out=share)
+        np.subtract(self.neighbours[..., first:last], u, out=d)
+        d -= self.r[..., first:last]
         # Of dy, the row above, as it was before this sweep.
-        d = scratch.difference[:, : pitch + last - first]
-        d[:, :pitch] = above
-        np.subtract(self.u[:, here.start + pitch : here.stop + pitch], u, out=d[:, pitch:])
-        d[:, pitch:] -= self.y[:, first:last]
-        above[...] = d[:, last - first :]
-        np.multiply(below, d[:, pitch:], out=product)
-        said += product
-        np.multiply(over, d[:, : last - first], out=product)
-        said -= product
-        said *= share
-        u += said
+        scratch.rows[:, :pitch] = above
+        above[...] = scratch.rows[:, size : size + pitch]
+        np.multiply(weights[2:, None], before, out=said)
+        d *= weights[:2, None]
+        d -= said
+        change = np.add(d[0], d[1], out=d[0])
+        change /= share
+        u += change
 
     def _grid(self, flat: np.ndarray) -> np.ndarray:
         return flat.reshape(*flat.shape[:-1], -1, self.pitch)
 
 
 class _Scratch:
-    """What a thread needs beside the strip for so many rows; ``above`` is of each of the sweeps under way."""
+    """What a thread needs beside the strip for so many rows; ``above`` is of each of the sweeps under way.
+
+    ``arrays`` (..., pixels): the weights of the neighbours, their sum with the pixel's own, dx and dy, those of the
+    pixels to the left and above, and room for as much. ``rows`` (C, pixels) is dy with one row more on top.
+    """
 
     def __init__(self, strip: _Strip, rows: int):
         channels, pitch, dtype = len(strip.u), strip.pitch, strip.u.dtype
         size = rows * pitch
-        self.weights, self.share = _aligned((4, size), dtype), _aligned((size,), dtype)
-        self.said, self.product = _aligned((channels, size), dtype), _aligned((channels, size), dtype)
-        self.difference = _aligned((channels, size + pitch), dtype)
+        d = _aligned((2, channels, pitch + size), dtype, 0)
+        self.rows, here = d[1], d[..., pitch:]
+        self.arrays = (
+            _aligned((4, size), dtype),
+            _aligned((size,), dtype),
+            here,
+            _pair(d[0, :, pitch - 1 :], d[1], size),
+            _aligned((2, channels, size), dtype),
+        )
         self.above = _aligned((DEPTH, channels, pitch), dtype, 0)
+
+
+def _pair(a: np.ndarray, b: np.ndarray, size: int) -> np.ndarray:
+    """The first ``size`` columns of two views (C, ...) of one array as one view (2, C, size)."""
+    apart = b.ctypes.data - a.ctypes.data
+    return np.lib.stride_tricks.as_strided(a, (2, len(a), size), (apart, *a.strides))
 
 
 def _aligned(shape: tuple[int, ...], dtype: np.dtype, value: float | None = None) -> np.ndarray:

@@ -17,6 +17,7 @@ for the factor k⁻².
 """
 
 import math
+from typing import Any
 
 import numpy as np
 
@@ -86,10 +87,20 @@ def smooth_variances(
     xp = module(primal_var)
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
-    p, x, y = (layer / mean + FLOOR if mean > 0 else xp.ones_like(layer) for layer in layers)
+    p, x, y = (_relative(layer, mean, primal_var.dtype) for layer in layers)
     differences = xp.stack([p, p])
     differences[0, :, :-1], differences[1, :-1] = x, y
-    return cast(p / SHARED, primal_var.dtype)[None], cast(without_missing(differences, trusted), primal_var.dtype)
+    return (p / SHARED)[None], without_missing(differences, trusted)
+
+
+def _relative(layer: Array, mean: float, dtype: Any) -> Array:
+    """Variances over their mean, with ``FLOOR``."""
+
+    def rows(first: int, last: int) -> tuple:
+        part = layer[first:last]
+        return (cast(part / mean + FLOOR if mean > 0 else module(part).ones_like(part), dtype),)
+
+    return by_rows(rows, empty(layer, dtype=dtype))[0]
 
 
 def without_missing(variances: Array, trusted: tuple[Array, Array] | None) -> Array:
@@ -129,13 +140,19 @@ def smoothed(variance: Array, outliers: bool = False) -> Array:
     def rows(first: int, last: int) -> tuple:
         top, bottom = max(first - 2, 0), min(last + 2, height)
         total, good = _over_colours(variance[top:bottom])
-        count = cast(good, variance.dtype)
         own = slice(first - top, last - top)
-        raw, sums = total, (sum_of(total[own]), sum_of(count[own]))
+        raw, sums = total, (sum_of(total[own]), int(good[own].sum()))
         if outliers:
-            total = xp.where(good, xp.sqrt(xp.sqrt(total.clip(_NONE, None))), 0)
-        for _ in range(2):
-            total, count = _box(total), _box(count)
+            total = xp.sqrt(xp.sqrt(total.clip(_NONE, None)))
+            # Roots of single precision are within it.
+            total = cast(total if good.all() else xp.where(good, total, 0), variance.dtype)
+        total = _box(_box(total))
+        if good.all():
+            # The counts of rows times those of columns.
+            ones = xp.ones_like(total)
+            count = _box(_box(ones[:, :1])) * _box(_box(ones[:1]))
+        else:
+            count = _box(_box(cast(good, variance.dtype)))
         smooth = total / count.clip(FEW, None)
         if outliers:
             smooth = xp.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
@@ -144,7 +161,8 @@ def smoothed(variance: Array, outliers: bool = False) -> Array:
 
     smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=xp.float64))
     mean = sum(total for total, _ in bands) / max(sum(count for _, count in bands), 1)
-    return xp.where(smooth < 0, mean, smooth)
+    missing = smooth < 0
+    return xp.where(missing, mean, smooth) if missing.any() else smooth
 
 
 def _box(values: Array) -> Array:
