@@ -20,7 +20,7 @@ from ngpt.network.identity import Identity, identify
 from ngpt.network.inputs import ESTIMATED
 from ngpt.network.run import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
-from ngpt.repair import Repaired, repair
+from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
 
 _LOG = logging.getLogger(__name__)
@@ -269,7 +269,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     if data.pixels or data.gradients:
         _LOG.info("%s: %d pixels repaired, %d differences left out", stack.path, data.pixels, data.gradients)
     weights = identify(own or Shipped(name).path) if "weights" in entry.options else None
-    lost = int(np.sum(~np.isfinite(image).all(axis=-1)))
+    lost = int(np.sum(~finite_pixels(image)))
     if lost:
         what = f"method '{name}'"
         if weights is not None and not weights.shipped:

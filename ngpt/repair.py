@@ -65,10 +65,10 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     """
     primal = stack["primal"]
     direct = stack["direct"] if "direct" in stack else np.zeros_like(primal)
-    good = _finite_pixels(primal) & _finite_pixels(direct)
+    good = finite_pixels(primal) & finite_pixels(direct)
     caustic = stack["caustic"] if "caustic" in stack and stack["caustic"].any() else None
     if caustic is not None:
-        good &= _finite_pixels(caustic)
+        good &= finite_pixels(caustic)
     if not good.any():
         raise NgptError(f"{stack.path}: layer 'primal' has no finite pixel among {good.size}; render it again")
     # Copies only of what changes: layers of large images are large.
@@ -97,7 +97,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
         both = good.copy()
         here, there = (np.s_[:, :-1], np.s_[:, 1:]) if axis == 1 else (np.s_[:-1], np.s_[1:])
         both[here] &= good[there]
-        both &= _finite_pixels(stack[name])
+        both &= finite_pixels(stack[name])
         border = np.s_[:, -1] if axis == 1 else np.s_[-1]
         both[border] = True  # no difference there, so nothing to mistrust
         layer = stack[name]
@@ -119,7 +119,7 @@ def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
     """``Repaired.parts``: pixels that are not ``good``, or lack a part, come from their neighbours."""
     held = [name for name in ("diffuse", "specular") if name in stack]
     for name in held:
-        good = good & _finite_pixels(stack[name])
+        good = good & finite_pixels(stack[name])
     parts = {name: stack[name] if good.all() else _from_neighbours(stack[name], good) for name in held}
     return parts | {f"{name}_var": _where(good, stack[f"{name}_var"]) for name in held if f"{name}_var" in stack}
 
@@ -137,7 +137,7 @@ def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndar
     return np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
 
 
-def _finite_pixels(layer: np.ndarray) -> np.ndarray:
+def finite_pixels(layer: np.ndarray) -> np.ndarray:
     """Where all channels of (H, W, C) are finite; at once if all are, since short last axes are slow to look along."""
     good = np.isfinite(layer)
     return np.ones(layer.shape[:2], bool) if good.all() else good.all(axis=-1)
