@@ -133,7 +133,8 @@ def test_files_are_found_beside_their_scene_alone(renderer, scene_file, tmp_path
     other = tmp_path / "other"
     other.mkdir()
     (other / "scene.xml").write_text(scene_file.read_text())
-    with pytest.raises(NgptError, match=r"a\.ply"):
+    # Mitsuba loads several at a time, so the first that lacks is any of them.
+    with pytest.raises(NgptError, match=r"\w\.ply"):
         load_scene(str(other / "scene.xml"))
     assert list(mi.file_resolver()) == before
 
