@@ -115,8 +115,8 @@ class Mixture(Head):
         return prediction[:, :3] + signed_log(mixed(torch.softmax(prediction[:, 3:], 1), images))
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
-        weights = op.Softmax(op.Slice(prediction, [3], [self.outputs], [1]), axis=1)
-        return op.Slice(prediction, [0], [3], [1]) + op.signed_log(_mixed(op, weights, images))
+        weights, total = _softmax(op, op.Slice(prediction, [3], [self.outputs], [1]))
+        return op.Slice(prediction, [0], [3], [1]) + op.signed_log(_mixed(op, weights, images) / total)
 
 
 @dataclass(frozen=True)
@@ -142,12 +142,9 @@ class Kernels(Head):
         return signed_log(mean)
 
     def graph(self, op: Any, prediction: Any, images: list[Any]) -> Any:
-        weights = op.Softmax(prediction, axis=1)
-        mean = 0.0
+        weights, total = _softmax(op, prediction)
         pixels = [shifted for image in images for shifted in _shifted(op, image, self.size)]
-        for tap, shifted in enumerate(pixels):
-            mean = op.Slice(weights, [tap], [tap + 1], [1]) * shifted + mean
-        return op.signed_log(mean)
+        return op.signed_log(_mixed(op, weights, pixels) / total)
 
 
 @dataclass(frozen=True)
@@ -238,7 +235,8 @@ class Pyramid(Head):
         image = images[0]
         if self._weights:
             logits = part(prediction, self.outputs - self._weights, self.outputs)
-            image = _mixed(op, op.Softmax(logits, axis=1), images[: self._weights])
+            weights, total = _softmax(op, logits)
+            image = _mixed(op, weights, images[: self._weights]) / total
         weight = (op.Sigmoid(part(prediction, 0, 1)) + LEAST_TRUST) / (op.ReduceMean(abs(image), [1], keepdims=1) + 1.0)
         if self.demodulate:
             image = image / images[-1]
@@ -250,11 +248,9 @@ class Pyramid(Head):
                 light, weight = halved(image * weight), halved(weight)
                 image, rest = light / weight, halved(part(rest, taps + 1, self.outputs))
             trust = _shifted(op, op.Pad(op.Log(weight), border, NEVER, [2, 3]), self.size)
-            kernels = op.Softmax(part(rest, 0, taps) + op.Concat(*trust, axis=1), axis=1)
-            total = 0.0
-            for tap, pixels in enumerate(_shifted(op, op.Pad(image, border, 0.0, [2, 3]), self.size)):
-                total = part(kernels, tap, tap + 1) * pixels + total
-            filtered.append(total)
+            kernels, total = _softmax(op, part(rest, 0, taps) + op.Concat(*trust, axis=1))
+            pixels = _shifted(op, op.Pad(image, border, 0.0, [2, 3]), self.size)
+            filtered.append(_mixed(op, kernels, pixels) / total)
             if scale + 1 < self.scales:
                 shares.append(op.Sigmoid(part(rest, taps, taps + 1)))
         result = filtered.pop()
@@ -289,7 +285,19 @@ def mixed(weights: Tensor, images: list[Tensor]) -> Tensor:
 
 def _mixed(op: Any, weights: Any, images: list[Any]) -> Any:
     """The same as nodes of a graph."""
-    return op.Sum(*(op.Slice(weights, [i], [i + 1], [1]) * image for i, image in enumerate(images)))
+    total = 0.0
+    for i, image in enumerate(images):
+        total = op.Slice(weights, [i], [i + 1], [1]) * image + total
+    return total
+
+
+def _softmax(op: Any, logits: Any) -> tuple[Any, Any]:
+    """Nodes of the softmax over channels: its numerators, and their sum (N, 1, H, W).
+
+    ONNX Runtime computes its own over the last axis only, between two transpositions of all channels.
+    """
+    weights = op.Exp(logits - op.ReduceMax(logits, [1], keepdims=1))
+    return weights, op.ReduceSum(weights, [1], keepdims=1)
 
 
 def _shifted(op: Any, image: Any, size: int) -> list[Any]:

@@ -103,13 +103,13 @@ class LastConvolution(nn.Module):
 
     It predicts logarithms, where 16 bits are off by percents. ``zero`` is for predictions of which 0 is a sensible
     one, such as corrections: it starts there, and its weights are not normalised, since what is to be small should not
-    need a direction first. ``normalise``: what it reads is divided by its root mean square in each pixel.
+    need a direction first. ``normalise``: what it reads is divided by its root mean square in each pixel, if ``zero``.
     """
 
     def __init__(self, inputs: int, outputs: int, zero: bool, normalise: bool = False):
         super().__init__()
         self.normalise = normalise
-        self.convolution: nn.Module
+        self.convolution: nn.Conv2d | Convolution
         if zero:
             self.convolution = nn.Conv2d(inputs, outputs, 1)
             for parameter in self.convolution.parameters():
@@ -120,9 +120,14 @@ class LastConvolution(nn.Module):
     def forward(self, x: Tensor) -> Tensor:
         with torch.autocast(x.device.type, enabled=False):
             x = x.float()
-            if self.normalise:
-                x = x * torch.rsqrt(x.square().mean(1, keepdim=True) + 1e-8)
-            return self.convolution(x)
+            if not self.normalise or isinstance(self.convolution, Convolution):
+                return self.convolution(x)
+            # A convolution of one channel is the fastest mean over channels that ONNX Runtime has. What comes out of
+            # the last convolution has fewer channels to divide than what goes in.
+            square = conv2d(x * x, x.new_full((1, x.shape[1], 1, 1), 1 / x.shape[1]))
+            bias = self.convolution.bias
+            assert bias is not None
+            return conv2d(x, self.convolution.weight) * torch.rsqrt(square + 1e-8) + bias[:, None, None]
 
 
 class Unit(nn.Module):

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 from ngpt.export.builder import END, Value, op
 from ngpt.export.graphs.repair import clean
-from ngpt.export.graphs.transfer import log_for_networks, signed_log, signed_log_for_networks
+from ngpt.export.graphs.transfer import log_for_networks, signed_log_for_networks
 from ngpt.network.features import ENLARGED, GLOSS, IMAGES, LEAST_DEPTH, NOISE_ENLARGED, RADIANCE, SOURCES, compared
 
 
@@ -34,7 +34,7 @@ def completed(scaled: Mapping[str, Value], inputs: tuple[str, ...]) -> dict[str,
 def _computed(name: str, layers: Mapping[str, Value], compared_with: str) -> Value:
     other, source = layers[compared_with], layers[SOURCES[name][0]]
     if name.endswith("_change"):
-        return signed_log(source) - signed_log(other)
+        return signed_log_for_networks(source) - signed_log_for_networks(other)
     if name.endswith("_noise"):
         return op.ReduceMean(source, [1], keepdims=1) / (op.ReduceMean(abs(other), [1], keepdims=1) + 1.0)
     axis = 3 if name.startswith("dx") else 2
@@ -57,7 +57,7 @@ def encoded(name: str, layer: Value) -> Value:
     if name.endswith("_noise"):
         return log_for_networks(layer * float(NOISE_ENLARGED))
     if name in SOURCES:
-        return signed_log(layer * float(ENLARGED))
+        return signed_log_for_networks(layer * float(ENLARGED))
     if name.endswith("_se"):
         return log_for_networks(op.ReduceMean(layer, [1], keepdims=1))
     return layer

@@ -23,7 +23,18 @@ _VARIANCES = ("primal_var", "dx_var", "dy_var")
 
 
 class _OperatorsOfHeads(Operators):
-    signed_exp, signed_log = staticmethod(signed_exp), staticmethod(signed_log)
+    """With the transfer between images and their logarithms; back at once, it takes no nodes."""
+
+    def __init__(self) -> None:
+        self._images: dict[str, Value] = {}
+
+    def signed_log(self, image: Value) -> Value:
+        result = signed_log(image)
+        self._images[result.name] = image
+        return result
+
+    def signed_exp(self, logarithm: Value) -> Value:
+        return self._images.get(logarithm.name) or signed_exp(logarithm)
 
 
 def layers(config: ModelConfig) -> tuple[str, ...]:

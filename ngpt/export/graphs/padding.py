@@ -10,16 +10,23 @@ from ngpt.network.padding import MARGIN
 class Side:
     """One side of an image, padded: for each place the pixel that lies there, and its difference to the next.
 
+    ``axis``     which it is, of (N, C, H, W)
     ``size``     pixels of the side, a scalar
     ``here``     which pixel lies at each place
     ``nearest``  which difference stands between there and the next place
     ``step``     with which sign: 1, -1, or 0 where the image is one pixel wide
     """
 
+    axis: int
     size: Value
     here: Value
     nearest: Value
     step: Value
+
+    def borders(self, values: Value, more: int) -> tuple[Value, Value]:
+        """What of one of these lies before the image, and what after all of it but ``more`` pixels."""
+        last = op.Reshape(self.size + (MARGIN - more), [1])
+        return op.Slice(values, [0], [MARGIN], [0]), op.Slice(values, last, [END], [0])
 
 
 class Mirror:
@@ -27,21 +34,15 @@ class Mirror:
 
     def __init__(self, image: Value, alignment: int):
         self.rows, self.columns = (
-            _side(op.Squeeze(op.Shape(image, start=axis, end=axis + 1)), alignment) for axis in (2, 3)
+            _side(axis, op.Squeeze(op.Shape(image, start=axis, end=axis + 1)), alignment) for axis in (2, 3)
         )
 
     def pad(self, layer: Value, name: str = "") -> Value:
         """A layer with its borders; its name says whether it holds differences, and whether these have a sign."""
-        if not name.startswith(("dx", "dy")):
-            return op.Gather(op.Gather(layer, self.rows.here, axis=2), self.columns.here, axis=3)
         signed = not name.endswith(("_se", "_noise"))
-        if name.startswith("dx"):
-            step = self.columns.step if signed else abs(self.columns.step)
-            across = op.Gather(layer, self.columns.nearest, axis=3) * step
-            return op.Gather(across, self.rows.here, axis=2)
-        step = op.Unsqueeze(self.rows.step, [1])
-        down = op.Gather(layer, self.rows.nearest, axis=2) * (step if signed else abs(step))
-        return op.Gather(down, self.columns.here, axis=3)
+        for side, along in ((self.rows, "dy"), (self.columns, "dx")):
+            layer = _differences(layer, side, signed) if name.startswith(along) else _pixels(layer, side)
+        return layer
 
     def crop(self, image: Value) -> Value:
         """What was padded, without the padding."""
@@ -54,11 +55,30 @@ class Mirror:
         return op.Pad(padded, [radius] * 4, None, [2, 3], mode="edge") if radius else padded
 
 
-def _side(size: Value, alignment: int) -> Side:
+def _pixels(layer: Value, side: Side) -> Value:
+    """The layer with its borders along one side. What lies between them is copied whole: to gather it takes longer."""
+    before, after = (op.Gather(layer, places, axis=side.axis) for places in side.borders(side.here, 0))
+    return op.Concat(before, layer, after, axis=side.axis)
+
+
+def _differences(layer: Value, side: Side, signed: bool) -> Value:
+    """The same for differences along that side. The last of them leads out of the image, and belongs to the border."""
+    steps = [
+        op.Reshape(step if signed else abs(step), [-1, 1] if side.axis == 2 else [-1])
+        for step in side.borders(side.step, 1)
+    ]
+    before, after = (
+        op.Gather(layer, places, axis=side.axis) * step
+        for places, step in zip(side.borders(side.nearest, 1), steps, strict=True)
+    )
+    return op.Concat(before, op.Slice(layer, [0], [-1], [side.axis]), after, axis=side.axis)
+
+
+def _side(axis: int, size: Value, alignment: int) -> Side:
     after = op.Mod(-(size + 2 * MARGIN), alignment) + MARGIN
     # Which pixel lies at -MARGIN, ..., size - 1 + after, and one beyond.
     period = op.Max((size - 1) * 2, 1)
     wave = op.Mod(op.Range(-MARGIN, size + after + 1, 1), period)
     pixels = op.Where(op.Less(wave, size), wave, period - wave)
     here, there = op.Slice(pixels, [0], [-1], [0]), op.Slice(pixels, [1], [END], [0])
-    return Side(size, here, op.Min(here, there), op.Cast(there - here, to=FLOAT))
+    return Side(axis, size, here, op.Min(here, there), op.Cast(there - here, to=FLOAT))
