@@ -1,6 +1,6 @@
 """What reconstructions take beside OIDN, and what they took at an earlier commit: bench/results/speed.json.
 
-    python -m bench.speed --before e736f73
+    python -m bench.speed --before f72936e
 
 On a synthetic stack with features and variances. Each row runs once in a turn, so that a busy moment hits all alike;
 those of the commit run in a process of their own, which takes its turn like the others.
