@@ -6,7 +6,7 @@ import torch
 
 from ngpt.network import features, padding
 from ngpt.network.model import Reconstructor, parameters
-from ngpt.network.unet import Convolution
+from ngpt.network.unet import Convolution, LastConvolution
 from ngpt.training.settings import Settings
 
 
@@ -16,14 +16,17 @@ def per_pixel(model: Reconstructor) -> tuple[float, float]:
 
     def count(module: Any, args: tuple, output: torch.Tensor) -> None:
         nonlocal macs, numbers
+        module = getattr(module, "convolution", module)
         weight = module.v if isinstance(module, Convolution) else module.weight
         # Of a transposed 2x2 kernel with stride 2 each output pixel sees one tap, of any other all of them.
         taps = weight.shape[0] if getattr(module, "kind", "") == "unpool" else weight[0].numel()
         macs += taps * output.numel()
         numbers += args[0].numel() + output.numel()
 
-    kinds = (Convolution, torch.nn.Conv2d)
-    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds)]
+    # The last one takes only the weights of its convolution, and runs them itself.
+    last = {m.convolution for m in model.modules() if isinstance(m, LastConvolution)}
+    kinds = (Convolution, LastConvolution, torch.nn.Conv2d)
+    hooks = [m.register_forward_hook(count) for m in model.modules() if isinstance(m, kinds) and m not in last]
     with torch.no_grad():
         device = next(model.parameters()).device
         model.network(torch.zeros(1, features.channels(model.config.inputs), size, size, device=device))
