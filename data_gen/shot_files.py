@@ -55,7 +55,7 @@ def write_frames(
     part_of = {frame: i * parts // len(files) for i, frame in enumerate(files)}
     ours = [frame for frame in files if part_of[frame] == number]
     for frame in ours:
-        check_output(files[frame], overwrite or skip_existing)
+        check_output(files[frame], overwrite or skip_existing, may_skip=True)
     written = Written()
 
     def skip(frame: int) -> bool:
@@ -102,7 +102,7 @@ def write_frames_on_cluster(
     if options.pop("shard", None):
         raise WrongUse("--cluster shares the frames out by itself; leave --shard out")
     for file in files.values():
-        check_output(file, overwrite or skip_existing)
+        check_output(file, overwrite or skip_existing, may_skip=True)
     from data_gen.dataset.jobs import cluster
 
     parts = -(-len(files) // FRAMES_OF_A_PART)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force, positive, size
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import WrongUse
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.measure.shown import available, judge
@@ -18,7 +18,7 @@ from ngpt.report.content import Entry, Scene, median
 from ngpt.report.page import oversize, write_report
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
+from ngpt.system.files import check_output, make_folder
 from ngpt.version import __version__
 
 LAYER_VIEWS = ("dx", "dy", "albedo", "normal", "depth")
@@ -50,11 +50,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     for name in names:
         if name not in SCENES:
             raise WrongUse(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")
-    folder = Path(args.output)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be made: {error.strerror}; name another folder with -o") from error
+    folder = make_folder(args.output)
     report = check_output(folder / "report.html", args.force)
     start = time.perf_counter()
     scenes = [demo_scene(name, args, folder, console) for name in names]

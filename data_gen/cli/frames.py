@@ -5,7 +5,8 @@ import re
 from pathlib import Path
 
 from data_gen.frames.pattern import filled, varies
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import WrongUse
+from ngpt.system.files import make_folder
 
 # More than anyone renders; a typing error must not fill the memory.
 _MOST = 1_000_000
@@ -56,11 +57,7 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
                 named = f"{folder.with_suffix('')}.{{frame:04d}}.exr"
                 raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
             return {numbers[0]: folder}
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
-        pattern = str(folder / f"{stem}.{{frame:04d}}.exr")
+        pattern = str(make_folder(folder) / f"{stem}.{{frame:04d}}.exr")
     found = {number: Path(filled(pattern, number)) for number in numbers}
     seen: dict[Path, int] = {}
     for number, path in found.items():
@@ -68,4 +65,6 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
             raise WrongUse(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
         if (other := seen.setdefault(path, number)) != number:
             raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
+    for path in found.values():
+        make_folder(path.parent)
     return found

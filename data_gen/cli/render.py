@@ -11,12 +11,22 @@ from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
-from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
+from ngpt.cli.arguments import (
+    add_force,
+    add_json,
+    assignment,
+    duration,
+    natural,
+    output_file,
+    part,
+    positive,
+    print_json,
+    size,
+)
 from ngpt.errors import WrongUse
 from ngpt.io.exr import write
 from ngpt.io.whole import finished
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
 from ngpt.system.interrupts import Interrupt
 
 # How many times its time a render takes whose user is told why, where it made no more than so many samples per pixel.
@@ -154,9 +164,10 @@ def image(args: argparse.Namespace, console: Console) -> int:
     for text in (args.scene, *(value for _, value in args.define)):
         if varies(text):
             raise WrongUse(f"'{text}' changes from frame to frame; name the frames: --frames 0:120")
-    target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force or args.skip_existing)
+    target = Path(args.output or f"{Path(args.scene).stem}.exr")
     if target.suffix.lower() != ".exr":
         raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+    output_file(target, args)
     if args.skip_existing and finished(target):
         console.say(f"{target}: skipped: the stack is there")
         return 0

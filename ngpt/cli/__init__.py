@@ -156,7 +156,7 @@ def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[s
     args = parser.parse_args(words)
     args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
-        with logged(args.verbose):
+        with logged(args.verbose, args.quiet):
             return import_module(f"{verb.room}.{args.verb}").run(args, Console(args.quiet))
     except ModuleNotFoundError as error:
         if not verb.extra:

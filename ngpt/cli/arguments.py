@@ -9,6 +9,7 @@ from pathlib import Path
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 from ngpt.system import configs
+from ngpt.system.files import check_output, make_folder
 
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
 RESULT_SUFFIX = "_denoised"
@@ -19,6 +20,16 @@ FILES = ("albedo", "normal", "depth")
 
 def add_force(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
+
+
+def output_file(path: str | Path, args: argparse.Namespace) -> Path:
+    """The path of a file to write, whose folder is made; raises NgptError where that cannot be, and for what exists.
+
+    ``args`` has ``force``, and ``skip_existing`` where the verb knows it.
+    """
+    skip = getattr(args, "skip_existing", None)
+    make_folder(Path(path).parent)
+    return check_output(path, args.force or bool(skip), may_skip=skip is not None)
 
 
 def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:

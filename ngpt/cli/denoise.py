@@ -23,6 +23,7 @@ from ngpt.cli.arguments import (
     add_untrusted,
     assignment,
     given_files,
+    output_file,
     print_json,
     stack_files,
 )
@@ -31,6 +32,7 @@ from ngpt.cli.picture import add_look, check_picture, exposed
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.foreign.pfm import write_pfm
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
@@ -43,7 +45,6 @@ from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
 
@@ -136,9 +137,9 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
     for _, target in pairs:
-        check_output(target, args.force or args.skip_existing)
         if target.suffix.lower() != ".exr":
             check_picture(target, args)
+        output_file(target, args)
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
@@ -274,6 +275,8 @@ def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", expo
     made = {**result.attributes, **over_time}
     if target.suffix.lower() == ".exr":
         write(target, result.image, like=stack, overwrite=overwrite or cut, attributes=made)
+    elif target.suffix.lower() == ".pfm":
+        write_pfm(target, converted(result.image, to_rec709(stack.attributes)), overwrite)
     else:
         light = converted(result.image, to_rec709(stack.attributes))
         write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
@@ -320,7 +323,7 @@ def describe(report: dict) -> str:
 
 
 def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Where the result of each source goes; makes the output folder where there is none."""
+    """Where the result of each source goes."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
     elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
@@ -331,12 +334,8 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
         if not folder.is_dir() and (folder.exists() or named_file):
             kind = "is a file" if folder.exists() else "is the name of a file"
             raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
-        targets = [folder / path.name for path in sources]
-        repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
-        if repeated:
-            raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
+        targets = [folder / (path.name if path.suffix.lower() == ".exr" else f"{path.stem}.exr") for path in sources]
+    repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
+    if repeated:
+        raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
     return list(zip(sources, targets, strict=True))

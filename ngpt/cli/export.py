@@ -4,10 +4,10 @@ import argparse
 from pathlib import Path
 
 from ngpt.classical.poisson import DEFAULT_ALPHA
-from ngpt.cli.arguments import add_force
+from ngpt.cli.arguments import add_force, output_file
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, check_output
+from ngpt.system.files import atomic_output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -26,13 +26,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    for path in (args.output, args.statistics):
-        if path is not None:
-            check_output(path, args.force)
     if not args.weights and (args.statistics or args.vector):
         raise WrongUse("--statistics and --vector belong to networks; leave them out for a classical method")
     if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.statistics or args.vector):
         raise WrongUse(f"{args.output}: a file of this kind holds a network and no more; give it --weights alone")
+    for path in (args.output, args.statistics):
+        if path is not None:
+            output_file(path, args)
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
     return 0

@@ -2,11 +2,10 @@
 
 import argparse
 
-from ngpt.cli.arguments import add_force, add_json, print_json
+from ngpt.cli.arguments import add_force, add_json, output_file, print_json
 from ngpt.io.exr import read, write
 from ngpt.merging import merge
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -17,7 +16,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    target = check_output(args.output, args.force)
+    target = output_file(args.output, args)
     merged = merge([read(path) for path in args.stacks])
     write(target, merged, overwrite=args.force)
     spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]

@@ -6,14 +6,14 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force
+from ngpt.cli.arguments import add_force, output_file
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_image
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
+from ngpt.system.files import make_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -38,7 +38,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if source.is_dir():
         return shot(args, source, target, console)
     check_kind(target, PICTURES)
-    check_output(target, args.force)
+    output_file(target, args)
     image = read_image(source)
     write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
     console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
@@ -53,7 +53,7 @@ def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console)
     film = bool(target.suffix)
     if film:
         check_kind(target, SHOTS)
-        check_output(target, args.force)
+        output_file(target, args)
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
     stops = exposed(args.exposure, read_image(files[0]))
@@ -75,10 +75,7 @@ def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console)
 
 def write_each(folder: Path, pictures, overwrite: bool) -> None:
     """A PNG of each (file, pixels) in a folder, which is made if there is none."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be made: {error.strerror}") from error
+    make_folder(folder)
     pixels: np.ndarray
     for file, pixels in pictures:
         write_picture(folder / f"{file.stem}.png", pixels, overwrite)
@@ -86,14 +83,16 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:
     """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
-    if target.suffix.lower() not in PICTURES:
-        raise WrongUse(f"{target}: results are OpenEXR, or pictures; let the name end in .exr or {' '.join(PICTURES)}")
+    kinds = (".pfm", *PICTURES)
+    if target.suffix.lower() not in kinds:
+        raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in .exr {' '.join(kinds)}")
     for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
         if given:
-            raise WrongUse(f"{option} makes layers, which a picture has none of; let {target} end in .exr")
+            raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:
-        raise WrongUse("--skip-existing knows whole files of OpenEXR alone; leave it out for a picture")
-    check_kind(target, PICTURES)
+        raise WrongUse(f"--skip-existing knows whole files of OpenEXR alone; leave it out for {target}")
+    if target.suffix.lower() in PICTURES:
+        check_kind(target, PICTURES)
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:

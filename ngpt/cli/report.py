@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force
+from ngpt.cli.arguments import add_force, output_file
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image
 from ngpt.measure.metrics import METRICS, exposure_mismatch
@@ -16,7 +16,7 @@ from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
 from ngpt.system.console import Console, tell
-from ngpt.system.files import atomic_output, check_output
+from ngpt.system.files import atomic_output
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
@@ -60,9 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    target = check_output(args.output, args.force)
-    if target.suffix.lower() not in (".html", ".htm"):
-        raise WrongUse(f"{target}: browsers know a page by its name; let it end in .html")
+    if Path(args.output).suffix.lower() not in (".html", ".htm"):
+        raise WrongUse(f"{args.output}: browsers know a page by its name; let it end in .html")
+    target = output_file(args.output, args)
     if any(is_run(Path(path)) for path in args.images):
         return run_trainings(args, target, console)
     names = labels(args.images)

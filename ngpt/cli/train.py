@@ -9,7 +9,7 @@ from ngpt.cli.arguments import add_config
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, check_output, exclusive
+from ngpt.system.files import atomic_output, check_output, exclusive, make_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -50,6 +50,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             raise NgptError("--init writes what can be set by hand then; leave --set out")
         from ngpt.training.parameters import template
 
+        make_folder(Path(args.init).parent)
         target = check_output(args.init)
         with atomic_output(target) as temporary:
             temporary.write_text(template(config.read_text()))
@@ -60,11 +61,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return 0
     if not args.out:
         raise WrongUse("--out is missing: the folder for checkpoint, weights and log")
-    out = Path(args.out)
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NgptError(f"{out}: cannot be made: {error.strerror}; name another folder with --out") from error
+    out = make_folder(args.out)
     say = (lambda text: None) if console.quiet else show
     loss = make_loss(settings.loss)
     processes = Processes()

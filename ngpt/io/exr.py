@@ -1,5 +1,7 @@
 """Gradient stacks and results in OpenEXR files: `read` and `write`.
 
+Images of other formats are read as well (``ngpt.io.foreign``), each as an OpenEXR file with the same light would be.
+
 Layers go by their names, those of the contract or of other renderers (``ngpt.io.aliases``). All else that a file
 holds, layers the toolkit does not know included, passes through as ``ngpt.io.openexr`` describes.
 """
@@ -17,7 +19,7 @@ import OpenEXR
 from ngpt.errors import NgptError
 from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
 from ngpt.io.aliases import layers_of_light as find_light
-from ngpt.io.header import read_headers
+from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.io.primaries import converted, to_rec709
@@ -96,10 +98,12 @@ def read(
 
     Colours stay in the primaries of the file, which its header attribute ``chromaticities`` names.
 
+    Light that is encoded for displays, as in PNG, is made scene-linear (``ngpt.io.foreign.files``).
+
     Raises NgptError if the file cannot be read, holds no primal, or holds layers of different size or place; and for
     such a file of a layer.
     """
-    image = read_exr_isolated(path) if isolated else read_exr(path)
+    image = read_exr_isolated(path) if isolated else read_file(path)
     ours = any("ngpt:sampler" in part.header for part in image.parts)
     resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path), ours)
     layers_found = map_parts(lambda found: _gather(image.parts[found.part], found.channels), resolution.values())
@@ -123,7 +127,7 @@ def read(
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
     """The names of the layers that ``read`` would find, by the file's header; raises NgptError as it does for that."""
     with regular_file(Path(path)) as file:
-        parts = [(part.name, list(part.channels)) for part in read_headers(file, str(path))]
+        parts = [(part.name, list(part.channels)) for part in file_headers(file, str(path))]
     return frozenset(resolve(parts, layers, str(path)))
 
 
@@ -131,7 +135,9 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     """Layer ``name`` (H, W, C) of a file of its own, of the size and place of ``main``, the part that holds primal."""
     if name not in LAYERS or name == "primal":
         raise NgptError(f"{file}: layer '{name}' cannot come from a file of its own")
-    parts = (read_exr_isolated(file) if isolated else read_exr(file)).parts
+    parts = (read_exr_isolated(file) if isolated else read_file(file)).parts
+    if name != "albedo" and (kind := parts[0].header.get(FROM, "")).endswith(ENCODED):
+        raise NgptError(f"{file}: {name} is no light, and this is {kind}; save it as .exr or .pfm")
     found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
     layer = _gather(parts[found.part], found.channels)
     if layer.shape[:2] != (stack.height, stack.width):
@@ -155,7 +161,7 @@ def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
     ``read`` takes for the primal. Unlike there, light of other primaries is converted to linear Rec. 709
     (``ngpt.io.primaries``): pictures are looked at and compared.
     """
-    part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
+    part = (read_exr_isolated(path) if isolated else read_file(path)).parts[0]
     if all(name in part.channels for name in RGB):
         return converted(_gather(part, RGB), to_rec709(part.header))
     stack = read(path, isolated=isolated)

@@ -19,7 +19,7 @@ MAX_CHANNELS = 4096
 MAX_PIXELS = 2**28  # of one part: 16384 x 16384
 MAX_TILE = 2**20  # pixels of a tile that is larger than its image
 
-_MAGIC = b"\x76\x2f\x31\x01"
+MAGIC = b"\x76\x2f\x31\x01"
 _DEEP, _MULTIPART = 0x800, 0x1000
 _TYPES = {0: 4, 1: 2, 2: 4}  # uint, half, float: bytes
 # By number: lines in a chunk, and the most that a byte of a file can stand for. Deflate ends at 1032 bytes, run lengths
@@ -70,8 +70,11 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
     magic = file.read(4)
     if not magic:
         raise NgptError(f"{path}: is empty; render or copy it again")
-    if magic != _MAGIC:
-        raise NgptError(f"{path}: not an OpenEXR file (it starts with {magic!r}); save the image as .exr")
+    if magic != MAGIC:
+        raise NgptError(
+            f"{path}: not an OpenEXR file, nor PFM, Radiance HDR, PNG, TIFF or JPEG (it starts with {magic!r}); "
+            "save the image as .exr"
+        )
     try:
         flags = struct.unpack("<I", file.read(4))[0]
         if flags & 0xFF != 2:
@@ -87,7 +90,7 @@ def read_headers(file: BinaryIO, path: str) -> list[PartHeader]:
         raise NgptError(f"{path}: damaged or incomplete (its header ends early); render or copy it again") from None
     except _Excess as excess:
         raise NgptError(f"{path}: {excess}; if it is no forgery, save it in pieces") from None
-    _check_size(parts, os.fstat(file.fileno()).st_size, path)
+    check_size(parts, os.fstat(file.fileno()).st_size, path)
     return parts
 
 
@@ -190,7 +193,8 @@ def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[i
         raise _Damage(f"{label} has no channels")
 
 
-def _check_size(parts: list[PartHeader], length: int, path: str) -> None:
+def check_size(parts: list[PartHeader], length: int, path: str) -> None:
+    """Raises NgptError for parts that a file of ``length`` bytes cannot hold, and for those beyond the limits above."""
     if not parts:
         raise NgptError(f"{path}: damaged or incomplete (it has no parts); render or copy it again")
     for part in parts:

@@ -1,4 +1,4 @@
-"""OpenEXR files from strangers, decoded in a process of their own: what crashes or stalls the decoder stays there.
+"""Images from strangers, decoded in a process of their own: what crashes or stalls the decoder stays there.
 
 The other process reads the file and writes it anew, without compression, to a folder that only this user can look into;
 here that copy is read. It has a limit on memory (on Linux) and on time, and its death is an NgptError.
@@ -17,7 +17,7 @@ from pathlib import Path
 import OpenEXR
 
 from ngpt.errors import NgptError
-from ngpt.io.header import read_headers
+from ngpt.io.foreign.files import file_headers, read_file, tell_conversion
 from ngpt.io.openexr import ExrImage, read_exr, write_exr
 from ngpt.system.limits import limit_address_space
 from ngpt.system.reading import regular_file
@@ -29,13 +29,13 @@ _REFUSED = 3
 
 
 def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
-    """What ``read_exr`` returns, but for the header of mipmaps, of which tiles with one level are left.
+    """What ``read_file`` returns, but for the header of mipmaps, of which tiles with one level are left.
 
-    Raises NgptError where ``read_exr`` does, and where the decoder crashes, runs out of memory or takes too long.
+    Raises NgptError where ``read_file`` does, and where the decoder crashes, runs out of memory or takes too long.
     """
     path = Path(path)
     with regular_file(path) as file:
-        size = sum(header.bytes for header in read_headers(file, str(path)))
+        size = sum(header.bytes for header in file_headers(file, str(path)))
     with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
         copy = Path(folder) / "copy.exr"
         # -P: a folder of strangers' files may hold a numpy.py, and might be the current one.
@@ -52,6 +52,7 @@ def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
             raise NgptError(f"{path}: decoding it failed ({_cause(done)}); it is damaged or an attack: do not use it")
         image = read_exr(copy)
         told = json.loads(done.stdout)
+    tell_conversion(path)
     for part, (compression, order) in zip(image.parts, told, strict=True):
         part.header.update(compression=OpenEXR.Compression(compression), lineOrder=OpenEXR.LineOrder(order))
     return image
@@ -67,7 +68,7 @@ def _cause(done: subprocess.CompletedProcess) -> str:
 def _main(path: str, copy: str, limit: str) -> int:
     limit_address_space(int(limit))
     try:
-        image = read_exr(path)
+        image = read_file(path)
         told = [(int(part.header["compression"]), int(part.header["lineOrder"])) for part in image.parts]
         for part in image.parts:
             part.header.update(compression=OpenEXR.NO_COMPRESSION, lineOrder=OpenEXR.INCREASING_Y)

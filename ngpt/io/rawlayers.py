@@ -13,7 +13,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
-from ngpt.system.files import atomic_output, check_output
+from ngpt.system.files import atomic_output, check_output, make_folder
 
 LISTING = "layers.json"
 
@@ -25,10 +25,7 @@ def write_layers(folder: Path, layers: Mapping[str, np.ndarray], overwrite: bool
     """
     if folder.exists() and not folder.is_dir():
         raise NgptError(f"{folder}: is a file; give a folder for the layers")
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise NgptError(f"{folder}: cannot be made: {error.strerror}; name another folder") from error
+    make_folder(folder)
     for name in (*(f"{layer}.f32" for layer in layers), LISTING):
         check_output(folder / name, overwrite)
     listing = {}

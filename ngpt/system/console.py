@@ -151,16 +151,13 @@ class _Handler(logging.Handler):
 
 
 @contextmanager
-def logged(wanted: bool) -> Iterator[None]:
-    """Shows what the logger "ngpt" is told, down to the details, where that is ``wanted``."""
-    if not wanted:
-        yield
-        return
+def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
+    """Shows what the logger "ngpt" is told: warnings, down to the details if ``verbose``, or errors alone."""
     logger, handler = logging.getLogger("ngpt"), _Handler()
-    handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s"))
+    handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s" if verbose else None))
     before = logger.level
     logger.addHandler(handler)
-    logger.setLevel(logging.DEBUG)
+    logger.setLevel(logging.DEBUG if verbose else logging.ERROR if quiet else logging.WARNING)
     try:
         yield
     finally:

@@ -23,16 +23,27 @@ _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
 _FORGOTTEN = 24 * 3600.0  # seconds without a change, after which they are swept where nothing can be locked
 
 
-def check_output(path: str | os.PathLike, overwrite: bool = False) -> Path:
+def make_folder(folder: str | os.PathLike) -> Path:
+    """Makes a folder, and those it is in, where there is none. Raises NgptError where that cannot be done."""
+    try:
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise NgptError(f"{folder}: cannot be made: {error.strerror}; name another folder") from error
+    return Path(folder)
+
+
+def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: bool = False) -> Path:
     """Returns ``path`` as a Path if a file may be written there, else raises NgptError.
 
-    Called before long work starts, so that an hour of rendering is not lost to a typing error.
+    Called before long work starts, so that an hour of rendering is not lost to a typing error. ``may_skip``: whoever
+    asks could leave out what exists, which the error then says.
     """
     path = Path(path)
     if path.is_dir():
         raise NgptError(f"{path}: is a directory; name a file to write")
     if path.exists() and not overwrite:
-        raise NgptError(f"{path}: exists already; pass --force (overwrite=True) to replace it")
+        skip = ", or --skip-existing (skip_existing=True) to leave it out" if may_skip else ""
+        raise NgptError(f"{path}: exists already; pass --force (overwrite=True) to replace it{skip}")
     if not path.parent.is_dir():
         raise NgptError(f"{path}: the folder {path.parent} does not exist; create it first")
     if not os.access(path.parent, os.W_OK):

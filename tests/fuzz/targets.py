@@ -7,8 +7,10 @@ failure. Number -1 is a whole input.
 import os
 import random
 import signal
+import struct
 import time
 import tomllib
+import zlib
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
@@ -37,6 +39,71 @@ def exr(number: int, folder: Path) -> None:
     assert image.shape == stack["primal"].shape and np.isfinite(image).all()
     write(result, image, like=stack, overwrite=True)
     ngpt.read_image(result)
+
+
+@cache
+def _foreign() -> list[tuple[str, bytes]]:
+    """Whole files of other formats than OpenEXR."""
+    import io
+
+    import tifffile
+    from PIL import Image
+
+    rng = np.random.default_rng(0)
+    light, codes = rng.random((9, 12, 4)).astype(np.float32), rng.integers(0, 256, (9, 12, 4), np.uint8)
+    hdr = b"#?RADIANCE\nEXPOSURE=2\nFORMAT=32-bit_rle_rgbe\n\n-Y 9 +X 12\n"
+    runs = b"\2\2\0\x0c" + b"".join(b"\4" + bytes(4) + b"\x88" + bytes([130]) for _ in range(4))
+    found = [
+        ("a.pfm", b"PF\n12 9\n-1.0\n" + light[..., :3].tobytes()),
+        ("a.hdr", hdr + 9 * runs),
+        ("a.hdr", hdr + codes.tobytes()),
+        ("a.hdr", hdr + 9 * (b"\1\2\3\x80" + b"\1\1\1\x0b")),
+    ]
+    palette = Image.fromarray(codes[..., :3]).quantize(7)
+    for kind, image, options in (
+        ("png", Image.fromarray(codes), {}),
+        ("png", Image.fromarray(codes[..., 0]), {}),
+        ("png", palette, {"transparency": b"\0\x80"}),
+        ("jpeg", Image.fromarray(codes[..., :3]), {}),
+    ):
+        image.save(file := io.BytesIO(), kind, **options)
+        found.append((f"a.{kind}", file.getvalue()))
+    for pixels, options in (
+        (light[..., :3], {}),
+        (codes, {"extrasamples": ["unassalpha"], "compression": "zlib", "predictor": True}),
+        (codes[..., :3], {"tile": (16, 16), "compression": "zlib", "bigtiff": True}),
+    ):
+        tifffile.imwrite(file := io.BytesIO(), pixels, photometric="rgb", **options)
+        found.append(("a.tif", file.getvalue()))
+    return found
+
+
+def _with_checksums(data: bytes) -> bytes:
+    """A PNG whose chunks are what their checksums say, so that damage is not found by those alone."""
+    place, out = 8, data[:8]
+    while place + 12 <= len(data):
+        length = min(struct.unpack_from(">I", data, place)[0], len(data) - place - 12)
+        chunk = data[place + 4 : place + 8 + length]
+        out += data[place : place + 4] + chunk + struct.pack(">I", zlib.crc32(chunk))
+        place += 12 + length
+    return out
+
+
+def foreign(number: int, folder: Path) -> None:
+    """PFM, Radiance HDR, PNG, TIFF and JPEG: read as a stack and as a picture."""
+    seeds = _foreign()
+    name, data = seeds[max(number, 0) % len(seeds)]
+    if number >= 0:
+        rng = random.Random(number)
+        data = bytes_changed(rng, data)
+        data = _with_checksums(data) if name.endswith("png") and rng.random() < 0.8 else data
+    path = folder / name
+    path.write_bytes(data)
+    stack = read(path)
+    image = ngpt.read_image(path)
+    assert image.shape == stack["primal"].shape and image.dtype == np.float32
+    if np.isfinite(image).all(axis=-1).any():
+        reconstruct(stack, "primal")
 
 
 @cache
@@ -243,5 +310,5 @@ def probe(number: int, folder: Path) -> None:
 
 
 TARGETS: dict[str, Callable[[int, Path], None]] = {
-    target.__name__: target for target in (exr, manifest, shard, weights, checkpoint, settings, network, probe)
+    target.__name__: target for target in (exr, foreign, manifest, shard, weights, checkpoint, settings, network, probe)
 }

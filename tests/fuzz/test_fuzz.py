@@ -16,6 +16,7 @@ from reliability import record
 # Target: what it is to a reader, inputs here, inputs in the slow campaign, what it needs beyond the base.
 TARGETS = {
     "exr": ("OpenEXR stacks, mutated: read, reconstructed, written", 250, 10_000, ()),
+    "foreign": ("PFM, HDR, PNG, TIFF, JPEG, mutated: read", 300, 10_000, ("PIL", "tifffile")),
     "manifest": ("Manifests of training sets, mutated", 150, 5000, ("safetensors",)),
     "shard": ("Shards of training sets, mutated, with a checksum that fits", 150, 5000, ("safetensors",)),
     "settings": ("Settings of training and data generation, mutated", 150, 5000, ("torch",)),

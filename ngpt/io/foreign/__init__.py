@@ -1,0 +1,1 @@
+"""Images of other formats than OpenEXR: PFM, Radiance HDR, PNG, TIFF, JPEG. ``files`` reads them all."""
