@@ -4,7 +4,7 @@ import logging
 
 from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
-from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
+from ngpt.errors import NgptError, WrongUse, did_you_mean, stop_if_interrupted
 from ngpt.system.install import install_command
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
@@ -32,7 +32,8 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     jit_variants = [v for v in mi.variants() if not v.startswith("scalar")]
     if name not in jit_variants:
         raise WrongUse(
-            f"variant '{name}' is not one this Mitsuba can vectorise; choose one of: {', '.join(jit_variants)}"
+            f"variant '{name}' is not one this Mitsuba can vectorise; {did_you_mean(name, jit_variants)}choose one of: "
+            f"{', '.join(jit_variants)}"
         )
     if name.startswith("llvm"):
         use_llvm()

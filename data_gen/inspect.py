@@ -8,10 +8,11 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.samplers import SAMPLERS, by_standing, choose
-from data_gen.scenes.builtin import SCENES
+from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.facts import Facts, polarised
 from data_gen.scenes.load import complaint
 from ngpt.errors import NgptError
+from ngpt.methods import METHODS
 
 _KINDS = ("Integrator", "Sensor", "Film", "Shape", "BSDF", "Emitter", "Medium", "Texture")
 _MIRRORS = ("conductor", "dielectric", "thindielectric")
@@ -34,7 +35,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         elif name in SCENES:
             nodes = mi.parser.parse_dict(config, SCENES[name]()).nodes
         else:
-            raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
+            raise no_scene(name, [*METHODS, *SAMPLERS])
     except RuntimeError as error:
         raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
     plugins = {kind: Counter() for kind in _KINDS}

@@ -1,5 +1,7 @@
 """The one exception that users of ngpt meet, its kind for wrong calls, and interrupts, which others hide."""
 
+from collections.abc import Iterable
+
 LONGEST = 1000
 
 
@@ -22,6 +24,14 @@ class WrongUse(NgptError):
 
     The command line ends with status 2 for it, and with 1 for any other ``NgptError``.
     """
+
+
+def did_you_mean(word: str, known: Iterable[str]) -> str:
+    """What to put before a list of the known names where a word is none of them: a question, or nothing."""
+    from difflib import get_close_matches  # only for those who mistype
+
+    near = get_close_matches(word.lower(), names := {name.lower(): name for name in known}, 1)
+    return f"did you mean '{names[near[0]]}'? " if near else ""
 
 
 class Interrupted(KeyboardInterrupt):

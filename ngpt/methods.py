@@ -13,7 +13,7 @@ import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
 from ngpt.denoisers import caustic, nfor, nlm, oidn
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
 from ngpt.magnitude import enlarged, magnitude, scaled
 from ngpt.network.identity import Identity, identify
@@ -198,6 +198,12 @@ def by_standing(*standings: str) -> dict[str, Method]:
     return {name: entry for name, entry in METHODS.items() if entry.standing in standings and not entry.variant}
 
 
+def unknown_method(name: str) -> WrongUse:
+    """The error for a name that is no method's."""
+    meant = did_you_mean(name, ("auto", *METHODS))
+    return WrongUse(f"unknown method '{name}'; {meant}choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
+
+
 # The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
 # OIDN's mean error it leaves 0.78 to 0.84 times in rooms, but 1.13 to 1.49 times in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
@@ -234,7 +240,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
         # Weights say themselves what they need: any method that runs them will do.
         name = "ngpt" if own else choose(stack)
     if name not in METHODS:
-        raise WrongUse(f"unknown method '{name}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
+        raise unknown_method(name)
     entry = METHODS[name]
     if method == "auto":
         # Where and in how much memory concerns only some of those it may stand for.

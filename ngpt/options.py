@@ -4,10 +4,9 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
-from difflib import get_close_matches
 from typing import Any
 
-from ngpt.errors import WrongUse
+from ngpt.errors import WrongUse, did_you_mean
 
 # Whom samplers and methods are for: users; users who know why; those who study them
 STANDINGS = ("use", "niche", "study")
@@ -55,9 +54,8 @@ class Option:
         outside = isinstance(typed, int | float) and not self.range[0] <= typed <= self.range[1]
         if typed is None or outside or (self.choices and self.range == _ANY):
             text = value if isinstance(value, str) else written(value)
-            near = get_close_matches(text, [written(choice) for choice in self.choices], 1)
-            meant = f"; did you mean '{near[0]}'?" if near else ""
-            raise WrongUse(f"'{text}' is not allowed; it takes {self.allowed}{meant}")
+            meant = did_you_mean(text, map(written, self.choices))
+            raise WrongUse(f"'{text}' is not allowed; it takes {self.allowed}{f'; {meant}' if meant else ''}".rstrip())
         return typed
 
     @property
@@ -96,8 +94,7 @@ def settings(owner: str, options: Mapping[str, Option], given: Mapping[str, Any]
     found: dict[str, Any] = {name: option.default for name, option in options.items()}
     for name, value in given.items():
         if name not in options:
-            near = get_close_matches(name, options, 1)
-            help = f"did you mean '{near[0]}'?" if near else f"it has: {', '.join(options) or 'none'}"
+            help = did_you_mean(name, options).strip() or f"it has: {', '.join(options) or 'none'}"
             raise WrongUse(f"{owner} has no option '{name}'; {help}")
         try:
             found[name] = options[name].check(value)

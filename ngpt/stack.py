@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 from ngpt.layers import LAYERS
 from ngpt.report.notebook import stack_html
 
@@ -147,7 +147,8 @@ _DIM = 2.0**-86
 
 def _check_name(name: str, path: str) -> None:
     if name not in LAYERS:
-        raise NgptError(f"{path}: no layer is called '{name}'; the layers are {', '.join(LAYERS)}")
+        meant = did_you_mean(name, LAYERS)
+        raise NgptError(f"{path}: no layer is called '{name}'; {meant}the layers are {', '.join(LAYERS)}")
 
 
 def _as_layer(name: str, array: ArrayLike, path: str) -> np.ndarray:

@@ -5,10 +5,12 @@ from ngpt.cli import CONTINUES, Verb
 ROOM = "data_gen.cli"
 
 VERBS = {
+    "render": Verb("render a scene to a gradient stack", ROOM, heading="rendering"),
+    "advise": Verb("say which method and how many samples to use, for a time or an error", ROOM, heading="rendering"),
     "demo": Verb(
-        "render built-in scenes, reconstruct with every method, and write a report to open in a browser", ROOM
+        "render built-in scenes, reconstruct with every method, and write a report to open in a browser",
+        ROOM,
+        heading="rendering",
     ),
-    "render": Verb("render a scene to a gradient stack", ROOM),
-    "advise": Verb("say which method and how many samples to use, for a time or an error", ROOM),
-    "dataset": Verb("make a training set, or continue one", ROOM, "train", CONTINUES),
+    "dataset": Verb("make a training set, or continue one", ROOM, "train", CONTINUES, "networks"),
 }

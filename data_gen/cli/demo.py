@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force, positive, size
-from ngpt.errors import WrongUse
+from ngpt.errors import WrongUse, did_you_mean
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS
 from ngpt.measure.shown import available, judge
@@ -49,7 +49,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     names = args.scene or list(SURFACES)
     for name in names:
         if name not in SCENES:
-            raise WrongUse(f"no built-in scene is called '{name}'; those are: {', '.join(SCENES)}")
+            meant = did_you_mean(name, SCENES)
+            raise WrongUse(f"no built-in scene is called '{name}'; {meant}those are: {', '.join(SCENES)}")
     folder = make_folder(args.output)
     report = check_output(folder / "report.html", args.force)
     start = time.perf_counter()
@@ -114,9 +115,9 @@ def demo_method(method: str, stack: GradientStack, reference: np.ndarray, target
 
 def print_table(scenes: list[Scene]) -> None:
     """The numbers of the report, for those who do not open it."""
-    print(f"{'scene':14}{'method':14}{'relMSE':>12}{'of primal':>12}{'seconds':>10}")
+    print(f"{'scene':14}{'method':14}{'relMSE trimmed':>16}{'of primal':>12}{'seconds':>10}")
     for scene in scenes:
         for entry in scene.entries:
-            error = median(entry.metrics["relMSE"])
-            share = error / max(median(scene.entries[0].metrics["relMSE"]), 1e-30)
-            print(f"{scene.name:14}{entry.name:14}{error:12.5f}{share:12.1%}{entry.seconds:10.2f}")
+            error = median(entry.metrics["relMSE trimmed"])
+            share = error / max(median(scene.entries[0].metrics["relMSE trimmed"]), 1e-30)
+            print(f"{scene.name:14}{entry.name:14}{error:16.5f}{share:12.1%}{entry.seconds:10.2f}")

@@ -8,11 +8,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from difflib import get_close_matches
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
 
 if TYPE_CHECKING:
@@ -190,8 +189,7 @@ def find(name: str, facts: Facts | None = None) -> Sampler:
     if name in FRAME_SAMPLERS:
         raise WrongUse(f"sampler '{name}' is for shots (--frames): {FRAME_SAMPLERS[name].alone}; use --sampler gpt")
     if name not in SAMPLERS:
-        near = get_close_matches(name, [*SAMPLERS, *FRAME_SAMPLERS], 1)
-        meant = f"did you mean '{near[0]}'? " if near else ""
+        meant = did_you_mean(name, ("auto", *SAMPLERS, *FRAME_SAMPLERS))
         shots = f"; for shots (--frames): {', '.join(FRAME_SAMPLERS)}"
         raise WrongUse(f"unknown sampler '{name}'; {meant}choose one of: auto, {', '.join(SAMPLERS)}{shots}")
     sampler = SAMPLERS[name]

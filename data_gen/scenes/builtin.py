@@ -5,10 +5,13 @@ Each function returns a Mitsuba scene dictionary, without its film size: units a
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+
 import mitsuba as mi
 import numpy as np
 
 from data_gen.scenes import grids
+from ngpt.errors import NgptError, did_you_mean
 
 
 def _transform():
@@ -261,3 +264,9 @@ def _sky(height: int, width: int) -> np.ndarray:
 SURFACES = {"diffuse": diffuse, "glossy": glossy, "environment": environment, "lens": lens}
 MEDIA = {"haze": haze, "smoke": smoke, "cloud": cloud}
 SCENES = SURFACES | MEDIA
+
+
+def no_scene(name: str, others: Iterable[str] = ()) -> NgptError:
+    """The error for what is neither a file nor a built-in scene; ``others`` are names that may have been meant too."""
+    meant = did_you_mean(name, [*SCENES, *others])
+    return NgptError(f"{name}: no such file, nor a built-in scene; {meant}those are: {', '.join(SCENES)}")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import mitsuba as mi
 
-from data_gen.scenes.builtin import SCENES
+from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.merging import load_merged
 from ngpt.errors import NgptError, stop_if_interrupted
 
@@ -35,7 +35,7 @@ def load_scene(
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
             scene = mi.load_dict(SCENES[name](), optimize=False)
         else:
-            raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
+            raise no_scene(name)
     except (RuntimeError, TypeError, ValueError) as error:
         if isinstance(error, NgptError):
             raise

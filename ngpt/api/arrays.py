@@ -13,9 +13,9 @@ from typing import Any, TypeVar, overload
 import numpy as np
 
 from ngpt.api.tensors import Bitmap, Image, Kind, Tensor, Transform, is_bitmap, layer, like, to_numpy
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 from ngpt.io.aliases import resolve
-from ngpt.methods import METHODS, by_standing, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct, unknown_method
 from ngpt.options import Value
 from ngpt.sequence.history import Temporal
 from ngpt.stack import GradientStack
@@ -161,7 +161,7 @@ class Denoiser:
         except (TypeError, ValueError, NgptError):
             raise NgptError(f"Denoiser: input_size is {input_size!r}; it must be (width, height)") from None
         if method not in ("auto", *METHODS):
-            raise NgptError(f"unknown method '{method}'; choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
+            raise unknown_method(method)
         _check_options("Denoiser", method, options, ())
         self.announced = {"albedo": albedo, "normals": normals, "temporal": temporal}
         self._temporal = Temporal() if temporal else None
@@ -229,7 +229,10 @@ class Denoiser:
         ``ngpt.denoise`` does.
         """
         if unknown := [name for name in layers if name not in _FURTHER]:
-            raise NgptError(f"Denoiser: no layer is called '{unknown[0]}'; there are: {', '.join(_FURTHER)}")
+            raise NgptError(
+                f"Denoiser: no layer is called '{unknown[0]}'; "
+                f"{did_you_mean(unknown[0], _FURTHER)}there are: {', '.join(_FURTHER)}"
+            )
         given: dict[str, Any] = {"albedo": _first(albedo, albedo_ch), "normals": _first(normals, normals_ch)}
         given["flow"] = _first(flow, flow_ch)
         given["previous_denoised"] = _first(previous_denoised, previous_denoised_ch)
@@ -305,14 +308,10 @@ def _check_options(where: str, method: str, options: Iterable[str], layers: tupl
     known = list(dict.fromkeys(option for entry in entries for option in entry.options))
     for name in options if entries else ():
         if name not in known:
-            from difflib import get_close_matches  # for those who mistype
-
-            meant = "".join(f"; did you mean '{near}'?" for near in get_close_matches(name, [*known, *layers], 1))
+            meant = did_you_mean(name, [*known, *layers])
             beside = f"; layers: {', '.join(layers)}" if layers else ""
-            raise NgptError(
-                f"{where}: method '{method}' has no option '{name}'{meant or ';'} options: {', '.join(known) or 'none'}"
-                f"{beside}"
-            )
+            names = ", ".join(known) or "none"
+            raise NgptError(f"{where}: method '{method}' has no option '{name}'; {meant}options: {names}{beside}")
 
 
 def _first(value: Any, channel: str) -> Any:

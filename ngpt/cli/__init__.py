@@ -12,7 +12,7 @@ import sys
 from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.system.console import Console, logged, run_command
 from ngpt.system.install import install_command
 from ngpt.system.parts import brought, no_renderer
@@ -21,52 +21,84 @@ from ngpt.version import __version__
 
 class Verb(NamedTuple):
     """What a verb does, the package whose module of the verb's name does it, which extra of ngpt-recon brings what it
-    needs, and what an interrupt means for its work."""
+    needs, what an interrupt means for its work, and under which of ``HEADINGS`` help has it."""
 
     summary: str
     room: str = "ngpt.cli"
     extra: str = ""
     interrupted: str = "interrupted"
+    heading: str = "images"
 
+
+HEADINGS = {"images": "images of any renderer", "rendering": "rendering", "networks": "networks"}
 
 CONTINUES = "interrupted; run the same command to continue"
 _GOES_ON = "interrupted; --skip-existing goes on with what is not done yet"
 
 VERBS = {
-    "denoise": Verb("reconstruct images from gradient stacks", interrupted=_GOES_ON),
+    "denoise": Verb("reconstruct images from gradient stacks or noisy renders", interrupted=_GOES_ON),
     "info": Verb("say what a file holds, or what a scene requires"),
-    "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
-    "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
     "diff": Verb("compare two images"),
     "report": Verb("make a page to compare images of any renderer in, with errors where there is a reference"),
     "picture": Verb("make a PNG, JPEG or WebP of an image, or a film of a shot, by a view transform"),
-    "train": Verb("train a network, or continue a run", extra="train", interrupted=CONTINUES),
+    "merge": Verb("merge stacks of one scene, rendered with different seeds, into one of all their samples"),
+    "unpack": Verb("write the layers of a stack as raw files, for hosts in other languages"),
+    "train": Verb("train a network, or continue a run", extra="train", interrupted=CONTINUES, heading="networks"),
     "evaluate": Verb(
         "compare methods on the same scenes with the same clock",
         extra="train",
         interrupted="interrupted; the same command goes on from here",
+        heading="networks",
     ),
-    "export": Verb("write a reconstruction as an ONNX file, or weights in 16 bits", extra="export"),
+    "export": Verb("write a reconstruction as an ONNX file, or weights in 16 bits", extra="export", heading="networks"),
 }
 
 
 def all_verbs() -> dict[str, Verb]:
-    """Those of other packages, which render, and ours.
+    """Ours, and those of other packages, which render, by their headings.
 
     A package names its own, a dictionary like ``VERBS``, by an entry point of the group "ngpt.verbs".
     """
     found: dict[str, Verb] = {}
     for verbs in brought("ngpt.verbs"):
         found |= verbs
-    return found | VERBS
+    order = list(HEADINGS)
+    return dict(sorted((found | VERBS).items(), key=lambda item: order.index(item[1].heading)))
 
 
 class _Parser(argparse.ArgumentParser):
     """Reports a wrong call in one line, as all other errors are."""
 
+    def _check_value(self, action: argparse.Action, value: Any) -> None:
+        if action.choices is not None and value not in action.choices:
+            known = list(map(str, action.choices))
+            text = f"invalid choice: '{value}'; {did_you_mean(str(value), known)}choose one of: {', '.join(known)}"
+            raise argparse.ArgumentError(action, text)
+
     def error(self, message: str) -> NoReturn:
         Console().error(f"{message}; see `{self.prog} --help`")
         sys.exit(2)
+
+
+class _Top(_Parser):
+    """Of ``ngpt`` itself: help has the verbs under headings."""
+
+    def format_help(self) -> str:
+        formatter, verbs = self._get_formatter(), all_verbs()
+        group: Any = self._subparsers
+        formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
+        formatter.add_text(self.description)
+        for heading, title in HEADINGS.items():
+            formatter.start_section(title)
+            for action in group._group_actions[0]._get_subactions():
+                if verbs[action.dest].heading == heading:
+                    formatter.add_argument(action)
+            formatter.end_section()
+        formatter.start_section("options")
+        formatter.add_arguments(self._optionals._group_actions)
+        formatter.end_section()
+        formatter.add_text(self.epilog)
+        return formatter.format_help()
 
 
 class _Print(argparse.Action):
@@ -113,9 +145,10 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     """Of all ``verbs``, with the arguments of the one that is called."""
-    if called and called not in verbs and verbs.keys() == VERBS.keys():
-        raise WrongUse(f"there is no verb '{called}' here; {no_renderer()}")
-    parser = _Parser(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
+    if called and called not in verbs:
+        meant = did_you_mean(called, verbs) or (f"{no_renderer()}; " if verbs.keys() == VERBS.keys() else "")
+        raise WrongUse(f"there is no verb '{called}'; {meant}verbs: {', '.join(verbs)}; see `ngpt --help`")
+    parser = _Top(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     parser.add_argument(
@@ -144,7 +177,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
 def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.ArgumentParser:
     """The parser, with what its verb is and the arguments of it."""
     parser.description = f"{verb.summary[0].upper()}{verb.summary[1:]}."
-    parser.set_defaults(verb=name)
+    parser.set_defaults(verb=name, parser=parser)
     loud = parser.add_mutually_exclusive_group()
     loud.add_argument("-q", "--quiet", action="store_true", help="say nothing but errors")
     loud.add_argument("-v", "--verbose", action="store_true", help="say what is read, chosen and run")
@@ -153,7 +186,10 @@ def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.
 
 
 def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[str], program: str) -> int:
-    args = parser.parse_args(words)
+    args, unknown = parser.parse_known_args(words)
+    if unknown:
+        meant = did_you_mean(unknown[0].partition("=")[0], args.parser._option_string_actions)
+        raise WrongUse(f"unrecognized argument '{unknown[0]}'; {meant}see `{args.parser.prog} --help`")
     args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
         with logged(args.verbose, args.quiet):

@@ -3,13 +3,20 @@
 import argparse
 import glob
 import json
+import logging
+import os
 import re
+from collections.abc import Mapping
 from pathlib import Path
 
+from ngpt.cli.framenames import frames_named, varies
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 from ngpt.system import configs
+from ngpt.system.console import Console, by_names
 from ngpt.system.files import check_output, make_folder
+
+_LOG = logging.getLogger(__name__)
 
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
 RESULT_SUFFIX = "_denoised"
@@ -113,28 +120,50 @@ def duration(text: str) -> float:
 def stack_files(names: list[str]) -> list[Path]:
     """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
 
-    Folders and patterns leave out results of earlier runs. Raises NgptError for a folder or pattern without a file; a
-    plain name is taken as it is, for its reader to complain about.
+    Patterns are those of shells, and names of frames (``ngpt.cli.framenames``); folders and files of that very name
+    win, also within one. Folders and patterns leave out results of earlier runs. Raises NgptError for a folder or
+    pattern without a file; a plain name is taken as it is, for its reader to complain about.
     """
     files: dict[Path, None] = {}
     for name in names:
         path = Path(name)
         if path.is_dir():
             found = sorted(p for p in path.iterdir() if p.suffix.lower() == ".exr")
+        elif varies(name):
+            found = list(frames_named(name).values())
         elif glob.has_magic(name) and not path.exists():
-            found = sorted(Path(p) for p in glob.glob(name, recursive=True))
+            found = sorted(Path(p) for p in glob.glob(_with_literals(path), recursive=True))
         else:
             files[path] = None
             continue
         inputs = [p for p in found if not p.stem.endswith(RESULT_SUFFIX) and not p.name.startswith(".")]
         if not inputs:
-            raise NgptError(f"{name}: no .exr files to denoise there")
+            raise NgptError(f"{name}: no .exr files to denoise there; other formats by their names, such as '*.pfm'")
         files.update(dict.fromkeys(inputs))
     return list(files)
 
 
+def _with_literals(path: Path) -> str:
+    """A pattern in which folders that exist by the very names it begins with are no patterns: ``dir[1]/*.exr``."""
+    known, parts = Path(), []
+    for part in path.parts:
+        if not (known / part).exists():
+            break
+        known /= part
+        parts.append(glob.escape(part))
+    return os.path.join(*parts, *path.parts[len(parts) :])
+
+
+def tell_lacks(lacks: Mapping[str, str], console: Console) -> None:
+    """Says which metrics are left out; why, which is the same each time, is for --verbose."""
+    for lack in lacks.values():
+        _LOG.info(lack)
+    if lacks:
+        console.say(f"without {' and '.join(lacks)}: --verbose says why")
+
+
 def print_json(value: object) -> None:
-    """Strict JSON: numbers that it does not know (infinite, not a number) become null."""
+    """Strict JSON: numbers that it does not know (infinite, not a number) become null; files as they are called."""
     print(json.dumps(_strict(value), indent=2))
 
 
@@ -143,6 +172,8 @@ def _strict(value):
         return {key: _strict(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
         return [_strict(item) for item in value]
+    if isinstance(value, str):
+        return by_names(value)
     if isinstance(value, float) and not abs(value) < float("inf"):
         return None
     return value

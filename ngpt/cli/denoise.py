@@ -28,6 +28,7 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import way, windowed
+from ngpt.cli.framenames import named, number_of, varies
 from ngpt.cli.picture import add_look, check_picture, exposed
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
@@ -51,14 +52,19 @@ from ngpt.version import __version__
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
-        "stacks", nargs="+", metavar="STACK", help=".exr files, folders of them, or patterns; -: standard input"
+        "stacks",
+        nargs="+",
+        metavar="STACK",
+        help="images (.exr .pfm .hdr .png .tif .jpg), folders of .exr, patterns, frames as shot.%%04d.exr, "
+        "shot.####.exr or 'shot.$F4.exr'; -: standard input",
     )
     parser.add_argument(
         "-o",
         "--output",
         metavar="OUT",
         help=f"file for one stack, folder for several; folders are made (default: STACK{RESULT_SUFFIX}.exr beside "
-        "each); of one stack a picture too (.png .jpg .webp); -: standard output",
+        "each); of one stack also .pfm, or a picture (.png .jpg .webp); of frames also clean.%%04d.exr; -: standard "
+        "output",
     )
     first = "; ".join(f"{name}: {method.summary}" for name, method in by_standing("use").items())
     parser.add_argument(
@@ -109,7 +115,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before; "
         "with -m wcv, and differences in time in all of them (`ngpt render --dt`), by those after too",
     )
-    parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
+    parser.add_argument(
+        "--ref",
+        metavar="REF",
+        help="reference image: report the error against it, relMSE and trimmed: without the worst 0.1 %% of the pixels",
+    )
     add_files(parser)
     add_layers(parser)
     add_look(parser)
@@ -136,14 +146,14 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         raise WrongUse(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
-    for _, target in pairs:
-        if target.suffix.lower() != ".exr":
-            check_picture(target, args)
-        output_file(target, args)
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
                 raise WrongUse(f"--temporal goes without {option}: history has no {option[2:]}; leave one out")
+    for _, target in pairs:
+        if target.suffix.lower() != ".exr":
+            check_picture(target, args)
+        output_file(target, args)
     # Their results are there, but later frames are made of them.
     missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
@@ -310,7 +320,8 @@ def describe(report: dict) -> str:
         text += f", sha256 {report['weights']['sha256'][:12]}"
     text += f", {report['seconds']:.2f} s"
     if report["repaired"] or report["untrusted"]:
-        text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+        text += f", repaired {report['repaired']} pixels"
+        text += f", left out {report['untrusted']} gradients" if report["untrusted"] else ""
     if "in place of" in report:
         text += f", in place of {report['in place of']}"
     if "history" in report:
@@ -318,7 +329,7 @@ def describe(report: dict) -> str:
     if report["groups"]:
         text += f", light groups {', '.join(report['groups'])}"
     if "metrics" in report:
-        text += f", relMSE {report['metrics']['relMSE']:.5g}"
+        text += ", " + ", ".join(f"{name} {report['metrics'][name]:.5g}" for name in ("relMSE", "relMSE trimmed"))
     return text
 
 
@@ -326,6 +337,8 @@ def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Pa
     """Where the result of each source goes."""
     if output is None:
         targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
+    elif varies(output):
+        targets = [Path(named(output, number_of(path, output))) for path in sources]
     elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
         targets = [Path(output)]
     else:

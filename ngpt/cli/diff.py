@@ -2,7 +2,8 @@
 
 import argparse
 
-from ngpt.cli.arguments import add_json, print_json
+from ngpt.cli.arguments import add_json, print_json, tell_lacks
+from ngpt.cli.streams import standard_input
 from ngpt.io.exr import read_image
 from ngpt.measure.metrics import compare
 from ngpt.measure.shown import available, judge
@@ -23,11 +24,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    image, reference = read_image(args.image), read_image(args.reference)
+    with standard_input([args.image, args.reference]) as names:
+        return compare_files(names[0], names[1], args, console)
+
+
+def compare_files(first: str, second: str, args: argparse.Namespace, console: Console) -> int:
+    image, reference = read_image(first), read_image(second)
     metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
-    for lack in lacks:
-        console.say(lack)
     metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]
     agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
     if args.json:
@@ -36,4 +40,5 @@ def run(args: argparse.Namespace, console: Console) -> int:
         for name, value in metrics.items():
             print(f"{name:16} {value:.6g}")
         print(f"{'agree' if agree else 'differ':16} (relMSE up to {args.tolerance:g}, no non-finite pixels)")
+    tell_lacks(lacks, console)
     return 0 if agree else 1

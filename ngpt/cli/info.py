@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
+from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError
 from ngpt.io.aliases import format_aliases, propose
 from ngpt.io.exr import pass_through, read
@@ -33,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "file",
         nargs="?",
         metavar="FILE",
-        help="an .exr file, a network's weights, a training set or run, a scene file or name, a sampler",
+        help="an image (-: standard input), weights, a training set or run, a scene file or name, a sampler",
     )
     parser.add_argument(
         "--aliases", action="store_true", help="print the layer names of other renderers that are known"
@@ -49,17 +50,26 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     if args.aliases:
         print(format_aliases())
-    elif args.file is None:
+        return 0
+    if args.file is None:
         show(overview(), args.json)
-    elif is_run(Path(args.file)):
-        show(run_summary(Path(args.file)), args.json)
-    elif Path(args.file).is_dir():
-        report = summary(Path(args.file))
+        return 0
+    with standard_input([args.file]) as (args.file,):
+        return told(args)
+
+
+def told(args: argparse.Namespace) -> int:
+    """What there is to say of a file, a folder or a name."""
+    path = Path(args.file)
+    if is_run(path):
+        show(run_summary(path), args.json)
+    elif path.is_dir():
+        report = summary(path)
         show(report, args.json)
         return 1 if report["problems"] else 0
-    elif Path(args.file).suffix.lower() in NETWORKS and Path(args.file).exists():
+    elif path.suffix.lower() in NETWORKS and path.exists():
         show(describe(args.file), args.json)
-    elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
+    elif path.suffix.lower() == ".xml" or not path.exists():
         show(other(args.file, dict(args.define)), args.json)
     else:
         show(stack(read(args.file, dict(args.layer), args.untrusted)), args.json)

@@ -7,6 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from ngpt.cli.arguments import add_force, output_file
+from ngpt.cli.framenames import frames_named, named, number_of, varies
+from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_image
 from ngpt.report.display import auto_exposure
@@ -20,13 +22,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. All frames of a folder have one exposure."
     )
-    parser.add_argument("image", metavar="IMAGE.exr", help="an image of any renderer, or a folder of frames")
+    parser.add_argument(
+        "image",
+        metavar="IMAGE",
+        help="an image of any renderer (-: standard input), a folder of frames, or shot.%%04d.exr",
+    )
     parser.add_argument(
         "-o",
         "--output",
         required=True,
         metavar="FILE",
-        help=f"picture to write ({' '.join(PICTURES)}); of a folder a film ({' '.join(SHOTS)}), or a folder for PNGs",
+        help=f"picture to write ({' '.join(PICTURES)}); of frames a film ({' '.join(SHOTS)}), a folder for PNGs, or "
+        "names as pic.%%04d.png",
     )
     add_look(parser)
     parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
@@ -35,25 +42,34 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     source, target = Path(args.image), Path(args.output)
-    if source.is_dir():
+    if source.is_dir() or varies(args.image):
         return shot(args, source, target, console)
     check_kind(target, PICTURES)
     output_file(target, args)
-    image = read_image(source)
-    write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
-    console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
+    with standard_input([args.image]) as (name,):
+        image = read_image(name)
+        write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
+        console.say(f"{name} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
 
 def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console) -> int:
     """A film of a folder's frames, or a picture of each."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
+    if folder.is_dir():
+        files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
+    else:
+        files = list(frames_named(str(folder)).values())
     if not files:
         raise NgptError(f"{folder}: no .exr files there")
-    film = bool(target.suffix)
+    each = varies(str(target))
+    film = bool(target.suffix) and not each
     if film:
         check_kind(target, SHOTS)
         output_file(target, args)
+    elif each:
+        check_kind(target, PICTURES)
+        for file in files:
+            output_file(named(str(target), number_of(file, str(target))), args)
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
     stops = exposed(args.exposure, read_image(files[0]))
@@ -74,11 +90,14 @@ def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console)
 
 
 def write_each(folder: Path, pictures, overwrite: bool) -> None:
-    """A PNG of each (file, pixels) in a folder, which is made if there is none."""
-    make_folder(folder)
+    """A picture of each (file, pixels): a PNG in a folder, which is made if there is none, or by names of frames."""
+    each = varies(str(folder))
+    if not each:
+        make_folder(folder)
     pixels: np.ndarray
     for file, pixels in pictures:
-        write_picture(folder / f"{file.stem}.png", pixels, overwrite)
+        name = named(str(folder), number_of(file, str(folder))) if each else folder / f"{file.stem}.png"
+        write_picture(Path(name), pixels, overwrite)
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:

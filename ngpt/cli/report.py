@@ -3,10 +3,13 @@
 import argparse
 import os
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force, output_file
+from ngpt.cli.arguments import add_force, output_file, tell_lacks
+from ngpt.cli.framenames import frames_named, varies
+from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image
 from ngpt.measure.metrics import METRICS, exposure_mismatch
@@ -15,7 +18,7 @@ from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
-from ngpt.system.console import Console, tell
+from ngpt.system.console import Console, by_names, tell
 from ngpt.system.files import atomic_output
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
@@ -45,8 +48,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "images",
         nargs="+",
-        metavar="IMAGE.exr",
-        help="images of one size, of any renderer; or folders of frames, or of training runs",
+        metavar="IMAGE",
+        help="images of one size, of any renderer (-: standard input); shots: folders, shot.%%04d.exr; training runs",
     )
     parser.add_argument(
         "--ref",
@@ -65,8 +68,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
     target = output_file(args.output, args)
     if any(is_run(Path(path)) for path in args.images):
         return run_trainings(args, target, console)
+    with standard_input([*args.images, args.ref or ""]) as (*args.images, args.ref):
+        return images_or_shots(args, target, console)
+
+
+def images_or_shots(args: argparse.Namespace, target: Path, console: Console) -> int:
     names = labels(args.images)
-    if any(os.path.isdir(path) for path in args.images):
+    if any(os.path.isdir(path) or varies(path) for path in args.images):
         return run_shots(args, names, target, console)
     images = [read_image(path) for path in args.images]
     reference = read_image(args.ref) if args.ref else None
@@ -78,12 +86,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     formulas, caption = {}, "no reference: with --ref the page has errors, SSIM, FLIP and their maps"
     if len(images) == 1 and reference is None:
         entries, layers = of_stack(read(args.images[0]), images[0], names[0])
-        caption = f"all layers of {args.images[0]}"
+        caption = f"all layers of {by_names(args.images[0])}"
     if reference is not None:
-        caption = f"reference {args.ref}"
+        caption = f"reference {by_names(args.ref)}"
         metrics, lacks = available(height, width)
-        for lack in lacks:
-            console.say(lack)
+        tell_lacks(lacks, console)
         with console.progress("errors", "images") as progress:
             progress(0, len(entries))
             for done, (entry, path) in enumerate(zip(entries, args.images, strict=True), 1):
@@ -120,21 +127,20 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 
 
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
-    """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
-    folders = [*args.images, *([args.ref] if args.ref else [])]
-    frames = frames_of(folders)
-    first = read_image(Path(folders[0]) / frames[0])
-    metrics, lacks = available(*first.shape[:2]) if args.ref else ([], [])
-    for lack in lacks:
-        console.say(lack)
+    """Shots of the same frames: a page that plays them, and what is measured over all of them."""
+    shots = frames_of([*args.images, *([args.ref] if args.ref else [])])
+    frames = sorted(shots[0])
+    first = read_image(shots[0][frames[0]])
+    metrics, lacks = available(*first.shape[:2]) if args.ref else ([], {})
+    tell_lacks(lacks, console)
     scenes, motions = [], []
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
             progress(done, len(frames))
-            paths = [str(Path(folder) / frame) for folder in folders]
+            paths = [str(shot[frame]) for shot in shots]
             images = [read_image(path) for path in paths]
             for path, image in zip(paths, images, strict=True):
-                check_size(path, image, str(Path(folders[0]) / frames[0]), first)
+                check_size(path, image, str(shots[0][frames[0]]), first)
             reference = images.pop() if args.ref else None
             entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
             motions.append(motion_of(paths))
@@ -143,8 +149,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
                     add_errors(entry, metrics, reference, path, paths[-1])
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             size = f"{first.shape[1]}x{first.shape[0]}"
-            caption = f"{frame}, {size}"
-            scenes.append(Scene(Path(frame).stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
+            caption = f"{shots[0][frame].name}, {size}"
+            scenes.append(Scene(shots[0][frame].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
     tables = {}
     for place in range(len(names)):
@@ -157,6 +163,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
+        if not any(motion is not None for motion in motions[1:]):
+            console.say("flicker is nan: no frame after the first has motion vectors to follow")
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
             tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
@@ -198,20 +206,29 @@ def motion_of(paths: list[str]) -> np.ndarray | None:
     return None
 
 
-def frames_of(folders: list[str]) -> list[str]:
-    """The names of the frames, which all folders must have. Raises NgptError for files among folders, and lacks."""
-    found = []
-    for folder in folders:
-        if not os.path.isdir(folder):
-            raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
-        found.append({path.name for path in Path(folder).iterdir() if path.suffix.lower() == ".exr"})
+def frames_of(names: list[str]) -> list[dict[Any, Path]]:
+    """The files of each shot by their frames, which are the same in all of them.
+
+    Frames go by the names of their files, or by their numbers where all shots are names that vary. Raises NgptError for
+    files among shots, and for frames that one of them lacks.
+    """
+    found: list[dict[Any, Path]] = []
+    numbered = not any(os.path.isdir(name) for name in names)
+    for name in names:
+        if varies(name):
+            frames = frames_named(name)
+            found.append(frames if numbered else {path.name: path for path in frames.values()})
+        elif os.path.isdir(name):
+            found.append({path.name: path for path in Path(name).iterdir() if path.suffix.lower() == ".exr"})
+        else:
+            raise NgptError(f"{name}: is no folder, and others are; give folders of frames, or images alone")
         if not found[-1]:
-            raise NgptError(f"{folder}: no .exr files there")
-        if differ := found[-1] ^ found[0]:
-            name = min(differ)
-            has, lacks = (folder, folders[0]) if name in found[-1] else (folders[0], folder)
-            raise NgptError(f"{has} has {name} and {lacks} has not; give folders of the same frames")
-    return sorted(found[0])
+            raise NgptError(f"{name}: no .exr files there")
+        if differ := found[-1].keys() ^ found[0].keys():
+            frame = min(differ)
+            has, lacks = (name, names[0]) if frame in found[-1] else (names[0], name)
+            raise NgptError(f"{has} has {frame} and {lacks} has not; give folders of the same frames")
+    return found
 
 
 def labels(paths: list[str]) -> list[str]:

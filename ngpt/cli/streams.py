@@ -3,13 +3,33 @@
 import shutil
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
+from ngpt.system.console import called
 
 STREAM = "-"
+
+
+@contextmanager
+def standard_input(names: Sequence[str]) -> Iterator[list[str]]:
+    """The names with a file in the place of ``-``, which holds what comes by standard input; messages call it that.
+
+    Raises WrongUse for two of them.
+    """
+    if STREAM not in names:
+        yield list(names)
+        return
+    if names.count(STREAM) > 1:
+        raise WrongUse(f"'{STREAM}' is one image, and is given {names.count(STREAM)} times; name files for the others")
+    with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
+        source = Path(folder) / "standard-input"
+        with source.open("wb") as file:
+            shutil.copyfileobj(sys.stdin.buffer, file)
+        with called(str(source), "standard input"):
+            yield [str(source) if name == STREAM else name for name in names]
 
 
 @contextmanager
@@ -21,27 +41,25 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
 
     Raises NgptError for ``-`` beside other inputs, without an output, and for images that would go to a terminal.
     """
-    if STREAM not in stacks and output != STREAM:
-        yield stacks, output
-        return
-    if len(stacks) > 1:
+    if STREAM in stacks and len(stacks) > 1:
         raise NgptError(f"'{STREAM}' is one stack, and {len(stacks)} are given; denoise them one by one")
-    if output is None:
+    if output == STREAM and len(stacks) > 1:
+        raise NgptError(f"'{STREAM}' is one result, and {len(stacks)} stacks are given; denoise them one by one")
+    if stacks == [STREAM] and output is None:
         raise NgptError(
             "standard input has no name to go by: name the result, -o FILE.exr, or -o - for standard output"
         )
     if output == STREAM and sys.stdout.isatty():
         raise NgptError("standard output is a terminal: send it into a file or a program, or name a file with -o")
-    with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
-        source, target = (Path(folder) / f"standard-{name}.exr" for name in ("input", "output"))
-        if stacks == [STREAM]:
-            with source.open("wb") as file:
-                shutil.copyfileobj(sys.stdin.buffer, file)
-        yield (
-            [str(source)] if stacks == [STREAM] else stacks,
-            str(target) if output == STREAM else output,
-        )
-        if output == STREAM and target.exists():
-            with target.open("rb") as file:
-                shutil.copyfileobj(file, sys.stdout.buffer)
-            sys.stdout.buffer.flush()
+    with standard_input(stacks) as inputs:
+        if output != STREAM:
+            yield inputs, output
+            return
+        with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
+            target = Path(folder) / "standard-output.exr"
+            with called(str(target), "standard output"):
+                yield inputs, str(target)
+            if target.exists():
+                with target.open("rb") as file:
+                    shutil.copyfileobj(file, sys.stdout.buffer)
+                sys.stdout.buffer.flush()

@@ -4,13 +4,14 @@ import argparse
 from pathlib import Path
 
 from ngpt.cli.arguments import add_files, add_force, add_layers, add_untrusted, given_files
+from ngpt.cli.streams import standard_input
 from ngpt.io.exr import read
 from ngpt.io.rawlayers import planes, write_layers
 from ngpt.system.console import Console
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("stack", metavar="STACK", help=".exr file, of any renderer")
+    parser.add_argument("stack", metavar="STACK", help="image of any renderer; -: standard input")
     parser.add_argument("folder", metavar="FOLDER", type=Path, help="folder for NAME.f32 and layers.json")
     add_files(parser)
     add_layers(parser)
@@ -19,7 +20,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    stack = read(args.stack, dict(args.layer), args.untrusted, given_files(args))
-    write_layers(args.folder, planes(stack), args.force)
-    console.say(f"{args.stack} -> {args.folder}: {stack.width}x{stack.height}, {', '.join(stack.names)}")
+    with standard_input([args.stack]) as (source,):
+        stack = read(source, dict(args.layer), args.untrusted, given_files(args))
+        write_layers(args.folder, planes(stack), args.force)
+        console.say(f"{source} -> {args.folder}: {stack.width}x{stack.height}, {', '.join(stack.names)}")
     return 0

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 from ngpt.evaluation.config import Column, Config
 from ngpt.evaluation.keys import file_hash, library_hash
 from ngpt.evaluation.references import Reference
@@ -95,7 +95,8 @@ class Scorer:
 def absence(column: Column) -> str:
     """Why a column cannot be computed at all here, "" if it can."""
     if column.method not in METHODS:
-        return f"there is no method '{column.method}'; choose one of: {', '.join(METHODS)}"
+        meant = did_you_mean(column.method, METHODS)
+        return f"there is no method '{column.method}'; {meant}choose one of: {', '.join(METHODS)}"
     weights = column.options.get("weights", "")
     if weights and not Path(weights).is_file():
         return f"weights {weights}: no such file; train them first"

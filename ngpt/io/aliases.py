@@ -8,7 +8,7 @@ nest with dots, and layer names may hold spaces: ``ViewLayer.Denoising Albedo.R`
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
 
 
@@ -158,7 +158,10 @@ def resolve(
     overrides = dict(overrides or {})
     for name in overrides:
         if name not in LAYERS:
-            raise NgptError(f"{path}: --layer {name}=...: no layer is called '{name}'; use one of {', '.join(LAYERS)}")
+            meant = did_you_mean(name, LAYERS)
+            raise NgptError(
+                f"{path}: --layer {name}=...: no layer is called '{name}'; {meant}use one of {', '.join(LAYERS)}"
+            )
     found: Resolution = {}
     for layer in LAYERS.values():
         main = found["primal"].part if "primal" in found else None
@@ -173,10 +176,11 @@ def resolve(
                 break
         else:
             if layer.name in overrides:
+                meant = did_you_mean(overrides[layer.name], {group.name for group in groups})
                 wanted = f'--layer {layer.name}="{overrides[layer.name]}"'
                 raise NgptError(
                     f"{path}: {wanted} fits no layer with channels {' '.join(layer.channels)}; "
-                    f"the file holds {_listing(groups)}"
+                    f"{meant}the file holds {_listing(groups)}"
                 )
         if layer.name == "primal" and "primal" not in found:
             raise _no_primal(groups, path)

@@ -10,12 +10,12 @@ SHOWN = ("relMSE", "relMSE trimmed", "SMAPE", "PSNR", "SSIM", "FLIP")
 _WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 
 
-def available(height: int, width: int) -> tuple[list[str], list[str]]:
-    """The metrics of SHOWN for images of this size, and a line for each of those that cannot be computed here."""
+def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
+    """The metrics of SHOWN for images of this size, and why others cannot be computed here: name -> a line."""
     lacks = {name: missing() for name in SHOWN if (missing := METRICS[name].missing)}
     if min(height, width) < 11:
         lacks["SSIM"] = f"SSIM needs images of 11x11 pixels, and these are {width}x{height}"
-    return [name for name in SHOWN if not lacks.get(name)], [lack for lack in lacks.values() if lack]
+    return [name for name in SHOWN if not lacks.get(name)], {name: lack for name, lack in lacks.items() if lack}
 
 
 def judge(names: list[str], image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, float], dict[str, np.ndarray]]:

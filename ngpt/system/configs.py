@@ -3,7 +3,7 @@
 import os
 from pathlib import Path
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 
 # In an installed package they lie inside of it, in the repository beside it.
 _PACKAGE = Path(__file__).parents[1]
@@ -31,4 +31,7 @@ def find_config(name: str, kind: str) -> Path:
     stem, known = name.removesuffix(".toml"), names(kind)
     if stem in known:
         return FOLDER / f"{stem}.toml"
-    raise NgptError(f"{name}: cannot be read: no such file; configurations that come with ngpt: {', '.join(known)}")
+    meant = did_you_mean(stem, known)
+    raise NgptError(
+        f"{name}: cannot be read: no such file; {meant}configurations that come with ngpt: {', '.join(known)}"
+    )

@@ -82,11 +82,36 @@ def _check_address_space() -> None:
         )
 
 
+# Files that stand for what has no file, by path: what it is called in all that is said.
+_names: dict[str, str] = {}
+
+
+@contextmanager
+def called(path: str, name: str) -> Iterator[None]:
+    """Within the block messages and results say ``name`` for the file ``path``, and so do errors that leave it."""
+    _names[path] = name
+    try:
+        yield
+    except NgptError as error:
+        raise type(error)(by_names(str(error))) from error
+    finally:
+        del _names[path]
+
+
+def by_names(text: str) -> str:
+    """The text with the names of files that are ``called`` by others."""
+    for path, name in _names.items():
+        text = text.replace(path, name)
+    return text
+
+
 def printable(text: str) -> str:
     """One line of text as it may go to a terminal: what files call their things may hold sequences that control one.
 
-    Control characters, line breaks and marks of direction become what Python writes for them, ``\\x1b``.
+    Files go by what they are ``called``. Control characters, line breaks and marks of direction become what Python
+    writes for them, ``\\x1b``.
     """
+    text = by_names(text)
     if text.isprintable():
         return text
     return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)

@@ -7,7 +7,7 @@ from dataclasses import MISSING, Field, fields, is_dataclass
 from pathlib import Path
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, did_you_mean
 from ngpt.system.reading import read_text
 
 T = TypeVar("T")
@@ -93,7 +93,7 @@ def from_table(kind: type[T], values: Any, where: str) -> T:
     hints, read = get_type_hints(kind), {}
     for name, value in values.items():
         if name not in known:
-            raise NgptError(f"{where}: unknown key '{name}'; there are: {', '.join(known)}")
+            raise NgptError(f"{where}: unknown key '{name}'; {did_you_mean(name, known)}there are: {', '.join(known)}")
         try:
             read[name] = _converted(value, hints[name], f"{where}: [{name}]")
         except _OtherType:

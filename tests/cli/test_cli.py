@@ -132,7 +132,10 @@ def test_diff_tells_what_the_eye_sees_where_the_packages_are(tmp_path, rng, caps
     monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda name: None)
     assert main(["diff", a, b]) == 1
     output, errors = capsys.readouterr()
-    assert "SSIM" not in output and "SSIM needs scikit-image" in errors and "FLIP needs flip-evaluator" in errors
+    assert "SSIM" not in output and errors == "without SSIM and FLIP: --verbose says why\n"
+    assert main(["diff", a, b, "-v"]) == 1
+    errors = capsys.readouterr().err
+    assert "SSIM needs scikit-image" in errors and "FLIP needs flip-evaluator" in errors
 
 
 def test_diff_judges_the_result_of_a_result_file(tmp_path, stack_file):
@@ -167,10 +170,31 @@ def test_info_prints_the_aliases(capsys):
         (["denoise", "{text}", "-o", "{dir}/o.exr"], "notes.exr: not an OpenEXR file"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l1"], "method 'l1' needs layers 'dx' and 'dy'"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx=gx"], "fits no layer"),
-        (["denoise", "{plain}", "-o", "{dir}/o.tiff"], "let the name end in .exr or .png"),
-        (["denoise", "{plain}", "-o", "{dir}/no/o.exr"], "does not exist; create it first"),
+        (["denoise", "{plain}", "-o", "{dir}/o.tiff"], "let the name end in .exr .pfm .png"),
+        (["denoise", "{plain}", "-o", "{text}/o.exr"], "notes.exr: cannot be made: "),
+        (["merge", "{plain}", "-o", "{text}/o.exr"], "notes.exr: cannot be made: "),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "dx"], "'dx' is not of the form NAME=VALUE"),
-        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "l3"], "invalid choice: 'l3'"),
+        (
+            ["denoise", "{plain}", "-o", "{dir}/o.exr", "--method", "odin"],
+            "'odin'; did you mean 'oidn'? choose one of: auto",
+        ),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "-m", "l2", "-O", "alhpa=1"], "did you mean 'alpha'?"),
+        (["denoise", "{plain}", "-o", "{dir}/o.exr", "--layer", "albdo=x"], "did you mean 'albedo'? use one of"),
+        (
+            ["denoise", "{plain}", "--methd", "l2"],
+            "argument '--methd'; did you mean '--method'? see `ngpt denoise --help`",
+        ),
+        (["denoise", "{plain}", "--wieghts=x"], "argument '--wieghts=x'; did you mean '--weights'?"),
+        (["unpack", "{plain}", "-o", "x"], "see `ngpt unpack --help`"),
+        (["denois", "{plain}"], "there is no verb 'denois'; did you mean 'denoise'? verbs: denoise, info"),
+        (["info", "ngpt-fst"], "did you mean 'ngpt-fast'?"),
+        (["info", "difuse"], "did you mean 'diffuse'?"),
+        (["render", "difuse"], "did you mean 'diffuse'?"),
+        (["render", "diffuse", "--sampler", "gtp"], "did you mean 'gpt'?"),
+        (["demo", "--scene", "difuse"], "did you mean 'diffuse'?"),
+        (["train", "--config", "papr"], "did you mean 'paper'?"),
+        (["train", "--config", "tiny", "--set", "run.stepz=3"], "unknown key 'stepz'; did you mean 'steps'?"),
+        (["evaluate", "--config", "eval-mian", "--out", "x"], "did you mean 'eval-main'?"),
         (["denoise", "{plain}", "{plain2}", "-o", "{text}"], "is a file; the results of 2 stacks need a folder"),
         (["denoise", "{plain}", "-o", "{dir}/o.exr", "--ref", "{small}"], "5x4 and 2x1"),
         (["diff", "{plain}", "{small}"], "5x4 and 2x1"),
@@ -179,7 +203,7 @@ def test_info_prints_the_aliases(capsys):
         (["render", "diffuse", "--size", "0x5"], "'0x5' is not a size"),
         (["render", "diffuse", "--spp", "0"], "'0' is not a whole number of 1 or more"),
         (["render", "diffuse", "-o", "{dir}/s.png"], "let the name end in .exr"),
-        (["frobnicate"], "invalid choice: 'frobnicate'"),
+        (["frobnicate"], "there is no verb 'frobnicate'; verbs: denoise"),
         ([], "required: VERB"),
     ],
 )
@@ -259,7 +283,7 @@ def test_render_errors(renderer, tmp_path, capfd, monkeypatch):
         (2, ["render", "diffuse", "--sampler", "best"], "unknown sampler 'best'"),
         (1, ["render", "diffuse", "--size", "30000x30000"], "; render a smaller image"),
         (2, ["render", "t.xml", "--spp", "9999999999"], "9999999999 samples per pixel"),
-        (1, ["render", "diffuse", "-o", "no/s.exr"], "the folder no does not exist"),
+        (1, ["render", "diffuse", "-o", "s.xml/s.exr"], "s.xml: cannot be made: "),
         (1, ["info", "moving.xml"], "animated transforms"),
         (1, ["render", "moving.xml"], "animated transforms"),
         (2, ["demo", "--scene", "attic"], "no built-in scene is called 'attic'"),

@@ -161,3 +161,91 @@ def test_on_a_terminal_there_is_a_bar_and_above_it_a_line_for_each_frame(frames,
     assert on_terminal("denoise", frames, "-o", tmp_path / "quiet", "-m", "l2", "-q") == ("", 0)
     seen, status = on_terminal("denoise", frames / "0.exr", "-o", tmp_path / "one.exr", "-m", "l2")
     assert status == 0 and "1/1" in seen
+
+
+@pytest.mark.parametrize(
+    ("name", "output", "found"),
+    [
+        ("shot.%d.exr", "c.%03d.exr", {"c.001.exr", "c.002.exr", "c.010.exr"}),
+        ("shot.$F.exr", "new/c.$F2.exr", {"c.01.exr", "c.02.exr", "c.10.exr"}),
+        ("shot.<frame>.exr", "new/", {"shot.1.exr", "shot.2.exr", "shot.10.exr"}),
+        ("pad.%04d.exr", "c.####.exr", {"c.0001.exr", "c.0002.exr", "c.12345.exr"}),
+        ("pad.####.exr", "new/", {"pad.0001.exr", "pad.0002.exr", "pad.12345.exr"}),
+        ("pad.$F4.exr", "c.%d.pfm", {"c.1.pfm", "c.2.pfm", "c.12345.pfm"}),
+        ("pad.{frame:04d}.exr", "c.<frame>.exr", {"c.1.exr", "c.2.exr", "c.12345.exr"}),
+        ("%02d/beauty.%02d.exr", "c.%d.exr", {"c.7.exr", "c.8.exr"}),
+    ],
+)
+def test_names_of_frames_are_the_frames_there_are(tmp_path, monkeypatch, capsys, name, output, found):
+    monkeypatch.chdir(tmp_path)
+    image = np.ones((4, 5, 3), np.float32)
+    names = [f"shot.{i}.exr" for i in (10, 1, 2)] + [f"pad.{i:04d}.exr" for i in (12345, 1, 2)]
+    for file in (*names, "shot.2_denoised.exr", "pad.01.exr", "other.0001.exr"):
+        ngpt.write(file, image)
+    for frame, other in ((7, 7), (8, 8), (9, 10)):
+        os.makedirs(f"{frame:02d}")
+        ngpt.write(f"{frame:02d}/beauty.{other:02d}.exr", image)
+    monkeypatch.setattr("ngpt.cli.denoise.RESULT_SUFFIX", "_denoised")
+    assert main(["denoise", name, "-o", output, "-m", "primal"]) == 0
+    told = [line.split()[1] for line in capsys.readouterr().err.splitlines() if line.startswith("[")]
+    number = [int("".join(filter(str.isdigit, os.path.basename(path)))) for path in told]
+    assert number == sorted(number) and len(told) == len(found)
+    written = {path.name for path in (tmp_path / "new" if output.startswith("new") else tmp_path).glob("*")}
+    assert found <= written
+
+
+def test_names_of_frames_that_are_not_there_or_have_no_number(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    image = np.ones((12, 14, 3), np.float32)
+    for name in ("a.exr", "b.%04d.exr", "c.0001.exr", "c.0002.exr", "d.1.exr", "d.2.exr"):
+        ngpt.write(name, image)
+    for words, status, said in (
+        (["denoise", "no.%04d.exr"], 1, "no.%04d.exr: no frames of that name are there; check the name"),
+        (["picture", "no.####.exr", "-o", "f.webp"], 1, "no.####.exr: no frames of that name"),
+        (["denoise", "a.exr", "-o", "x.%04d.exr"], 2, "a.exr: has no number, which x.%04d.exr asks for"),
+        (["denoise", "b.%04d.exr", "-m", "primal"], 0, "[1/1] b.%04d.exr -> b.%04d_denoised.exr"),
+        (["picture", "c.####.exr", "-o", "pics/p.%d.png"], 0, "c.####.exr -> pics/p.%d.png: 2 frames"),
+        (["report", "c.%04d.exr", "--ref", "d.%d.exr"], 0, "flicker is nan: no frame after the first has motion"),
+        (["report", "c.%04d.exr", "d.%d.exr", "--force"], 0, "report.html: open it"),
+        (["report", "c.%04d.exr", "a.exr", "--force"], 1, "a.exr: is no folder, and others are"),
+    ):
+        assert main(words) == status, words
+        assert said in capsys.readouterr().err
+    assert {path.name for path in (tmp_path / "pics").iterdir()} == {"p.1.png", "p.2.png"}
+
+
+def test_folders_win_over_patterns_by_their_names(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    image = np.ones((4, 5, 3), np.float32)
+    for file in ("dir[1]/a.exr", "dir[1]/x[2]/b.exr", "dir1/c.exr"):
+        os.makedirs(os.path.dirname(file), exist_ok=True)
+        ngpt.write(file, image)
+    for pattern, found in (
+        ("dir[1]/*.exr", {"a.exr"}),
+        ("dir[1]/x[2]/?.exr", {"b.exr"}),
+        ("dir[1]/**/*.exr", {"a.exr", "b.exr"}),
+        ("dir[2-9]*/../dir?/c.exr", None),
+        (str(tmp_path / "dir[1]" / "*.exr"), {"a.exr"}),
+    ):
+        assert main(["denoise", pattern, "-o", "out", "-m", "primal", "--force"]) == (1 if found is None else 0)
+        if found is not None:
+            assert {path.name for path in (tmp_path / "out").iterdir()} == found
+            for path in (tmp_path / "out").iterdir():
+                path.unlink()
+
+
+def test_a_file_that_is_there_names_both_ways_out_and_single_outputs_get_their_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    ngpt.write("a.exr", full_stack(12, 14))
+    for words in (
+        ["denoise", "a.exr", "-m", "primal", "-o", "1/2/a.exr"],
+        ["picture", "a.exr", "-o", "2/a.png"],
+        ["report", "a.exr", "-o", "3/a.html"],
+        ["train", "--config", "tiny", "--init", "5/a.toml"],
+    ):
+        assert main(words) == 0
+        capsys.readouterr()
+        assert main(words) == 1
+        said = capsys.readouterr().err
+        assert "exists already; pass --force" in said
+        assert ("or --skip-existing" in said) == (words[0] == "denoise")

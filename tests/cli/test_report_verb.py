@@ -112,8 +112,9 @@ def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkey
     write(tmp_path / "a.exr", image * 4)
     write(tmp_path / "truth.exr", image)
     words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
-    assert main(["report", *words]) == 0
+    assert main(["report", *words, "--verbose"]) == 0
     output, messages = capfd.readouterr()
+    assert "without SSIM and FLIP" in messages
     assert f"FLIP needs flip-evaluator: {install_command('peers')}" in messages and "FLIP" not in output
     assert "a.exr: 2.0 stops brighter than" in messages
     assert facts(tmp_path / "page.html")["maps"] == []
@@ -123,6 +124,8 @@ def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
     write(tmp_path / "a.exr", image[:5, :7])
     words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]
     assert main(["report", *words]) == 0
+    assert "without SSIM: --verbose says why" in capfd.readouterr().err
+    assert main(["report", *words, "-v", "--force"]) == 0
     assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err
 
 

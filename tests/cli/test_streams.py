@@ -3,6 +3,7 @@
 import io
 import subprocess
 import sys
+import tempfile
 
 import numpy as np
 import pytest
@@ -41,8 +42,9 @@ def test_one_end_may_be_a_file(noisy, tmp_path, monkeypatch, capfd):
     [
         (["-"], "standard input has no name to go by"),
         (["-", "noisy.exr", "-o", "x/"], "'-' is one stack, and 2 are given"),
+        (["noisy.exr", "noisy.exr", "-o", "-"], "'-' is one result, and 2 stacks are given"),
         (["noisy.exr", "-o", "-", "--json"], "both want standard output"),
-        (["-", "-o", "-"], "standard-input.exr: is empty"),
+        (["-", "-o", "-"], "error: standard input: is empty"),
     ],
 )
 def test_what_makes_no_sense_is_said_and_nothing_is_written(noisy, arguments, complaint, monkeypatch, capfd):
@@ -50,3 +52,39 @@ def test_what_makes_no_sense_is_said_and_nothing_is_written(noisy, arguments, co
     assert main(["denoise", *arguments]) != 0
     output, errors = capfd.readouterr()
     assert complaint in errors and output == ""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["info", "-"], "file: standard input"),
+        (["info", "-", "--json"], '"file": "standard input"'),
+        (["diff", "-", "noisy.exr"], "agree"),
+        (["diff", "noisy.exr", "-"], "agree"),
+        (["picture", "-", "-o", "made/a.png"], "standard input -> made/a.png: "),
+        (["report", "-", "-o", "made/a.html"], "made/a.html: open it"),
+        (["report", "noisy.exr", "--ref", "-", "-o", "made/a.html"], "made/a.html: open it"),
+        (["unpack", "-", "made"], "standard input -> made: "),
+        (["denoise", "-", "-o", "made/a.exr", "-m", "primal", "--untrusted"], "standard input -> made/a.exr: primal"),
+    ],
+)
+def test_every_verb_that_reads_one_file_takes_it_by_standard_input(
+    noisy, tmp_path, monkeypatch, capfd, arguments, said
+):
+    data = (tmp_path / noisy).read_bytes()
+    for content, status, message in (
+        (data, 0, said),
+        (b"", 1, "ngpt: error: standard input: is empty"),
+        (data[:-9], 1, "ngpt: error: standard input: damaged"),
+    ):
+        monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO(content)))
+        assert main([*arguments, *(["--force"] if arguments[0] not in ("info", "diff") else [])]) == status
+        output, errors = capfd.readouterr()
+        assert message in output + errors and tempfile.gettempdir() + "/ngpt-" not in output + errors
+    for page in tmp_path.glob("made/*.html"):
+        assert tempfile.gettempdir() + "/ngpt-" not in page.read_text()
+
+
+def test_standard_input_is_one_image(noisy, capfd):
+    assert main(["diff", "-", "-"]) == 2
+    assert "'-' is one image, and is given 2 times" in capfd.readouterr().err

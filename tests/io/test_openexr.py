@@ -252,8 +252,8 @@ def subsampled(path):
         (lambda path: path.mkdir(), "is a directory"),
         (lambda path: path.touch(), "is empty"),
         (
-            lambda path: path.write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(90)),
-            "not an OpenEXR file (it starts with b'\\x89PNG')",
+            lambda path: path.write_bytes(b"\x93NUMPY" + bytes(90)),
+            "not an OpenEXR file, nor PFM, Radiance HDR, PNG, TIFF or JPEG (it starts with b'\\x93NUM')",
         ),
         (lambda path: path.write_bytes(b"PF\n4 3\n-1.0\n" + bytes(144)), "not an OpenEXR file"),
         (lambda path: path.write_bytes(b"#?RADIANCE\n"), "not an OpenEXR file"),

@@ -6,7 +6,7 @@ https://www.w3.org/TR/png-3/; ``ngpt.report.png`` is the encoder.
 import struct
 import zlib
 from collections.abc import Iterator
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 
@@ -153,8 +153,8 @@ def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
             across, down = np.abs(above - corner), np.abs(left - corner)
             both = np.abs(left + above - 2 * corner)
             nearest = np.where((across <= down) & (across <= both), left, np.where(down <= both, above, corner))
-            guess = np.choose(kind, (0, left, above, (left + above) >> 1, nearest))
-            here[...] = (here + guess) & 255
+            guesses: Any = (0, left, above, (left + above) >> 1, nearest)
+            here[...] = (here + np.choose(kind, guesses)) & 255
     return np.ascontiguousarray(out[1:, 1:].astype(np.uint8).reshape(rows, -1))
 
 

@@ -1,0 +1,58 @@
+"""Names of a shot's frames as studios write them: ``shot.%04d.exr``, ``shot.####.exr``, ``shot.$F4.exr``, ``<frame>``.
+
+``{frame:04d}``, which ``ngpt render`` takes, is one of them. The number after % and $F, and how many # there are, is
+the least number of digits. A file of that very name wins, as with other patterns.
+"""
+
+import glob
+import os
+import re
+from pathlib import Path
+
+from ngpt.errors import NgptError, WrongUse
+
+_FIELD = re.compile(r"%(?:0(\d))?d|(##+)|\$F(\d?)|<frame>|\{frame(?::0(\d)d)?\}")
+
+
+def varies(name: str) -> bool:
+    """Whether a name is one for each frame."""
+    return bool(_FIELD.search(name)) and not os.path.exists(name)
+
+
+def frames_named(name: str) -> dict[int, Path]:
+    """The files there are of a name that varies: number -> file, in order. Raises NgptError where there are none."""
+    pieces, form, end = [], "", 0
+    for field in _FIELD.finditer(name):
+        pieces.append(name[end : field.start()])
+        form += re.escape(pieces[-1]) + rf"(-?\d{{{max(_digits(field), 1)},}})"
+        end = field.end()
+    pieces.append(name[end:])
+    form += re.escape(pieces[-1])
+    found = {}
+    for path in glob.glob("*".join(map(glob.escape, pieces))):
+        match = re.fullmatch(form, path)
+        # All numbers in a name are the same one.
+        if match and len(numbers := set(map(int, match.groups()))) == 1:
+            found[numbers.pop()] = Path(path)
+    if not found:
+        raise NgptError(f"{name}: no frames of that name are there; check the name")
+    return dict(sorted(found.items()))
+
+
+def named(name: str, frame: int) -> str:
+    """A name that varies, for one frame."""
+    return _FIELD.sub(lambda field: f"{frame:0{_digits(field)}d}" if _digits(field) else str(frame), name)
+
+
+def number_of(path: Path, wanted: str) -> int:
+    """The frame that a file is by the last number in its name. Raises WrongUse where there is none for ``wanted``."""
+    numbers = re.findall(r"\d+", path.stem)
+    if not numbers:
+        raise WrongUse(f"{path}: has no number, which {wanted} asks for; name the output without")
+    return int(numbers[-1])
+
+
+def _digits(field: re.Match) -> int:
+    """The least number of digits, 0 where none is told."""
+    printf, hashes, houdini, ours = field.groups()
+    return len(hashes) if hashes else int(printf or houdini or ours or 0)
