@@ -76,7 +76,7 @@ class _Parser(argparse.ArgumentParser):
             raise argparse.ArgumentError(action, text)
 
     def error(self, message: str) -> NoReturn:
-        Console().error(f"{message}; see `{self.prog} --help`")
+        Console().error(f"{message}{'' if message.endswith('?') else ';'} see `{self.prog} --help`")
         sys.exit(2)
 
 
@@ -146,7 +146,9 @@ def door(verb: str, program: str, arguments: list[str] | None = None, name: str 
 def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
     """Of all ``verbs``, with the arguments of the one that is called."""
     if called and called not in verbs:
-        meant = did_you_mean(called, verbs) or (f"{no_renderer()}; " if verbs.keys() == VERBS.keys() else "")
+        meant = did_you_mean(called, verbs)
+        if not meant and verbs.keys() == VERBS.keys():
+            raise WrongUse(f"there is no verb '{called}' here; {no_renderer()}")
         raise WrongUse(f"there is no verb '{called}'; {meant}verbs: {', '.join(verbs)}; see `ngpt --help`")
     parser = _Top(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
     parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
@@ -189,7 +191,7 @@ def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[s
     args, unknown = parser.parse_known_args(words)
     if unknown:
         meant = did_you_mean(unknown[0].partition("=")[0], args.parser._option_string_actions)
-        raise WrongUse(f"unrecognized argument '{unknown[0]}'; {meant}see `{args.parser.prog} --help`")
+        args.parser.error(f"unrecognized argument '{unknown[0]}'{f'; {meant}' if meant else ''}".rstrip())
     args.command, verb = f"{program} {shlex.join(words)}", verbs[args.verb]
     try:
         with logged(args.verbose, args.quiet):

@@ -12,6 +12,7 @@ import json
 import os
 import threading
 import time
+from html import escape
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -25,7 +26,10 @@ ADDRESS, PORT = "127.0.0.1", 8642
 _GONE, _FAREWELL = 5.0, 2.5
 _FIRST = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="1">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="dark">
-<title>ngpt render</title><p>Rendering. The first image comes after the first passes.</p></html>"""
+<title>{title}</title><body style="margin: 2em; font: 15px/1.5 sans-serif; background: #191919; color: #e0e0e0">
+<h1 style="font-size: 1.3em">{title}</h1><p><strong>{line}</strong></p>
+<p>The first image comes after the first passes. Kernels are compiled before them, which takes some
+seconds.</p><p><code>{command}</code></p></body></html>"""
 _HEADERS = {
     "Cache-Control": "no-store",
     "X-Content-Type-Options": "nosniff",
@@ -43,7 +47,7 @@ class LivePage:
     def __init__(self, title: str, command: str, port: int = PORT):
         self.title, self.command = title, command
         self.enough, self.ended = False, False
-        self.number, self.text, self.line = 0, _FIRST, "rendering"
+        self.number, self.text, self.line = 0, "", "rendering"
         self.exposure: float | None = None
         self._asked, self._told_end = -_GONE, threading.Event()
         try:
@@ -85,11 +89,15 @@ class LivePage:
         self.server.shutdown()
         self.server.server_close()
 
+    def _first(self) -> str:
+        """The page while there are no images."""
+        return _FIRST.format(title=escape(self.title), line=escape(self.line), command=escape(self.command))
+
     def answer(self, path: str) -> tuple[str, str] | None:
         """Type and text of what there is at ``path``, None if there is nothing."""
         if path == "/":
             self._asked = time.monotonic()
-            return "text/html", self.text
+            return "text/html", self.text or self._first()
         if path == "/status":
             self._asked = time.monotonic()
             news = {"number": self.number, "text": self.line, "ended": self.ended}

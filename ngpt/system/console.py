@@ -243,7 +243,7 @@ class _Pace:
             self.past.append((self.elapsed, done))
         words = [f"{pace:{'.0f' if pace >= 100 else '.3g'}} {self.unit}/s"] if self.rate and pace else []
         if pace and done < total:
-            words.append(f"about {_span((total - done) / pace)} left")
+            words.append(f"about {span((total - done) / pace)} left")
         return words
 
 
@@ -252,7 +252,7 @@ def brief(value: float) -> str:
     return f"{value:.2g}" if value < 10 else f"{value:.0f}"
 
 
-def _span(seconds: float) -> str:
+def span(seconds: float) -> str:
     """A duration, roughly."""
     for unit, size in (("s", 1), ("min", 60)):
         if seconds < 100 * size:

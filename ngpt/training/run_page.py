@@ -18,6 +18,7 @@ from ngpt.errors import NgptError
 from ngpt.report.curves import curves
 from ngpt.report.document import document
 from ngpt.report.markup import plain_table, plots_html
+from ngpt.system.console import span
 from ngpt.system.files import atomic_output
 from ngpt.system.records import read_json
 from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
@@ -131,7 +132,7 @@ def page(runs: list[Run], command: str = "") -> str:
 
 def _overview(runs: list[Run]) -> list[list[str]]:
     """A row for each run: how far, how good, how fast."""
-    head = ["run", "steps", "best relMSE", "at step", "over the input's", "over the base's", "last relMSE", "hours"]
+    head = ["run", "steps", "best relMSE", "at step", "over the input's", "over the base's", "last relMSE", "time"]
     rows = [[*head, "steps/s", "memory, MiB", "parameters"]]
     least = min((run.best["relMSE"] for run in runs if run.best), default=math.nan)
     for run in runs:
@@ -140,7 +141,7 @@ def _overview(runs: list[Run]) -> list[list[str]]:
         row = [run.name, f"{run.done:,} of {run.steps:,}" if run.steps else f"{run.done:,}"]
         row += [_number(score) + mark, _number(best.get("step", math.nan))]
         row += [_number(score / best[f"relMSE {of}"]) if best.get(f"relMSE {of}") else "-" for of in ("primal", "base")]
-        row += [_number(run.last("relMSE")), _number(run.last("seconds") / 3600)]
+        row += [_number(run.last("relMSE")), _time(run.last("seconds"))]
         row += [_number(run.last("steps/s")), _number(run.last("memory MiB"))]
         rows.append([*row, f"{run.record['parameters']:,}" if "parameters" in run.record else "-"])
     return rows
@@ -153,7 +154,7 @@ def _state(run: Run) -> str:
     if run.done >= run.steps:
         return "Finished. The weights with the least error are in best.safetensors, the last in weights.safetensors."
     left, rate = run.steps - run.done, run.last("steps/s")
-    time = f", about {left / rate / 3600:.2g} hours at {rate:.3g} steps/s" if rate > 0 else ""
+    time = f", about {span(left / rate)} at {rate:.3g} steps/s" if rate > 0 else ""
     return f"{left:,} steps to go{time}. This page is read again every {REFRESH} seconds while it is open."
 
 
@@ -165,7 +166,8 @@ def _plots(runs: list[Run]) -> dict[str, str]:
         plots = {"relMSE of the views held out": curves("steps", error)}
     else:
         plots = {"relMSE of the views held out": curves("steps", {run.name: run.line("relMSE") for run in runs})}
-        plots["the same over hours"] = curves("hours", {run.name: _over_hours(run) for run in runs})
+        unit, seconds = ("hours", 3600.0) if any(run.last("seconds") >= 3600 for run in runs) else ("minutes", 60.0)
+        plots[f"the same over {unit}"] = curves(unit, {run.name: _over_time(run, seconds) for run in runs})
     for title, name in (
         ("loss", "loss"),
         ("norm of the gradient", "gradient norm"),
@@ -177,14 +179,19 @@ def _plots(runs: list[Run]) -> dict[str, str]:
     return {title: svg for title, svg in plots.items() if svg}
 
 
-def _over_hours(run: Run) -> list[tuple[float, float]]:
-    """relMSE over the hours that the run took until then."""
-    hours, points = 0.0, []
+def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
+    """relMSE over the time that the run took until then, in units of so many seconds."""
+    seconds, points = 0.0, []
     for entry in run.entries:
-        hours = entry.get("seconds", 3600 * hours) / 3600
+        seconds = entry.get("seconds", seconds)
         if "relMSE" in entry:
-            points.append((hours, entry["relMSE"]))
+            points.append((seconds / unit, entry["relMSE"]))
     return points
+
+
+def _time(seconds: float) -> str:
+    """A duration, "-" where none is told."""
+    return span(seconds) if math.isfinite(seconds) else "-"
 
 
 # --- pictures --------------------------------------------------------------------------------------------------------

@@ -48,14 +48,18 @@ def test_a_verb_imports_no_other(tmp_path):
         "main(['merge', 'nowhere.exr', '-o', sys.argv[1]])\n"
         "print(*sorted(m for m in sys.modules if m.startswith('ngpt.cli.')))"
     )
-    assert run_python(code, str(tmp_path / "x.exr")).stdout.split() == ["ngpt.cli.arguments", "ngpt.cli.merge"]
+    assert run_python(code, str(tmp_path / "x.exr")).stdout.split() == [
+        "ngpt.cli.arguments",
+        "ngpt.cli.framenames",
+        "ngpt.cli.merge",
+    ]
 
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_wrong_option_is_said_in_one_line(verb, capfd):
     status, output, errors = stopped(main, [verb, "--nonsense"], capfd)
     assert status == 2 and output == "" and errors.count("\n") == 1
-    assert re.match(rf"ngpt: error: .*; see `ngpt( {verb})? --help`\n", errors)
+    assert re.match(rf"ngpt: error: .*[;?] see `ngpt( {verb})? --help`\n", errors)
 
 
 @pytest.mark.parametrize("verb", DOORS)

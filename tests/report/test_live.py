@@ -49,6 +49,7 @@ def test_nobody_but_this_machine_is_served_and_nothing_but_three_paths(page):
     assert status == 200 and "first image" in text and page.watched
     assert headers["Cache-Control"] == "no-store" and headers["X-Frame-Options"] == "DENY"
     page.tell("64 of 256 <b>")
+    assert "64 of 256 &lt;b&gt;" in asked(page, "GET", "/")[2]
     assert json.loads(asked(page, "GET", "/status")[2]) == {"number": 0, "text": "64 of 256 <b>", "ended": False}
     for method, path in (("GET", "/etc/passwd"), ("GET", "/../live.py"), ("GET", "/enough"), ("POST", "/")):
         origin = {"Origin": page.url.rstrip("/")}

@@ -27,5 +27,8 @@ def test_a_name_is_found_from_anywhere_and_a_file_comes_first(tmp_path, monkeypa
 @pytest.mark.parametrize("name", ["nope", "", "data-tiny", "configs/nope.toml", "a\0b", "x" * 5000])
 def test_what_is_neither_is_told_what_there_is(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(NgptError, match=r"no such file; configurations that come with ngpt: .*combine, .*fast, .*tiny"):
+    with pytest.raises(
+        NgptError,
+        match=r"no such file; (did you mean .*\? )?configurations that come with ngpt: .*combine, .*fast, .*tiny",
+    ):
         find_config(name, TRAINING)

@@ -107,7 +107,10 @@ def test_a_table_becomes_a_dataclass():
     [
         (3, "h.toml = 3: must be a table"),
         ({}, "h.toml: lacks 'door'"),
-        (DOOR | {"flours": 3}, "h.toml: unknown key 'flours'; there are: door, floors, height, "),
+        (
+            DOOR | {"flours": 3},
+            "h.toml: unknown key 'flours'; did you mean 'floors'? there are: door, floors, height, ",
+        ),
         (DOOR | {"floors": 2.5}, "h.toml: floors = 2.5: must be a whole number, like 2"),
         (DOOR | {"floors": True}, "h.toml: floors = True: must be a whole number, like 2"),
         (DOOR | {"floors": 2**63}, "h.toml: floors = 9223372036854775808: must be a whole number, like 2"),

@@ -99,7 +99,8 @@ def test_runs_are_compared(tmp_path, capsys, monkeypatch):
         made(tmp_path / name, rate=rate).run()
     assert main(["report", "slow", "fast", "-o", "both.html"]) == 0
     text = (tmp_path / "both.html").read_text()
-    assert "2 training runs" in text and "the same over hours" in text
+    assert "2 training runs" in text and "the same over minutes" in text
+    assert re.search(r"<td>\d+ s</td>", text)
     differ = text.partition("Settings that differ")[2].partition("</table>")[0]
     assert re.findall(r'scope="row">([^<]*)', differ) == ["optimizer.learning_rate"]
     assert text.count("(least)") == 1
