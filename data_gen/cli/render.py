@@ -271,4 +271,4 @@ def shot(args: argparse.Namespace, console: Console) -> int:
 
 
 def ending() -> None:
-    Console().say("interrupted: ending with this pass; press Ctrl-C again to discard it all")
+    Console().say("interrupted: ending with this pass; Ctrl-C, or a second signal, discards it all")

@@ -99,6 +99,7 @@ def test_runs_are_compared(tmp_path, capsys, monkeypatch):
         made(tmp_path / name, rate=rate).run()
     assert main(["report", "slow", "fast", "-o", "both.html"]) == 0
     text = (tmp_path / "both.html").read_text()
+    assert ".plot img { filter: invert" in text  # charts are made for white paper, and the page is dark
     assert "2 training runs" in text and "the same over minutes" in text
     assert re.search(r"<td>\d+ s</td>", text)
     differ = text.partition("Settings that differ")[2].partition("</table>")[0]
