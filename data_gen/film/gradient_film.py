@@ -8,6 +8,7 @@ import numpy as np
 
 from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
+from data_gen.film.nets import split
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
@@ -29,8 +30,9 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
-# Per strand, of samples before: double means of 15 channels, and counts of all names
-_HALVES_BYTES = 15 * 8 + 10 * 8
+# Per strand, of two sets of earlier samples: single means of 15 channels, and counts of the five names they belong to,
+# with the number of bits
+_HALVES_BYTES = 2 * 15 * 4 + 5 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
@@ -309,33 +311,43 @@ class GradientFilm:
         sum of ``terms``: name, which pixels, factor."""
         if not self.net:
             return variance
-        seen = sum(factor * self._image(self._halves(name))[pixels] for name, pixels, factor in terms)
-        n = int(self.samples_each.max())
-        of_one_net = (self.blocks if self.batches else n) if n <= self.net else 0
+        contrast = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
         where = terms[0][1]
         claimed = variance.copy()
-        claimed[where] *= claims.factors(seen, variance[where], of_one_net)
+        samples = self._image(self._numbers)[where][..., 0]
+        claimed[where] *= claims.factors(contrast, variance[where], samples, self._net_of_numbers)
         return claimed
 
-    def _halves(self, name: str) -> np.ndarray:
-        """The later samples of each pixel against the earlier ones, (pixels, C): what has the variance of the mean as
-        its expected square where both are independent."""
+    @property
+    def _numbers(self) -> np.ndarray:
+        """Of each pixel, how many values variances are over, (pixels): its samples, or its batches."""
+        return np.full(self.pixels, self.blocks) if self.batches else self.samples_each
+
+    @property
+    def _net_of_numbers(self) -> int:
+        """How many of these values the first round of points has, a power of two: a batch is a block of points."""
+        net = self.net * self.blocks // self.samples if self.batches else self.net
+        return 1 << max(net.bit_length() - 1, 0)
+
+    def _contrast(self, name: str) -> np.ndarray:
+        """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it."""
         moments, shape = self.moments[name], (self.strands, self.pixels)
-        counts, earlier, bits = (
-            np.array(field, np.int64).reshape(shape) for field in (moments.count, moments.earlier, moments.bits)
-        )
-        # Strands that have no sample of the last part have all of theirs before it.
-        old = bits < bits.max(axis=0)
-        earlier = np.where(old, counts, earlier)
-        n, n1 = counts.sum(axis=0), earlier.sum(axis=0)
+        earlier = moments.earlier[0]
+        counts = [np.array(each, np.int64).reshape(shape) for each in (*earlier.counts[::-1], moments.count)]
+        bits = np.array(earlier.bits, np.int64).reshape(shape)
+        numbers, kind = np.unique(self._numbers, return_inverse=True)
+        splits = np.array([split(max(int(n), 2)) for n in numbers])[kind]
+        # The samples of a strand whose numbers are less than ``splits``: all, or as many as one of ``earlier``.
+        which = np.clip(np.log2(splits).astype(np.int64) + 2 - bits, 0, 2)
+        before, n = np.choose(which, counts), counts[-1].sum(axis=0)
+        n1 = before.sum(axis=0)
         columns = []
         with np.errstate(invalid="ignore", divide="ignore"):
-            for mean, before in zip(moments.mean, moments.before, strict=True):
-                means, befores = np.array(mean).reshape(shape), np.array(before).reshape(shape)
-                befores = np.where(old, means, befores)
-                first = (earlier * befores).sum(axis=0) / n1
+            for channel in zip(*earlier.means[::-1], moments.mean, strict=True):
+                means = [np.array(each, np.float64).reshape(shape) for each in channel]
+                first = (before * np.choose(which, means)).sum(axis=0) / n1
                 # last - first, times sqrt(n1 (n - n1)) / n
-                columns.append(((counts * means).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
+                columns.append(((counts[-1] * means[-1]).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
         return np.stack(columns, axis=-1)
 
     def _image(self, columns: np.ndarray) -> np.ndarray:

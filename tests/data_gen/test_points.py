@@ -233,14 +233,29 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
             assert 0.8 < seen.ravel()[quiet].mean() / told.ravel()[quiet].mean() < 1.25, layer
 
 
-def test_the_law_of_one_net(renderer):
-    from data_gen.film.claims import _of_one_net
+@pytest.mark.parametrize("net", [1, 16, 64])
+def test_laws_are_sums_over_pairs_of_samples(net):
+    """Of any number of samples: covariances of all pairs, one by one."""
+    from data_gen.film.nets import RATES, law, split
 
-    for a, near in ((1.0, 1e-9), (1.2, 0.1), (1.5, 1e-9), (2.0, 0.4)):
-        for n in (8, 16, 64):
-            halves = (2**a - 1) * (n - 1) / (n**a - 1)
-            assert np.isclose(_of_one_net(halves, n), n ** (1 - a), rtol=near)
-    assert _of_one_net(0.5, 2) == 0.5
+    def covariance(i, j):
+        first, size = (0, net) if i < net else (1 << i.bit_length() - 1,) * 2
+        if not first <= j < first + size:
+            return 0 * RATES
+        together = 1 << ((i - first) ^ (j - first)).bit_length()
+        return 2 * together**-RATES - (together // 2) ** -RATES if together > 1 else 1 + 0 * RATES
+
+    for n in (2, 3, 5, 16, 17, 31, 48, 65):
+        pairs = np.array([[covariance(i, j) for j in range(n)] for i in range(n)])
+        n1 = split(n)
+        assert n / 3 <= n1 <= 2 * n / 3
+        weights = np.where(np.arange(n) < n1, -1 / n1, 1 / (n - n1)) * np.sqrt(n1 * (n - n1)) / n
+        variance = pairs.mean(axis=(0, 1))
+        claimed = (1 - variance) / (n - 1)
+        assert np.allclose(law(n, net).truth, variance / claimed)
+        assert np.allclose(law(n, net).seen, np.einsum("i,j,ijr->r", weights, weights, pairs) / claimed)
+        # A rate can be read off: what is seen falls with it.
+        assert (np.diff(law(n, net).seen) < 1e-9).all()
 
 
 # ------------------------- Lamps -------------------------
