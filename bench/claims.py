@@ -17,6 +17,7 @@ import argparse
 import os
 from collections.abc import Iterator
 from copy import copy
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -150,12 +151,12 @@ def print_every(name: str, found: dict[int, dict]) -> None:
                 f"{pixels[high]:.2f} at {high} | {within} of {len(numbers)} |",
                 flush=True,
             )
-    rises = {n: found[n]["wcv"][0] / found[before]["wcv"][0] for before, n in zip(numbers, numbers[1:], strict=False)}
+    rises = {n: found[n]["wcv"][0] / found[before]["wcv"][0] for before, n in pairwise(numbers)}
     worst = max(rises, key=rises.__getitem__)
     print(
         f"`{name}`: error of `wcv` {found[numbers[0]]['wcv'][0]:.5f} at {numbers[0]} samples, "
-        f"{found[numbers[-1]]['wcv'][0]:.5f} at {numbers[-1]}; at most {rises[worst]:.3f} times that of one sample less, "
-        f"at {worst} (standard error {found[worst]['wcv'][1] / found[worst]['wcv'][0]:.3f} of it)",
+        f"{found[numbers[-1]]['wcv'][0]:.5f} at {numbers[-1]}; at most {rises[worst]:.3f} times that of one "
+        f"sample less, at {worst} (standard error {found[worst]['wcv'][1] / found[worst]['wcv'][0]:.3f} of it)",
         flush=True,
     )
 

@@ -92,9 +92,7 @@ def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack
     return [found[0], merge(found[1:]), *found[1:]] if args.halves else found
 
 
-def case(
-    method: str, reference: GradientStack, stack: GradientStack, *halves: GradientStack
-) -> tuple[np.ndarray, ...]:
+def case(method: str, reference: GradientStack, stack: GradientStack, *halves: GradientStack) -> tuple[np.ndarray, ...]:
     """Of all values that show no lamp: difference to the reference, change by more noise, variance of the reference."""
     result = reconstruct_with_error(stack, method, halves=halves or None)
     image, changed = result.image, result.error / FACTORS.get(method, FACTOR)

@@ -8,9 +8,9 @@ with means a and b, and held against each other by their *contrast*
     (b - a) sqrt(n1 n2) / n,
 
 whose expected square is the variance of the pixel's mean where samples are independent. What it is where they are
-points of nets, and what the variance of the mean is then, ``data_gen.film.nets.law`` says for each rate at which noise
-may fall. One square says little of a pixel, but pixels of about the same noise together show their rate: where little
-light is found by luck, points help much, and where all is, not at all.
+points of nets, and what the variance of the mean is then, ``data_gen.film.nets.law`` says for each way in which noise
+may fall. One square says little of a pixel, but pixels of about the same noise together show which: where little light
+is found by luck, points help much, and where all is, not at all.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import uniform_filter
 
-from data_gen.film.nets import RATES, law
+from data_gen.film.nets import law
 
 # Pixels of about the same noise: so many groups at most, of so many pixels at least
 _GROUPS, _LEAST = 64, 64
@@ -53,8 +53,12 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
         if total > 0:
             prior = _PRIOR / len(group) * total
             ratio = (squares[group].sum() + prior) / (total + prior)
-            # Falls with the rate, and np.interp wants it to rise.
-            rate = np.interp(-ratio, -(claimed @ seen) / total, RATES)
-            factor = np.array([np.interp(rate, RATES, each) for each in truth])
-            found[group] = factor[kind[group]]
+            # What is seen falls from law to law, and np.interp wants it to rise.
+            which = np.interp(-ratio, -(claimed @ seen) / total, np.arange(seen.shape[1]))
+            found[group] = (truth @ _hat(which, seen.shape[1]))[kind[group]]
     return found.reshape(*good.shape, 1)
+
+
+def _hat(place: float, n: int) -> np.ndarray:
+    """Weights that interpolate linearly between ``n`` values at a ``place`` from 0 to n - 1."""
+    return np.maximum(1 - np.abs(np.arange(n) - place), 0)

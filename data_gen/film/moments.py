@@ -135,7 +135,9 @@ def _each(moments: Moments, f: Callable, *others: Moments) -> Moments:
         if isinstance(value, list):
             return [of(*parts) for parts in zip(value, *more, strict=True)]
         if is_dataclass(value):
-            return type(value)(*(of(*(getattr(each, field.name) for each in (value, *more))) for field in fields(value)))
+            return type(value)(
+                *(of(*(getattr(each, field.name) for each in (value, *more))) for field in fields(value))
+            )
         return f(value, *more)
 
     return of(moments, *others)

@@ -7,8 +7,8 @@ has 2m points have the same covariance. A block of 2m points is two blocks of m 
     V(2m) = (V(m) + C(m)) / 2,    C(m) = 2 V(2m) - V(m).
 
 Points of different rounds (``data_gen.paths.streams``) are independent. So V gives the variance of a mean of *any*
-number of points, and of the difference between the means of any two parts of them. The one assumption is that V is a
-power of the number of points, V(m) = m^-rate, with a rate that the render itself shows.
+number of points, and of the difference between the means of any two parts of them. The one assumption is that V belongs
+to a family of laws, from independent samples to smooth integrands. The render itself shows which law holds.
 """
 
 from __future__ import annotations
@@ -18,18 +18,21 @@ from typing import NamedTuple
 
 import numpy as np
 
-# 1: as independent samples. 3/2: steps of the integrand. 3: a smooth integrand in two dimensions. Below 1: worse than
-# independent, which a few pixels may seem to be by chance.
-RATES = np.linspace(0.5, 3.0, 51)
+# The family: V(m) = share / m + (1 - share) m^-rate, from much noise to little. Rates below 1 are worse than independent
+# samples, as a few pixels may seem to be by chance. Share 1: independent samples. Share 0 and rate 3/2: steps of the
+# integrand. In between: steps beside light that is found by luck. Rate 3: a smooth integrand in two dimensions.
+_MIXED = np.linspace(1.0, 0.0, 21)
+SHARES = np.concatenate([np.zeros(10), _MIXED, np.zeros(30)])
+RATES = np.concatenate([np.linspace(0.5, 0.95, 10), np.full(21, 1.5), np.linspace(1.55, 3.0, 30)])
 
 
 class Law(NamedTuple):
-    """What ``n`` samples of a pixel show, and what their mean's variance is, for each of ``RATES``; both (rates).
+    """What ``n`` samples of a pixel show, and the variance of their mean, for each law of the family; both (laws).
 
     Both are over the variance that the spread of the samples claims, which takes them for independent.
     """
 
-    seen: np.ndarray  # of the contrast of data_gen.film.claims; falls with the rate
+    seen: np.ndarray  # of the contrast of data_gen.film.claims; falls from law to law
     truth: np.ndarray
 
 
@@ -58,7 +61,7 @@ def law(n: int, net: int) -> Law:
 
 def _covariances(begin: int, end: int, net: int) -> np.ndarray:
     """The sum of the covariances of all pairs of samples from ``begin`` to before ``end``."""
-    total, start, size = np.zeros_like(RATES), 0, net
+    total, start, size = np.zeros(len(RATES)), 0, net
     while start < end:
         total += _in_block(begin, end, start, size)
         # A round is as large as all before it together.
@@ -71,12 +74,16 @@ def _in_block(begin: int, end: int, start: int, size: int) -> np.ndarray:
     """The same of those among them that are in the aligned block of ``size`` samples from ``start`` on."""
     begin, end = max(begin, start), min(end, start + size)
     if begin >= end:
-        return np.zeros_like(RATES)
+        return np.zeros(len(RATES))
     if end - begin == size:
-        return size**2 * size**-RATES
+        return size**2 * _variance(size)
     half = size // 2
     middle = start + half
     apart = max(middle - begin, 0) * max(end - middle, 0)
-    covariance = 2 * size**-RATES - half**-RATES
+    covariance = 2 * _variance(size) - _variance(half)
     left, right = _in_block(begin, end, start, half), _in_block(begin, end, middle, half)
     return left + right + 2 * apart * covariance
+
+
+def _variance(m: int) -> np.ndarray:
+    return SHARES / m + (1 - SHARES) * float(m) ** -RATES
