@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The family: V(m) = share / m + (1 - share) m^-rate, from much noise to little. Rates below 1 are worse than independent
+# The family: V(m) = share / m + (1 - share) m^-rate, from much noise to little. Rates below 1: worse than independent
 # samples, as a few pixels may seem to be by chance. Share 1: independent samples. Share 0 and rate 3/2: steps of the
 # integrand. In between: steps beside light that is found by luck. Rate 3: a smooth integrand in two dimensions.
 _MIXED = np.linspace(1.0, 0.0, 21)
