@@ -52,7 +52,7 @@ class GradientFilm:
     ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where
     samples of a pass share photons, reservoirs or the state of a chain, or lanes splat onto pixels of others, the film
     is made with ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over
-    batches.
+    batches. A batch counts by its samples: the last one may have fewer than those before it.
     """
 
     def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
@@ -61,6 +61,7 @@ class GradientFilm:
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel; of those that were in all passes alone
         self.blocks = 0  # of samples, each of which goes to one strand
+        self.batch = 0  # samples per pixel of all batches but the last, which may have fewer
         # The same of each pixel, where they may differ
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
@@ -176,6 +177,9 @@ class GradientFilm:
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
+        self.batch = self.batch or spp
+        if spp > self.batch:
+            raise ValueError(f"a batch of {spp} samples after batches of {self.batch}: only the last may be smaller")
         first = dr.arange(mi.UInt32, self.pixels) * opaque(spp)
         strands = Strands(first, first + opaque(spp), opaque(spp), opaque(spp), opaque(0), opaque(spp))
         for name in dict.fromkeys((*values, *splats)):
@@ -191,7 +195,7 @@ class GradientFilm:
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
-            moments = one_more(self._moments(name, len(mean)), mean, exists, number)
+            moments = one_more(self._moments(name, len(mean)), mean, exists, number, opaque(spp))
             moments.lost += lost
             dr.eval(moments)
             self.moments[name] = moments
@@ -259,14 +263,15 @@ class GradientFilm:
         }
 
     def _statistics(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Count (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
+        """How many values (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
 
-        Unknown must not look like zero: the mean of no sample is NaN, and so is the variance of fewer than two. Chan,
-        Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
+        Values are samples, or batches. Unknown must not look like zero: the mean of no sample is NaN, and so is the
+        variance of fewer than two. Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
         """
         moments, shape = self.moments[name], (self.strands, self.pixels)
         counts = np.array(moments.count, np.float64).reshape(shape)
         count = counts.sum(axis=0)
+        values = np.ceil(count / self.batch) if self.batches else count
         means, variances = [], []
         with np.errstate(invalid="ignore", divide="ignore"):
             for channel in moments.mean:
@@ -278,8 +283,8 @@ class GradientFilm:
                     m2 = np.array(moments.m2[len(variances)]).reshape(shape).sum(axis=0)
                     if self.strands > 1:
                         m2 += (counts * np.square(strands - mean)).sum(axis=0)
-                    variances.append(np.where(count > 1, m2 / (count - 1) / count, np.nan))
-        return count[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
+                    variances.append(np.where(values > 1, m2 / (values - 1) / count, np.nan))
+        return values[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
 
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
@@ -326,7 +331,7 @@ class GradientFilm:
     @property
     def _net_of_numbers(self) -> int:
         """How many of these values the first round of points has, a power of two: a batch is a block of points."""
-        net = self.net * self.blocks // self.samples if self.batches else self.net
+        net = self.net // self.batch if self.batches else self.net
         return 1 << max(net.bit_length() - 1, 0)
 
     def _contrast(self, name: str) -> np.ndarray:

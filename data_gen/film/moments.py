@@ -17,10 +17,10 @@ import mitsuba as mi
 class Moments:
     """Running statistics of one value, for all strands: counts UInt32, a Float64 for each channel of the others."""
 
-    count: mi.UInt32  # samples that count
+    count: mi.UInt32  # samples that count, the weights added up
     lost: mi.UInt32  # samples left out because they were not finite
     mean: list
-    m2: list  # sum of squared deviations from the mean; empty where nobody asks for a variance
+    m2: list  # weighted sum of squared deviations from the mean; empty where nobody asks for a variance
     # Of earlier samples, see ``Earlier``; empty where nobody asks for it
     earlier: list
 
@@ -47,19 +47,19 @@ def no_moments(width: int, channels: int, variance: bool, halves: bool = False) 
     return Moments(count, lost, mean, m2 if variance else [], [Earlier(bits, counts, means)] if halves else [])
 
 
-def one_more(old: Moments, x: list, exists, number: mi.UInt32) -> Moments:
+def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32 | int = 1) -> Moments:
     """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``; one
-    that is not finite is lost."""
+    that is not finite is lost. A mean of several samples counts as many times: its ``weight``."""
     Float64 = dr.float64_array_t(mi.Float)
     finite = dr.all([dr.isfinite(component) for component in x])
     good = exists & finite
-    count = dr.select(good, old.count + 1, old.count)
+    count = dr.select(good, old.count + weight, old.count)
     lost = dr.select(exists & ~finite, old.lost + 1, old.lost)
-    share = 1 / Float64(dr.maximum(count, 1))
+    share = Float64(weight) / Float64(dr.maximum(count, weight))
     deviations = [dr.select(good, Float64(c) - m, 0) for c, m in zip(x, old.mean, strict=True)]
     mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
-    # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
-    m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
+    # weight (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
+    m2 = [dr.fma(Float64(weight) * d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
     return Moments(count, lost, mean, m2, [_one_later(each, old, number) for each in old.earlier])
 
 
