@@ -89,7 +89,9 @@ class Place:
         return self != Place.whole(*self.data.size)
 
     def __str__(self) -> str:
-        return f"{self.data} of {self.display}" if self.known else f"{self.data.width}x{self.data.height}"
+        if not self.known:
+            return "x".join(map(str, self.data.size))
+        return f"{self.data} of {self.display if any(self.display.corner) else Place.whole(*self.display.size)}"
 
     def seen_from(self, other: Place) -> Window | None:
         """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.

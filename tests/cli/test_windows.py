@@ -70,9 +70,12 @@ def test_what_has_no_place_in_common_is_refused(stack, tmp_path, capfd):
     small = written(tmp_path / "small.exr", GradientStack({"primal": stack["primal"][::2, ::2]}))
     for command in (["diff"], ["report", "-o", str(tmp_path / "page.html")]):
         assert main([*command, left, right]) == 1
-        assert f"20x30 at (0, 0) of {WHOLE}, {right} is 20x30 at (30, 0) of {WHOLE}" in capfd.readouterr().err
+        assert (
+            f"20x30 at (0, 0) of {WIDTH}x{HEIGHT}, {right} is 20x30 at (30, 0) of {WIDTH}x{HEIGHT}"
+            in capfd.readouterr().err
+        )
         assert main([*command, left, small]) == 1
-        assert f"{small} is 28x20 but {left} is 20x30 at (0, 0) of {WHOLE}" in capfd.readouterr().err
+        assert f"{small} is 28x20 but {left} is 20x30 at (0, 0) of {WIDTH}x{HEIGHT}" in capfd.readouterr().err
     assert main(["denoise", left, "-m", "primal", "--ref", right]) == 1
     assert "these have no pixel in common" in capfd.readouterr().err
     assert not (tmp_path / "page.html").exists()
