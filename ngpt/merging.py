@@ -67,7 +67,9 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     _check(stacks, spp)
     canvas = reduce(Window.around, (stack.place.data for stack in stacks))
     tiles = [_Tile(stack, n, canvas) for stack, n in zip(stacks, spp, strict=True)]
-    _check_filled(tiles, canvas)
+    if hole := _hole(tiles, canvas):
+        have = ", ".join(f"{tile.stack.path} {tile.stack.place.data}" for tile in tiles)
+        raise NgptError(f"no stack has all pixels of {hole}: {have}; render those too")
     total = _total(tiles)
     layers = {}
     for name in stacks[0].names:
@@ -199,17 +201,19 @@ def _variance(tiles: Sequence[_Tile], name: str, variance: str) -> np.ndarray:
         return np.where(total > 1, squares / (total * (total - 1)), np.nan)
 
 
-def _check_filled(tiles: Sequence[_Tile], canvas: Window) -> None:
-    """Raises NgptError for pixels that no tile has."""
+def _hole(tiles: Sequence[_Tile], canvas: Window) -> Window | None:
+    """The rectangle around the pixels that no tile has; None where there are none."""
+    # Tiles may lie so far apart that no memory holds what is between them.
+    if canvas.width * canvas.height > 4 * sum(tile.stack.width * tile.stack.height for tile in tiles):
+        return canvas
     empty = np.ones((canvas.height, canvas.width), bool)
     for tile in tiles:
         empty[tile.part] = False
-    if empty.any():
-        rows, columns = (np.flatnonzero(empty.any(axis=axis)) for axis in (1, 0))
-        left, top = canvas.left + int(columns[0]), canvas.top + int(rows[0])
-        hole = Window(left, top, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
-        have = ", ".join(f"{tile.stack.path} {tile.stack.place.data}" for tile in tiles)
-        raise NgptError(f"no stack has all pixels of {hole}: {have}; render those too")
+    if not empty.any():
+        return None
+    rows, columns = (np.flatnonzero(empty.any(axis=axis)) for axis in (1, 0))
+    left, top = canvas.left + int(columns[0]), canvas.top + int(rows[0])
+    return Window(left, top, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
 
 
 def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:

@@ -14,6 +14,8 @@ import numpy as np
 
 from ngpt.errors import NgptError
 
+MOST = 2**28  # pixels of a picture that is filled up: 16384 x 16384
+
 
 @dataclass(frozen=True)
 class Window:
@@ -148,9 +150,17 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
 
 
 def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
-    """An image (H, W, C) of the pixels of ``window``, cut to those of ``canvas``, and filled up to them."""
+    """An image (H, W, C) of the pixels of ``window``, cut to those of ``canvas``, and filled up to them.
+
+    Raises NgptError for a canvas that is out of all proportion, as a header may ask for with a few bytes.
+    """
     if window == canvas:
         return image
+    if canvas.width * canvas.height > MOST:
+        raise NgptError(
+            f"a picture of {canvas.width}x{canvas.height} pixels is to be filled, of which a file has {window}; "
+            f"{MOST >> 20} million are shown at most: set its display window"
+        )
     filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)
     if common := window.common(canvas):
         filled[common.within(canvas)] = image[common.within(window)]

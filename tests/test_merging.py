@@ -14,6 +14,7 @@ from ngpt.io.exr import pass_through, with_channels
 from ngpt.merging import merge
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
 
 SHAPE = (5, 4, 3)
 
@@ -356,6 +357,14 @@ def test_tiles_that_do_not_fit_are_refused(rng, windows, message):
         merge(tiles)
 
 
+def test_tiles_that_lie_far_apart_are_refused_at_once(rng):
+    tiles = [stack_of(rng.random((4, *LARGE)), seed) for seed in range(2)]
+    for tile, far in zip(tiles, (0, 2**30), strict=True):
+        tile.place = Place(Window(far, far, 12, 9), Window(0, 0, 2**31, 2**31))
+    with pytest.raises(NgptError, match=r"no stack has all pixels of 1073741836x1073741833 at \(0, 0\)"):
+        merge(tiles)
+
+
 def test_tiles_of_other_pictures_are_refused(rng):
     (tile,) = parts(stack_of(rng.random((4, *LARGE)), 0), 1, (0, 0, 4, 5))
     with pytest.raises(
@@ -389,3 +398,23 @@ def test_merged_tiles_have_no_seams(rng, method):
             assert np.abs(np.diff(image - truth, axis=axis).mean(axis=(1 - axis, 2)))[seam] < 0.035
         assert np.square(image - truth).mean() < (1.1 if overlap else 1.5) * np.square(expected - truth).mean()
         assert known_noise(merged).all()  # that of differences which are left out does not matter
+
+
+def test_tiles_from_files_keep_what_else_they_carry(rng, tmp_path):
+    """Diagnostics, samples that differ, motion; of frames that lie beyond the display window too."""
+    whole = stack_of(rng.random((4, *LARGE)), 0, **{"ngpt:frame": 2})
+    motion = rng.normal(size=(*LARGE[:2], 2)).astype(np.float32)
+    motion[2, 7] = np.nan
+    whole = whole.replace(motion=motion, samples=rng.integers(2, 9, LARGE[:2]))
+    whole.place = Place(Window(-2, -3, 12, 9), Window(0, 0, 8, 4))
+    rates, files = rng.random(LARGE[:2]).astype(np.float32), []
+    for tile in parts(whole, 1, (-2, -3, 5, 9), (3, -3, 7, 9)):
+        there = tile.place.data.within(whole.place.data)
+        tile = with_channels(tile, {"diagnostics.discarded": rates[there]})
+        files.append(str(ngpt.write(tmp_path / tile.path, tile)))
+    assert main(["merge", *files, "-o", str(tmp_path / "merged.exr")]) == 0
+    merged = ngpt.read(tmp_path / "merged.exr")
+    assert merged.place == whole.place and merged.attributes["ngpt:frame"] == 2
+    assert np.array_equal(merged["motion"], motion, equal_nan=True)
+    assert np.array_equal(merged["samples"], whole["samples"])
+    assert np.array_equal(pass_through(merged)["diagnostics.discarded"], rates)

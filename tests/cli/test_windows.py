@@ -140,6 +140,15 @@ def test_pictures_leave_overscan_out(stack, tmp_path):
     assert main(["denoise", crop, "-m", "primal", "-o", str(tmp_path / "crop2.png")]) == 0
 
 
+def test_a_display_window_out_of_all_proportion_fills_no_memory(stack, tmp_path, capfd):
+    (tmp_path / "shot").mkdir()
+    written(tmp_path / "shot" / "a.exr", stack, display=Window(0, 0, 2**29, 2**29))
+    for command in (["picture", "-o", str(tmp_path / "f.webp")], ["report", "-o", str(tmp_path / "page.html")]):
+        assert main([*command, str(tmp_path / "shot")]) == 1
+        assert "536870912x536870912 pixels is to be filled" in capfd.readouterr().err
+    assert main(["picture", str(tmp_path / "shot" / "a.exr"), "-o", str(tmp_path / "a.png")]) == 0
+
+
 @pytest.mark.parametrize("target", ["film.webp", "frames"])
 def test_films_show_display_windows(target, stack, tmp_path):
     shot = tmp_path / "shot"
