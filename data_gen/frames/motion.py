@@ -137,7 +137,8 @@ def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
 def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
     """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
 
-    Of the arrays: where crop windows move from frame to frame, motion in the picture is more by ``window_moved``.
+    It leads from pixel to pixel of the two arrays. Where crop windows move from frame to frame, the motion in the whole
+    picture is the sum of it and ``window_moved``.
     ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where motion is not known:
     behind the camera of before, or on a shape that was not there. Raises NgptError for a camera without a projection.
     """

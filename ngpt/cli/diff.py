@@ -11,7 +11,7 @@ from ngpt.windows import overlap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.epilog = "Of images with data windows the pixels that both have are compared."
+    parser.epilog = "Images are compared in the pixels that both have, by their data windows."
     parser.add_argument("image", metavar="A", help="the image to judge: its root R G B, i.e. the result if it has one")
     parser.add_argument("reference", metavar="B", help="the image to judge it by")
     parser.add_argument(
