@@ -9,7 +9,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import OpenEXR
@@ -26,6 +26,7 @@ from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
+from ngpt.windows import Place, Window
 
 _LOG = logging.getLogger(__name__)
 
@@ -33,6 +34,7 @@ __all__ = [
     "MADE_BY",
     "ExrImage",
     "ExrPart",
+    "Picture",
     "StackSource",
     "channels_alone",
     "layers_in",
@@ -41,6 +43,7 @@ __all__ = [
     "read",
     "read_exr",
     "read_image",
+    "read_picture",
     "replace_layers_of_light",
     "with_channels",
     "write",
@@ -106,7 +109,7 @@ def read(
     arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
     attributes = {name: value for name, value in main.header.items() if name not in _STRUCTURE}
-    stack = GradientStack(arrays, attributes, StackSource(image, resolution), str(path))
+    stack = GradientStack(arrays, attributes, StackSource(image, resolution), str(path), _place(main))
     for name, found in resolution.items():
         here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
         if not np.array_equal(here, there):
@@ -148,8 +151,20 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     return layer
 
 
+class Picture(NamedTuple):
+    """What a viewer shows of a file, (H, W, 3) float32, and where it lies."""
+
+    pixels: np.ndarray
+    place: Place
+
+
 def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
-    """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
+    """Reads what a viewer would show of a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    return read_picture(path, isolated).pixels
+
+
+def read_picture(path: str | os.PathLike, isolated: bool = False) -> Picture:
+    """Reads the picture that a viewer would show: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
     ``read`` takes for the primal. Unlike there, light of other primaries is converted to linear Rec. 709
@@ -157,9 +172,9 @@ def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
     """
     part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
     if all(name in part.channels for name in RGB):
-        return converted(_gather(part, RGB), to_rec709(part.header))
+        return Picture(converted(_gather(part, RGB), to_rec709(part.header)), _place(part))
     stack = read(path, isolated=isolated)
-    return converted(stack["primal"], to_rec709(stack.attributes))
+    return Picture(converted(stack["primal"], to_rec709(stack.attributes)), stack.place)
 
 
 def write(
@@ -172,7 +187,7 @@ def write(
     """Writes a stack, a result or an image, and returns its path.
 
     A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
-    removed), or else as one scanline part, compressed with ZIP, primal in the root R G B.
+    removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
 
     A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
     of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
@@ -217,13 +232,13 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
     a file are. ``pass_through`` reads them.
     """
     stack.require("primal", why="carrying further channels")
-    part, found = ExrPart("", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {}), {}
+    part, found = ExrPart("", _new_header(stack), {}), {}
     for name in stack.names:
         prefix = "" if name in ("primal", "alpha") else f"{name}."
         found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
         _scatter(part, found[name].channels, stack[name], half=False)
     part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
-    return GradientStack(stack.layers, stack.attributes, StackSource(ExrImage([part]), found), stack.path)
+    return replace(stack, source=StackSource(ExrImage([part]), found))
 
 
 def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
@@ -253,7 +268,7 @@ def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
     """The stack with others in place of some of its ``layers_of_light``, (H, W, 3), of the type they have there."""
     image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
-    changed = GradientStack(stack.layers, stack.attributes, StackSource(image, stack.source.resolution), stack.path)
+    changed = replace(stack, source=StackSource(image, stack.source.resolution))
     places = _light(changed)
     for name, values in layers.items():
         part, names = places[name]
@@ -296,8 +311,7 @@ def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, in
     """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes."""
     if stack.source is None:
         stack.require("primal", why=f"writing {path}")
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        image, resolution, main = ExrImage([ExrPart("", header, {})]), {}, 0
+        image, resolution, main = ExrImage([ExrPart("", _new_header(stack), {})]), {}, 0
     else:
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
         resolution = dict(stack.source.resolution)
@@ -372,6 +386,16 @@ def _scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bo
 
 def _is_half(part: ExrPart, names: tuple[str, ...]) -> bool:
     return all(part.channels[name].dtype == np.float16 for name in names)
+
+
+def _place(part: ExrPart) -> Place:
+    return Place(Window.of_box(part.header["dataWindow"]), Window.of_box(part.header["displayWindow"]))
+
+
+def _new_header(stack: GradientStack) -> dict[str, Any]:
+    """Of the part that a stack is written to which comes from no file."""
+    windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
+    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
 
 
 def _corner(window: tuple[np.ndarray, np.ndarray]) -> str:
