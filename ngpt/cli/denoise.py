@@ -15,7 +15,6 @@ import numpy as np
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
-    RESULT_SUFFIX,
     add_files,
     add_force,
     add_json,
@@ -31,6 +30,7 @@ from ngpt.cli.picture import add_look, check_picture, exposed
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image, write
+from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.measure.metrics import compare
@@ -160,6 +160,9 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         by_wcv = args.method == "wcv" and not options
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
+        for name in filter(is_shot, args.stacks):
+            for remark in remarks(name, stack_files([name]), results=False):
+                console.say(remark)
     if windows:
         everything = {target for _, target in pairs}
         frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)

@@ -9,6 +9,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_image
+from ngpt.io.frames import is_shot, remarks, shot_files
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
@@ -20,7 +21,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. All frames of a folder have one exposure."
     )
-    parser.add_argument("image", metavar="IMAGE.exr", help="an image of any renderer, or a folder of frames")
+    parser.add_argument(
+        "image",
+        metavar="IMAGE.exr",
+        help="an image of any renderer; or a folder of frames, or a pattern of their names",
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -35,8 +40,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     source, target = Path(args.image), Path(args.output)
-    if source.is_dir():
-        return shot(args, source, target, console)
+    if is_shot(args.image):
+        return shot(args, args.image, target, console)
     check_kind(target, PICTURES)
     check_output(target, args.force)
     image = read_image(source)
@@ -45,17 +50,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     return 0
 
 
-def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console) -> int:
-    """A film of a folder's frames, or a picture of each."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
-    if not files:
-        raise NgptError(f"{folder}: no .exr files there")
+def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) -> int:
+    """A film of the frames of a folder or a pattern, or a picture of each."""
+    files = shot_files(folder)
     film = bool(target.suffix)
     if film:
         check_kind(target, SHOTS)
         check_output(target, args.force)
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
+    for remark in remarks(folder, files):
+        console.say(remark)
     stops = exposed(args.exposure, read_image(files[0]))
 
     def pictures():

@@ -9,6 +9,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_image
+from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "images",
         nargs="+",
         metavar="IMAGE.exr",
-        help="images of one size, of any renderer; or folders of frames, or of training runs",
+        help="images of one size, of any renderer; or folders of frames, patterns of their names, or training runs",
     )
     parser.add_argument(
         "--ref",
@@ -66,7 +67,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if any(is_run(Path(path)) for path in args.images):
         return run_trainings(args, target, console)
     names = labels(args.images)
-    if any(os.path.isdir(path) for path in args.images):
+    if any(is_shot(path) for path in args.images):
         return run_shots(args, names, target, console)
     images = [read_image(path) for path in args.images]
     reference = read_image(args.ref) if args.ref else None
@@ -122,8 +123,12 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
     """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
-    frames = frames_of(folders)
-    first = read_image(Path(folders[0]) / frames[0])
+    shots = [shot_files_of(folder) for folder in folders]
+    frames = frames_of(folders, shots)
+    for folder, files in zip(folders, shots, strict=True):
+        for remark in remarks(folder, files):
+            console.say(remark)
+    first = read_image(frames[0][0])
     metrics, lacks = available(*first.shape[:2]) if args.ref else ([], [])
     for lack in lacks:
         console.say(lack)
@@ -131,10 +136,10 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
             progress(done, len(frames))
-            paths = [str(Path(folder) / frame) for folder in folders]
+            paths = [str(path) for path in frame]
             images = [read_image(path) for path in paths]
             for path, image in zip(paths, images, strict=True):
-                check_size(path, image, str(Path(folders[0]) / frames[0]), first)
+                check_size(path, image, str(frames[0][0]), first)
             reference = images.pop() if args.ref else None
             entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
             motions.append(motion_of(paths))
@@ -143,8 +148,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
                     add_errors(entry, metrics, reference, path, paths[-1])
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
             size = f"{first.shape[1]}x{first.shape[0]}"
-            caption = f"{frame}, {size}"
-            scenes.append(Scene(Path(frame).stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
+            caption = f"{frame[0].name}, {size}"
+            scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
     tables = {}
     for place in range(len(names)):
@@ -198,20 +203,23 @@ def motion_of(paths: list[str]) -> np.ndarray | None:
     return None
 
 
-def frames_of(folders: list[str]) -> list[str]:
-    """The names of the frames, which all folders must have. Raises NgptError for files among folders, and lacks."""
-    found = []
-    for folder in folders:
-        if not os.path.isdir(folder):
-            raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
-        found.append({path.name for path in Path(folder).iterdir() if path.suffix.lower() == ".exr"})
-        if not found[-1]:
-            raise NgptError(f"{folder}: no .exr files there")
-        if differ := found[-1] ^ found[0]:
-            name = min(differ)
-            has, lacks = (folder, folders[0]) if name in found[-1] else (folders[0], folder)
-            raise NgptError(f"{has} has {name} and {lacks} has not; give folders of the same frames")
-    return sorted(found[0])
+def shot_files_of(folder: str) -> list[Path]:
+    """The frames of a shot; raises NgptError for files, of which a shot has several."""
+    if not is_shot(folder):
+        raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+    return shot_files(folder)
+
+
+def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
+    """The file of each frame in every shot, in the order of the first; raises NgptError where one lacks a frame."""
+    found = [{frame_name(path): path for path in files} for files in shots]
+    for folder, files in zip(folders, found, strict=True):
+        if differ := files.keys() ^ found[0].keys():
+            name = min(differ, key=natural)
+            has, lacks = (folder, folders[0]) if name in files else (folders[0], folder)
+            path = files.get(name) or found[0][name]
+            raise NgptError(f"{has} has {path.name} and {lacks} has not; give folders of the same frames")
+    return [tuple(files[name] for files in found) for name in found[0]]
 
 
 def labels(paths: list[str]) -> list[str]:

@@ -112,3 +112,19 @@ def test_one_frame_without_differences_in_time_makes_it_history_and_is_named(sho
 def test_what_history_does_not_hold_is_refused(rest, option, tmp_path, capsys):
     assert denoised(rest, tmp_path / "clean", *option) == 2
     assert "--temporal goes without" in capsys.readouterr().err
+
+
+def test_frames_are_blended_in_the_order_of_their_numbers(rest, tmp_path, capsys):
+    """Names of Houdini and of scripts: f.1 to f.12, without ``ngpt:frame``."""
+    plain, folder = ngpt.read(next(rest.iterdir())), tmp_path / "houdini"
+    folder.mkdir()
+    for i in (1, 2, 10, 11):
+        ngpt.write(folder / f"f.{i}.exr", ngpt.GradientStack(plain.layers))
+    (folder / "._f.1.exr").write_bytes(b"of macOS")
+    ngpt.write(folder / "f.2_denoised.exr", ngpt.GradientStack(plain.layers))
+    assert denoised(folder, tmp_path / "clean", "-m", "primal", "--json") == 0
+    told = capsys.readouterr()
+    reports = json.loads(told.out)["files"]
+    assert [report["input"] for report in reports] == [str(folder / f"f.{i}.exr") for i in (1, 2, 10, 11)]
+    assert reports[0]["history"] == 0 < reports[1]["history"] < reports[3]["history"]
+    assert f"{folder}: f.#.exr goes from 1 to 11 without 3 to 9" in told.err
