@@ -52,8 +52,13 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=LAYER",
-        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file; may be repeated",
+        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file, or from channels with signs and factors "
+        '("-velocity.R,velocity.G"); may be repeated',
     )
+
+
+def add_view(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument("--view", metavar="NAME", help=f"a view of stereo files, such as left or right ({default})")
 
 
 def assignment(text: str) -> tuple[str, str]:

@@ -63,6 +63,21 @@ class PartHeader:
         code = {"int": "<i", "float": "<f", "double": "<d"}.get(kind)
         return struct.unpack(code, data)[0] if code and len(data) == struct.calcsize(code) else None
 
+    def text(self, attribute: str) -> str:
+        """An attribute that is a string; "" where there is none."""
+        kind, data = self.attributes.get(attribute, ("", b""))
+        return data.decode(errors="replace") if kind == "string" else ""
+
+    def texts(self, attribute: str) -> list[str]:
+        """An attribute that is a list of strings, as far as it is whole; none where there is none."""
+        kind, data = self.attributes.get(attribute, ("", b""))
+        found = []
+        while kind == "stringvector" and len(data) >= 4:
+            (length,) = struct.unpack_from("<i", data)
+            found.append(data[4 : 4 + max(length, 0)].decode(errors="replace"))
+            data = data[4 + max(length, 0) :]
+        return found
+
     @property
     def bytes(self) -> int:
         """Of the decoded image."""
