@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force
+from ngpt.cli.arguments import add_force, add_view
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_image
 from ngpt.io.frames import is_shot, remarks, shot_files
@@ -34,6 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"picture to write ({' '.join(PICTURES)}); of a folder a film ({' '.join(SHOTS)}), or a folder for PNGs",
     )
     add_look(parser)
+    add_view(parser, "default: the first")
     parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
     add_force(parser)
 
@@ -44,7 +45,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return shot(args, args.image, target, console)
     check_kind(target, PICTURES)
     check_output(target, args.force)
-    image = read_image(source)
+    image = read_image(source, view=args.view)
     write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
     console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
@@ -61,12 +62,12 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
     for remark in remarks(folder, files):
         console.say(remark)
-    stops = exposed(args.exposure, read_image(files[0]))
+    stops = exposed(args.exposure, read_image(files[0], view=args.view))
 
     def pictures():
         for done, file in enumerate(files):
             progress(done, len(files))
-            yield file, shown(read_image(file), args.transform, stops)
+            yield file, shown(read_image(file, view=args.view), args.transform, stops)
         progress(len(files), len(files))
 
     with console.progress("pictures", "frames") as progress:

@@ -162,6 +162,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
+        if all(motion is None for motion in motions[1:]):
+            console.say("flicker is nan: no frame has motion vectors (layer 'motion'), to tell it from what moves")
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
             tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))

@@ -90,7 +90,7 @@ LOOKS = {
     "depth": ("depth", "distance"),
     "dx": ("gradientx", "gradx"),
     "dy": ("gradienty", "grady"),
-    "motion": ("motionvec", "velocity", "vector", "dpcameradt"),
+    "motion": ("motionvec", "velocity", "vector"),
 }
 # Parts of names of what is none of them: V-Ray's depth is a shade of grey between two distances.
 NOT_LOOKS = {"depth": ("zdepth",)}

@@ -183,17 +183,24 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     return layer
 
 
-def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
+def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
     """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
-    ``read`` takes for the primal. Unlike there, light of other primaries is converted to linear Rec. 709
-    (``ngpt.io.primaries``): pictures are looked at and compared.
+    ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
+    primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
     """
-    part = (read_exr_isolated(path) if isolated else read_exr(path)).parts[0]
-    if all(name in part.channels for name in RGB):
+    image = read_exr_isolated(path) if isolated else read_exr(path)
+    part = image.parts[0]
+    if view is None and all(name in part.channels for name in RGB):
         return converted(gather(part, RGB), to_rec709(part.header))
-    stack = read(path, isolated=isolated)
+    chosen = choose_views(file_views(image), view, str(path))[0]
+    stack = _stack(image, chosen, None, isolated, None, str(path))
+    # That of a result is beside its input.
+    for place in (stack.source.resolution["primal"].part, chosen.first):
+        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
+        if all(name in part.channels for name in root):
+            return converted(gather(part, root), to_rec709(part.header))
     return converted(stack["primal"], to_rec709(stack.attributes))
 
 

@@ -90,7 +90,7 @@ def _eyes(parts: Sequence[Part]) -> list[str]:
 def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
     """The name of a part without that of the view, and the channels that belong to it."""
     own = part.view or (part.name if part.name in names else "")
-    bare = re.sub(rf"[-._ ]?\b{re.escape(view)}$|^{re.escape(view)}[-._ ]", "", part.name)
+    bare = re.sub(rf"(^|[-._ ]){re.escape(view)}$|^{re.escape(view)}[-._ ]", "", part.name)
     if own:
         return bare, {channel: channel for channel in part.channels} if own == view else {}
     found: Mapping[str, str] = {}

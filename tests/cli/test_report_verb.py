@@ -171,3 +171,15 @@ def test_frames_play_in_the_order_of_numbers_and_results_beside_them_are_compare
         assert list(dict.fromkeys(re.findall(r"f\.\d+", text))) == ["f.1", "f.2", "f.10"]
         played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
         assert [len(scene["pictures"]) for scene in played["scenes"]] == [count] * 3
+
+
+def test_flicker_without_motion_is_explained(tmp_path, capsys):
+    for folder in ("a", "truth"):
+        (tmp_path / folder).mkdir()
+        for i in range(2):
+            write(tmp_path / folder / f"{i}.exr", np.full((12, 16, 3), 1 + i, np.float32))
+    words = ["report", str(tmp_path / "a"), "--ref", str(tmp_path / "truth"), "-o", str(tmp_path / "page.html")]
+    assert main(words) == 0
+    told = capsys.readouterr()
+    assert told.out.splitlines()[-1].split()[-1] == "nan"
+    assert "flicker is nan: no frame has motion vectors (layer 'motion')" in told.err

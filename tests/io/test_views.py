@@ -38,6 +38,10 @@ LAYOUTS = {
     "Blender, one part": [(channels(lambda v, k, c: f"ViewLayer.{k}.{v}.{c}"), BOTH)],
     "no attribute": [(channels(lambda v, k, c: f"ViewLayer.{k}.{v}.{c}"), {})],
     "a part for each view": [(channels(lambda v, k, c: bare(k, c), [v]), {"view": v}, v) for v in ("left", "right")],
+    "Nuke": [
+        (channels(lambda v, k, c: c, [v], {k: LAYERS[k]}), {"view": v}, f"{'rgba' if k == 'Combined' else k}.{v}")
+        for v in ("left", "right") for k in LAYERS
+    ],
     "named parts": [(channels(lambda v, k, c: bare(k, c), [v]), {}, v) for v in ("left", "right")],
     "Blender, many parts": [
         (channels(lambda v, k, c: f"ViewLayer.{k}.{c}", [v], {k: LAYERS[k]}), {"view": v}, f"ViewLayer.{k}-{v}")
@@ -74,6 +78,7 @@ def test_every_view_is_read(source):
     assert [held(stack) for stack in stacks] == [expected("left"), expected("right")]
     assert held(read(source)) == expected("left") and held(read(source, view="right")) == expected("right")
     assert [held(stack) for stack in read_views(source, view="right")] == [expected("right")]
+    assert tuple(read_image(source, view="right")[0, 0]) == expected("right")["primal"]
     with pytest.raises(NgptError, match=r"has no view 'top'; it has left, right"):
         read(source, view="top")
 
@@ -86,6 +91,7 @@ def test_results_keep_the_layout_and_the_inputs(source, tmp_path):
         after = read_views(path)
         assert [held(stack) for stack in after] == [expected("left"), expected("right")]
         assert (read_image(path) == first).all()
+        assert (read_image(path, view="right") == first + 1).all() and (read_image(path, view="left") == first).all()
         held_before = {(name, c) for name, _, parts in read_raw(source) for c in parts}
         found = {(name, c): pixels for name, _, parts in read_raw(path) for c, pixels in parts.items()}
         assert held_before <= set(found)
