@@ -106,7 +106,7 @@ def _resolved(
     view: View, layers: Mapping[str, str] | None, attributes: Iterable[Mapping[str, Any]], path: str
 ) -> Resolution:
     """Where the layers of a view are; ``attributes`` are those of the parts."""
-    headers, wanted = list(attributes), dict(layers or {})
+    headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
     # In a result the input is elsewhere by now.
     if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):

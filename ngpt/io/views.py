@@ -46,6 +46,11 @@ class View(NamedTuple):
         """The first part with channels of this view."""
         return next(index for index, (_, channels) in enumerate(self.parts) if channels)
 
+    def without(self, name: str) -> str:
+        """A layer's name, or names of channels, without the name of this view: "right.albedo" is its "albedo"."""
+        word = re.escape(self.name)
+        return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
+
     def channel(self, part: int, name: str) -> str:
         """What a channel of this view is called in a part of the file, whether it is there or not."""
         known = self.parts[part][1] if part < len(self.parts) else {}

@@ -79,6 +79,8 @@ def test_every_view_is_read(source):
     assert held(read(source)) == expected("left") and held(read(source, view="right")) == expected("right")
     assert [held(stack) for stack in read_views(source, view="right")] == [expected("right")]
     assert tuple(read_image(source, view="right")[0, 0]) == expected("right")["primal"]
+    for name in ("right.Denoising Albedo", "Denoising Albedo.right", "Denoising Albedo"):
+        assert held(read(source, {"albedo": name}, view="right"))["albedo"] == expected("right")["albedo"]
     with pytest.raises(NgptError, match=r"has no view 'top'; it has left, right"):
         read(source, view="top")
 
