@@ -83,8 +83,7 @@ def read(
     such a file of a layer.
     """
     image = read_exr_isolated(path) if isolated else read_exr(path)
-    found = choose_views(file_views(image), view, str(path))
-    return _stack(image, found[0], layers, isolated, files, str(path))
+    return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
 
 
 def read_views(
@@ -100,6 +99,14 @@ def read_views(
     if len(found) == 1:
         return [_stack(image, found[0], layers, isolated, files, str(path))]
     return [_stack(image, one, layers, isolated, files, f"{path}, view {one.name}") for one in found]
+
+
+def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
+    """The view of that name, or the first; a warning says so where there are others."""
+    found = choose_views(file_views(image), wanted, path)
+    if len(found) > 1:
+        _LOG.warning("%s: of the views %s, %s is taken", path, ", ".join(view.name for view in found), found[0].name)
+    return found[0]
 
 
 def _resolved(
@@ -191,10 +198,9 @@ def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None
     primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
     """
     image = read_exr_isolated(path) if isolated else read_exr(path)
-    part = image.parts[0]
+    part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
         return converted(gather(part, RGB), to_rec709(part.header))
-    chosen = choose_views(file_views(image), view, str(path))[0]
     stack = _stack(image, chosen, None, isolated, None, str(path))
     # That of a result is beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
