@@ -11,7 +11,7 @@ https://openexr.com/en/latest/MultiViewOpenEXR.html
 """
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from ngpt.errors import NgptError
@@ -98,15 +98,15 @@ def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str
     bare = re.sub(rf"(^|[-._ ]){re.escape(view)}$|^{re.escape(view)}[-._ ]", "", part.name)
     if own:
         return bare, {channel: channel for channel in part.channels} if own == view else {}
-    found: Mapping[str, str] = {}
+    found: dict[str, str] = {}
     for channel in part.channels:
         words = channel.split(".")
         place = next((i for i in reversed(range(len(words) - 1)) if words[i] in names), None)
         if (words[place] if place is not None else names[0]) == view:
             name = ".".join(word for i, word in enumerate(words) if i != place)
             # Of two with one name the one that names its view is the view's.
-            found = {**found, name: channel} if place is not None or name not in found else found
-    return bare, dict(found)
+            found[name] = channel if place is not None else found.get(name, channel)
+    return bare, found
 
 
 def _infix(parts: Sequence[Part], view: str, names: Sequence[str]) -> str:
