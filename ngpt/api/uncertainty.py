@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from ngpt.layers import DIFFERENCES
 from ngpt.merging import VARIANCES
 from ngpt.methods import Result, reconstruct
 from ngpt.stack import GradientStack
@@ -47,13 +48,18 @@ def reconstruct_with_error(stack: GradientStack, method: str = "auto", **options
 
 
 def known_noise(stack: GradientStack) -> np.ndarray:
-    """Where all variances are finite of what images are made of, (H, W) booleans; differences beyond the border do not
-    count, for there are none."""
+    """Where all variances are finite of what images are made of, (H, W) booleans.
+
+    Differences beyond the border do not count, for there are none, nor those that are not finite, which are left out.
+    """
     known = np.ones((stack.height, stack.width), bool)
     inside: Any
     for name, inside in (("primal", np.s_[:]), ("caustic", np.s_[:]), ("dx", np.s_[:, :-1]), ("dy", np.s_[:-1])):
         if name in stack and VARIANCES[name] in stack:
-            known[inside] &= np.isfinite(stack[VARIANCES[name]][inside]).all(axis=-1)
+            finite = np.isfinite(stack[VARIANCES[name]][inside]).all(axis=-1)
+            if name in DIFFERENCES:
+                finite |= ~np.isfinite(stack[name][inside]).all(axis=-1)
+            known[inside] &= finite
     return known
 
 

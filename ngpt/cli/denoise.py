@@ -28,14 +28,14 @@ from ngpt.cli.arguments import (
     stack_files,
 )
 from ngpt.cli.denoise_shot import motion_hint, one_view_only, way, windowed
-from ngpt.cli.picture import add_look, check_picture, exposed
+from ngpt.cli.picture import add_look, check_picture, exposed, in_picture
+from ngpt.cli.reference import Errors, Reference
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read_image, read_views, write
+from ngpt.io.exr import read_views, write
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
-from ngpt.measure.metrics import compare
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
@@ -110,7 +110,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the stacks are frames of one shot, in order, with motion vectors: less flicker by the frames before; "
         "with -m wcv, and differences in time in all of them (`ngpt render --dt`), by those after too",
     )
-    parser.add_argument("--ref", metavar="REF", help="reference image: report the error against it")
+    parser.add_argument("--ref", metavar="REF", help="reference image: report the error in the pixels that both have")
     add_files(parser)
     add_layers(parser)
     add_view(parser, "default: all of them")
@@ -149,7 +149,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     # Their results are there, but later frames are made of them.
     missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
-    reference = read_image(args.ref, args.untrusted) if args.ref else None
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
@@ -224,7 +224,7 @@ class Frame(NamedTuple):
     target: Path
     stack: GradientStack | None
     result: Result | None = None
-    metrics: dict[str, float] | None = None
+    errors: Errors | None = None
     groups: tuple[str, ...] = ()
     there: bool = False
     cut: bool = False
@@ -259,7 +259,7 @@ def compute_frame(
     frame: Frame,
     args: argparse.Namespace,
     options: dict,
-    reference: np.ndarray | None,
+    reference: Reference | None,
     temporal: dict[str, Temporal] | None,
 ) -> Frame:
     """The frame with its result, and those of its other views; ``temporal`` is the history of each view."""
@@ -277,20 +277,19 @@ def compute_frame(
         over_time, reason = {"ngpt:temporal": "history", "ngpt:history": history.share}, history.reason
         if isinstance(history.corrections, Network):
             over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
-    light = converted(result.image, to_rec709(stack.attributes))
-    metrics = compare(light, reference) if reference is not None else None
+    errors = reference.errors(result.image, stack) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    frame = frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), others=others)
+    frame = frame._replace(stack=stack, result=result, errors=errors, groups=tuple(groups), others=others)
     return frame._replace(over_time=over_time, reason=reason)
 
 
 def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, cut, over_time, reason, others = frame
+    source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
@@ -299,7 +298,7 @@ def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", expo
         views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
         write(target, [image for image, _ in views], [of for _, of in views], overwrite or cut, made)
     else:
-        light = converted(result.image, to_rec709(stack.attributes))
+        light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
         write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
     report |= {
         "method": result.method,
@@ -321,7 +320,9 @@ def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", expo
     report |= {"why no history": reason} if reason else {}
     report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
-    return report | ({"metrics": metrics} if metrics else {})
+    if errors is not None:
+        report |= {"metrics": errors.metrics} | ({"compared": errors.part} if errors.part else {})
+    return report
 
 
 def describe(report: dict) -> str:
@@ -347,6 +348,7 @@ def describe(report: dict) -> str:
         text += f", light groups {', '.join(report['groups'])}"
     if "metrics" in report:
         text += f", relMSE {report['metrics']['relMSE']:.5g}"
+        text += f" of the pixels that both have: {report['compared']}" if "compared" in report else ""
     return text
 
 

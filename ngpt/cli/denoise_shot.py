@@ -5,13 +5,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ngpt.cli.reference import Reference
 from ngpt.errors import NgptError
 from ngpt.io.exr import layers_in, read
-from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.resolution import propose
-from ngpt.measure.metrics import compare
 from ngpt.sequence.history import NO_MOTION
 from ngpt.sequence.wcv_windows import LENGTH, LINK, reconstruct_shot
 from ngpt.stack import GradientStack
@@ -64,7 +61,7 @@ def windowed(
     pairs: Sequence[tuple[Path, Path]],
     read: Callable[[tuple[Path, Path]], Any],
     write: Callable[[Any], dict],
-    reference: np.ndarray | None,
+    reference: Reference | None,
 ) -> Iterator[dict | NgptError]:
     """What there is to report of each pair, in order: files that cannot be read are cuts, and reported.
 
@@ -90,10 +87,9 @@ def windowed(
         while done < number:
             yield told[done] if done in told else write(frames.pop(done))
             done += 1
-        light = converted(result.image, to_rec709(frames[number].stack.attributes))
-        metrics = compare(light, reference) if reference is not None else None
+        errors = reference.errors(result.image, frames[number].stack) if reference is not None else None
         over_time = {"ngpt:temporal": "windows"}
-        yield write(frames.pop(number)._replace(result=result, metrics=metrics, over_time=over_time))
+        yield write(frames.pop(number)._replace(result=result, errors=errors, over_time=over_time))
         done = number + 1
     while done < len(pairs):
         yield told[done] if done in told else write(frames.pop(done))

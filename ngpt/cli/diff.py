@@ -3,13 +3,15 @@
 import argparse
 
 from ngpt.cli.arguments import add_json, print_json
-from ngpt.io.exr import read_image
+from ngpt.io.exr import read_picture
 from ngpt.measure.metrics import compare
 from ngpt.measure.shown import available, judge
 from ngpt.system.console import Console
+from ngpt.windows import overlap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Images are compared in the pixels that both have, by their data windows."
     parser.add_argument("image", metavar="A", help="the image to judge: its root R G B, i.e. the result if it has one")
     parser.add_argument("reference", metavar="B", help="the image to judge it by")
     parser.add_argument(
@@ -23,7 +25,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    image, reference = read_image(args.image), read_image(args.reference)
+    names = [args.image, args.reference]
+    images, places = zip(*map(read_picture, names), strict=True)
+    both = overlap(names, places)
+    image, reference = both.of(images)
+    if both.line:
+        console.say(both.line)
     metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
     for lack in lacks:

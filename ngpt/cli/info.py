@@ -134,7 +134,9 @@ def stack(stack: GradientStack) -> dict:
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
-    window = [[int(n) for n in corner] for corner in main.header["dataWindow"]]
+    data, display = (
+        [[int(n) for n in corner] for corner in main.header[f"{name}Window"]] for name in ("data", "display")
+    )
     further = pass_through(stack)
     rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}
     layers = {}
@@ -154,7 +156,8 @@ def stack(stack: GradientStack) -> dict:
     report = {
         "file": stack.path,
         "size": [stack.width, stack.height],
-        "data window": window,
+        "data window": data,
+        "display window": display,
         "parts": len(parts),
         "layers": layers,
         "diagnostics": {

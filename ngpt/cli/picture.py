@@ -8,18 +8,20 @@ import numpy as np
 
 from ngpt.cli.arguments import add_force, add_view
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read_image
+from ngpt.io.exr import read_picture
 from ngpt.io.frames import is_shot, remarks, shot_files
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
+from ngpt.windows import Place, put
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Of a stack the noisy image is shown, of a result the result. All frames of a folder have one exposure."
+        "Of a stack the noisy image is shown, of a result the result. A picture has the pixels of the data window that "
+        "lie in the display window; frames of a folder have all of their display window, and one exposure."
     )
     parser.add_argument(
         "image",
@@ -45,7 +47,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         return shot(args, args.image, target, console)
     check_kind(target, PICTURES)
     check_output(target, args.force)
-    image = read_image(source, view=args.view)
+    image = in_picture(*read_picture(source, view=args.view))
     write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
     console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
@@ -62,12 +64,13 @@ def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) 
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
     for remark in remarks(folder, files):
         console.say(remark)
-    stops = exposed(args.exposure, read_image(files[0], view=args.view))
+    stops = exposed(args.exposure, in_picture(*read_picture(files[0], view=args.view)))
 
     def pictures():
         for done, file in enumerate(files):
             progress(done, len(files))
-            yield file, shown(read_image(file, view=args.view), args.transform, stops)
+            pixels, place = read_picture(file, view=args.view)
+            yield file, shown(put(pixels, place.data, place.display), args.transform, stops)
         progress(len(files), len(files))
 
     with console.progress("pictures", "frames") as progress:
@@ -88,6 +91,12 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
     pixels: np.ndarray
     for file, pixels in pictures:
         write_picture(folder / f"{file.stem}.png", pixels, overwrite)
+
+
+def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
+    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole."""
+    seen = place.data.common(place.display) or place.data
+    return image[seen.within(place.data)]
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:

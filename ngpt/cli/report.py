@@ -8,7 +8,7 @@ import numpy as np
 
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read, read_image
+from ngpt.io.exr import read, read_picture
 from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
@@ -21,6 +21,9 @@ from ngpt.system.files import atomic_output, check_output
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
+from ngpt.windows import Place, overlap, put
+
+Slices = tuple[slice, slice]
 
 # Denoising moves the mean by a fraction of this.
 _STOPS = 0.5
@@ -39,15 +42,15 @@ MEANINGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Of one file alone all layers are shown. Folders are shots: the page plays them, and with a folder of "
-        "references there is a table of errors and flicker. Folders of training runs are compared: curves, pictures, "
-        "settings that differ."
+        "Of one file alone all layers are shown. Images are compared in the pixels that all have, by their data "
+        "windows. Folders are shots: the page plays their display windows, and with a folder of references there is a "
+        "table of errors and flicker. Folders of training runs are compared: curves, pictures, settings that differ."
     )
     parser.add_argument(
         "images",
         nargs="+",
         metavar="IMAGE.exr",
-        help="images of one size, of any renderer; or folders of frames, patterns of their names, or training runs",
+        help="images of one place and size, of any renderer; or folders of frames, patterns of their names, or runs",
     )
     parser.add_argument(
         "--ref",
@@ -69,10 +72,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
     names = labels(args.images)
     if any(is_shot(path) for path in args.images):
         return run_shots(args, names, target, console)
-    images = [read_image(path) for path in args.images]
-    reference = read_image(args.ref) if args.ref else None
-    for path, image in zip([*args.images[1:], args.ref], [*images[1:], reference], strict=True):
-        check_size(path, image, args.images[0], images[0])
+    paths = [*args.images, *([args.ref] if args.ref else [])]
+    whole, places = zip(*map(read_picture, paths), strict=True)
+    all_have = overlap(paths, places)
+    if all_have.line:
+        console.say(all_have.line)
+    images = all_have.of(whole)
+    reference = images.pop() if args.ref else None
     height, width = images[0].shape[:2]
     entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
     layers: dict[str, np.ndarray] = {}
@@ -128,37 +134,50 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     for folder, files in zip(folders, shots, strict=True):
         for remark in remarks(folder, files):
             console.say(remark)
-    first = read_image(frames[0][0])
-    metrics, lacks = available(*first.shape[:2]) if args.ref else ([], [])
+    start = str(frames[0][0])
+    first = read_picture(start).place.display
+    metrics, lacks = available(first.height, first.width) if args.ref else ([], [])
     for lack in lacks:
         console.say(lack)
-    scenes, motions = [], []
+    scenes: list[Scene] = []
+    motions: list[np.ndarray | None] = []
+    partly = 0
+    # Of each folder the frames as they are measured: NaN where the display window has no pixel of theirs.
+    known: list[list[np.ndarray]] = [[] for _ in folders]
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
             progress(done, len(frames))
             paths = [str(path) for path in frame]
-            images = [read_image(path) for path in paths]
-            for path, image in zip(paths, images, strict=True):
-                check_size(path, image, str(frames[0][0]), first)
+            whole, places = zip(*map(read_picture, paths), strict=True)
+            all_have, display = overlap(paths, places), places[0].display
+            both = all_have.common.common(display)
+            if both is None or display.size != first.size:
+                why = "render or crop them to one size" if both else "nothing of it is seen"
+                raise NgptError(f"{paths[0]} is {places[0]} and {start} is of {first}; {why}")
+            partly += bool(all_have.line)
+            images = [put(image, window, display) for image, window in zip(whole, all_have.windows, strict=True)]
+            for values, image, window in zip(known, whole, all_have.windows, strict=True):
+                values.append(put(image, window, display, np.nan))
             reference = images.pop() if args.ref else None
             entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
-            motions.append(motion_of(paths))
+            motions.append(motion_of(paths, places[0]))
             if reference is not None:
                 for entry, path in zip(entries, paths, strict=False):
-                    add_errors(entry, metrics, reference, path, paths[-1])
+                    add_errors(entry, metrics, reference, path, paths[-1], both.within(display))
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
-            size = f"{first.shape[1]}x{first.shape[0]}"
-            caption = f"{frame[0].name}, {size}"
+            caption = f"{frame[0].name}, {first.width}x{first.height}"
             scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
+    if partly:
+        console.say(f"{partly} of {len(frames)} frames: compared are the pixels that all images have")
     tables = {}
     for place in range(len(names)):
-        add_maps(scenes, place, "change", change_maps([scene.entries[place].image for scene in scenes], motions))
+        add_maps(scenes, place, "change", change_maps(known[place], motions))
     if args.ref and len(frames) > 1:
-        references = [np.asarray(scene.reference) for scene in scenes]
+        references = known[-1]
         rows = [["", *metrics, "flicker"]]
         for place, name in enumerate(names):
-            images = [scene.entries[place].image for scene in scenes]
+            images = known[place]
             add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
@@ -196,12 +215,13 @@ def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarra
         scene.entries[place].maps[name] = np.broadcast_to(values, image.shape[:2])
 
 
-def motion_of(paths: list[str]) -> np.ndarray | None:
-    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them."""
+def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
+    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them; in its display window."""
     for path in paths:
-        layers = read(path).layers
-        if "motion" in layers:
-            return layers["motion"]
+        stack = read(path)
+        window = stack.place.seen_from(place)
+        if "motion" in stack and window is not None:
+            return put(stack["motion"], window, place.display, np.nan)
     return None
 
 
@@ -238,19 +258,17 @@ def labels(paths: list[str]) -> list[str]:
     return [str(place) for place in places]  # they differ in their endings only
 
 
-def check_size(path: str, image: np.ndarray | None, first: str, expected: np.ndarray) -> None:
-    """Raises NgptError unless the image is as large as the first."""
-    if image is not None and image.shape != expected.shape:
-        (height, width), (rows, columns) = image.shape[:2], expected.shape[:2]
-        raise NgptError(f"{path} is {width}x{height} but {first} is {columns}x{rows}; render or crop them to one size")
-
-
-def add_errors(entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str) -> None:
-    """Measures a picture of file ``path`` against the reference of file ``other``."""
+def add_errors(
+    entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
+) -> None:
+    """Measures ``part`` of a picture of file ``path`` against the reference of file ``other``."""
     try:
-        entry.metrics, entry.maps = judge(metrics, entry.image, reference)
+        entry.metrics, maps = judge(metrics, entry.image[part], reference[part])
     except NgptError as error:
         raise NgptError(f"{path} and {other}: {error}") from error
+    for name, values in maps.items():
+        entry.maps[name] = np.zeros(entry.image.shape[:2], values.dtype)
+        entry.maps[name][part] = values
 
 
 def print_table(entries: list[Entry]) -> None:

@@ -9,27 +9,27 @@ import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR
 
 from ngpt.errors import NgptError
 from ngpt.io.aliases import writer_of
 from ngpt.io.header import read_headers
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.layout import StackSource, file_views, gather, is_half, scatter, taken
+from ngpt.io.layout import StackSource, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.resolution import Found, Resolution, resolve, resolve_alone
 from ngpt.io.resolution import layers_of_light as find_light
-from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, with_result
+from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, with_result
 from ngpt.io.views import Part, View, choose_views, views_of
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
+from ngpt.windows import Place
 
 _LOG = logging.getLogger(__name__)
 
@@ -37,6 +37,7 @@ __all__ = [
     "MADE_BY",
     "ExrImage",
     "ExrPart",
+    "Picture",
     "StackSource",
     "channels_alone",
     "layers_in",
@@ -45,6 +46,7 @@ __all__ = [
     "read",
     "read_exr",
     "read_image",
+    "read_picture",
     "read_views",
     "replace_layers_of_light",
     "views_in",
@@ -136,7 +138,7 @@ def _stack(
     arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
     attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
-    stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path)
+    stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
     for name, found in resolution.items():
         here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
         if not np.array_equal(here, there):
@@ -190,8 +192,20 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     return layer
 
 
+class Picture(NamedTuple):
+    """What a viewer shows of a file, (H, W, 3) float32, and where it lies."""
+
+    pixels: np.ndarray
+    place: Place
+
+
 def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
-    """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
+    """Reads what a viewer would show of a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    return read_picture(path, isolated, view).pixels
+
+
+def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> Picture:
+    """Reads the picture that a viewer would show: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
     ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
@@ -200,14 +214,14 @@ def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None
     image = read_exr_isolated(path) if isolated else read_exr(path)
     part, chosen = image.parts[0], _one_view(image, view, str(path))
     if view is None and all(name in part.channels for name in RGB):
-        return converted(gather(part, RGB), to_rec709(part.header))
+        return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
     stack = _stack(image, chosen, None, isolated, None, str(path))
     # That of a result is beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
         part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
         if all(name in part.channels for name in root):
-            return converted(gather(part, root), to_rec709(part.header))
-    return converted(stack["primal"], to_rec709(stack.attributes))
+            return Picture(converted(gather(part, root), to_rec709(part.header)), place_of(part))
+    return Picture(converted(stack["primal"], to_rec709(stack.attributes)), stack.place)
 
 
 def write(
@@ -220,7 +234,7 @@ def write(
     """Writes a stack, a result or an image, and returns its path.
 
     A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
-    removed), or else as one scanline part, compressed with ZIP, primal in the root R G B.
+    removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
 
     A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
     of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
@@ -286,14 +300,14 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
     a file are. ``pass_through`` reads them.
     """
     stack.require("primal", why="carrying further channels")
-    part, found = ExrPart("", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {}), {}
+    part, found = ExrPart("", new_header(stack), {}), {}
     for name in stack.names:
         prefix = "" if name in ("primal", "alpha") else f"{name}."
         found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
         scatter(part, found[name].channels, stack[name], half=False)
     part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
     image = ExrImage([part])
-    return GradientStack(stack.layers, stack.attributes, StackSource(image, found, file_views(image)[0]), stack.path)
+    return replace(stack, source=StackSource(image, found, file_views(image)[0]))
 
 
 def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:

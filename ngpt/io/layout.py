@@ -7,6 +7,7 @@ import numpy as np
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.io.resolution import Found, Resolution
 from ngpt.io.views import Part, View, views_of
+from ngpt.windows import Place, Window
 
 _HALF_MAX = 65504.0
 _HALF_NORMAL_MIN = 2.0**-14
@@ -30,6 +31,11 @@ def file_views(image: ExrImage) -> list[View]:
             for part in image.parts
         ]
     )
+
+
+def place_of(part: ExrPart) -> Place:
+    """Where the pixels of a part lie."""
+    return Place(Window.of_box(part.header["dataWindow"]), Window.of_box(part.header["displayWindow"]))
 
 
 def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:

@@ -1,6 +1,7 @@
 """Stacks and results as files: what a stack was read from, with its layers brought up to date, and a result in it."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -41,8 +42,7 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
     """
     if stack.source is None:
         stack.require("primal", why=f"writing {path}")
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        image, resolution, main = ExrImage([ExrPart("", header, {})]), {}, 0
+        image, resolution, main = ExrImage([ExrPart("", new_header(stack), {})]), {}, 0
     else:
         parts = (base or stack.source.image).parts
         image = ExrImage([replace(part, channels=dict(part.channels)) for part in parts])
@@ -79,6 +79,12 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
             resolution[name] = Found(main, names, name)
         scatter(part, names, values, half)
     return image, resolution, main
+
+
+def new_header(stack: GradientStack) -> dict[str, Any]:
+    """Of the part that a stack is written to which comes from no file."""
+    windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
+    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
 
 
 def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:

@@ -30,6 +30,13 @@ class StackCrop:
         self.scene, self.inputs = folder.name, len(stacks)
         self._stacks, self._reference = stacks, reference
         held = [read(str(path)) for path in stacks]
+        converged = read(str(reference))
+        for stack in held:
+            if stack.place.seen_from(converged.place) != converged.place.data:
+                raise NgptError(
+                    f"{stack.path} is {stack.place} but {reference} is {converged.place}; render them with one data "
+                    "window"
+                )
         self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
         self._caustic = ["caustic" in stack for stack in held]
         self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)

