@@ -1,17 +1,13 @@
 """Arguments that several verbs share, and their conversion."""
 
 import argparse
-import glob
 import json
 import re
 from pathlib import Path
 
-from ngpt.errors import NgptError
+from ngpt.io.frames import input_files, is_shot
 from ngpt.layers import LAYERS
 from ngpt.system import configs
-
-# What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
-RESULT_SUFFIX = "_denoised"
 
 # Layers that many renderers write into files of their own.
 FILES = ("albedo", "normal", "depth")
@@ -56,8 +52,13 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=LAYER",
-        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file; may be repeated",
+        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file, or from channels with signs and factors "
+        '("-velocity.R,velocity.G"); may be repeated',
     )
+
+
+def add_view(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument("--view", metavar="NAME", help=f"a view of stereo files, such as left or right ({default})")
 
 
 def assignment(text: str) -> tuple[str, str]:
@@ -105,21 +106,8 @@ def stack_files(names: list[str]) -> list[Path]:
     Folders and patterns leave out results of earlier runs. Raises NgptError for a folder or pattern without a file; a
     plain name is taken as it is, for its reader to complain about.
     """
-    files: dict[Path, None] = {}
-    for name in names:
-        path = Path(name)
-        if path.is_dir():
-            found = sorted(p for p in path.iterdir() if p.suffix.lower() == ".exr")
-        elif glob.has_magic(name) and not path.exists():
-            found = sorted(Path(p) for p in glob.glob(name, recursive=True))
-        else:
-            files[path] = None
-            continue
-        inputs = [p for p in found if not p.stem.endswith(RESULT_SUFFIX) and not p.name.startswith(".")]
-        if not inputs:
-            raise NgptError(f"{name}: no .exr files to denoise there")
-        files.update(dict.fromkeys(inputs))
-    return list(files)
+    files = [path for name in names for path in (input_files(name) if is_shot(name) else [Path(name)])]
+    return list(dict.fromkeys(files))
 
 
 def print_json(value: object) -> None:

@@ -3,6 +3,7 @@
 import argparse
 import os
 import time
+from collections import defaultdict
 from collections.abc import Container, Mapping
 from contextlib import closing, nullcontext
 from dataclasses import replace
@@ -15,23 +16,24 @@ import numpy as np
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
-    RESULT_SUFFIX,
     add_files,
     add_force,
     add_json,
     add_layers,
     add_untrusted,
+    add_view,
     assignment,
     given_files,
     print_json,
     stack_files,
 )
-from ngpt.cli.denoise_shot import way, windowed
+from ngpt.cli.denoise_shot import motion_hint, one_view_only, way, windowed
 from ngpt.cli.picture import add_look, check_picture, exposed, in_picture
 from ngpt.cli.reference import Errors, Reference
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read, write
+from ngpt.io.exr import read_views, write
+from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
@@ -111,6 +113,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ref", metavar="REF", help="reference image: report the error in the pixels that both have")
     add_files(parser)
     add_layers(parser)
+    add_view(parser, "default: all of them")
     add_look(parser)
     add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
@@ -160,6 +163,9 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         by_wcv = args.method == "wcv" and not options
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
+        for name in filter(is_shot, args.stacks):
+            for remark in remarks(name, stack_files([name]), results=False):
+                console.say(remark)
     if windows:
         everything = {target for _, target in pairs}
         frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)
@@ -172,7 +178,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
                 args=args,
                 options=options,
                 reference=reference,
-                temporal=Temporal() if args.temporal else None,
+                temporal=defaultdict(Temporal) if args.temporal else None,
             ),
             overwrite,
         )
@@ -189,6 +195,8 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
                     console.say(f"{source}: the error of {unknown} pixels is NaN, for their variances are not finite")
             reports.append(report)
             progress(i, len(pairs))
+    if args.temporal and (hint := motion_hint(pairs, reports, args)):
+        console.say(hint)
     failed = sum("error" in report for report in reports)
     skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:
@@ -208,7 +216,8 @@ class Frame(NamedTuple):
     """A stack on its way from its file to that of its result; with ``there`` its result was there already.
 
     ``cut`` says that a file is in its place that is not whole.
-    ``over_time`` is what other frames were to the result, as header attributes.
+    ``over_time`` is what other frames were to the result, as header attributes; ``reason`` why they were nothing.
+    ``others`` are the other views of the file.
     """
 
     source: Path
@@ -220,6 +229,13 @@ class Frame(NamedTuple):
     there: bool = False
     cut: bool = False
     over_time: Mapping[str, Any] = {}
+    reason: str = ""
+    others: tuple["Frame", ...] = ()
+
+    @property
+    def view(self) -> str:
+        """The name of the view that it is of; "" in a file without views."""
+        return self.stack.source.view.name if self.stack is not None and self.stack.source is not None else ""
 
 
 def read_frame(
@@ -232,7 +248,11 @@ def read_frame(
     if there and target not in again:
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
-    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there, cut=cut)
+    stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
+    first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
+    if others and (what := one_view_only(target, args, files)):
+        raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
+    return first._replace(others=tuple(others))
 
 
 def compute_frame(
@@ -240,39 +260,43 @@ def compute_frame(
     args: argparse.Namespace,
     options: dict,
     reference: Reference | None,
-    temporal: Temporal | None,
+    temporal: dict[str, Temporal] | None,
 ) -> Frame:
+    """The frame with its result, and those of its other views; ``temporal`` is the history of each view."""
     stack = frame.stack
     if stack is None:
         return frame
+    others = tuple(compute_frame(other, args, options, None, temporal) for other in frame.others)
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
     result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
-    over_time = {}
+    over_time, reason = {}, ""
     if temporal is not None:
-        begun = time.perf_counter()
-        image = temporal.next(stack, result.image)
+        begun, history = time.perf_counter(), temporal[frame.view]
+        image = history.next(stack, result.image)
         result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
-        over_time = {"ngpt:temporal": "history", "ngpt:history": temporal.share}
-        if isinstance(temporal.corrections, Network):
-            over_time["ngpt:historyWeights"] = str(identify(temporal.corrections.path))
+        over_time, reason = {"ngpt:temporal": "history", "ngpt:history": history.share}, history.reason
+        if isinstance(history.corrections, Network):
+            over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
     errors = reference.errors(result.image, stack) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    return frame._replace(stack=stack, result=result, errors=errors, groups=tuple(groups), over_time=over_time)
+    frame = frame._replace(stack=stack, result=result, errors=errors, groups=tuple(groups), others=others)
+    return frame._replace(over_time=over_time, reason=reason)
 
 
 def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
     """Writes the result, and returns what there is to report."""
-    source, target, stack, result, errors, groups, there, cut, over_time = frame
+    source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
     made = {**result.attributes, **over_time}
     if target.suffix.lower() == ".exr":
-        write(target, result.image, like=stack, overwrite=overwrite or cut, attributes=made)
+        views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
+        write(target, [image for image, _ in views], [of for _, of in views], overwrite or cut, made)
     else:
         light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
         write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
@@ -292,6 +316,8 @@ def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", expo
     }
     if result.error is not None:
         report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
+    report |= {"views": [one.view for one in (frame, *others)]} if frame.view else {}
+    report |= {"why no history": reason} if reason else {}
     report |= {"in place of": "a file that was not whole"} if cut else {}
     report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
     if errors is not None:
@@ -307,12 +333,17 @@ def describe(report: dict) -> str:
     if report["weights"] and report["method"] not in METHODS:
         text += f", sha256 {report['weights']['sha256'][:12]}"
     text += f", {report['seconds']:.2f} s"
-    if report["repaired"] or report["untrusted"]:
-        text += f", repaired {report['repaired']} pixels, left out {report['untrusted']} gradients"
+    if report.get("views"):
+        text += f", views {', '.join(report['views'])}"
+    if report["repaired"]:
+        text += f", repaired {report['repaired']} pixels"
+    if report["untrusted"]:
+        text += f", left out {report['untrusted']} gradients"
     if "in place of" in report:
         text += f", in place of {report['in place of']}"
     if "history" in report:
         text += f", {report['history']:.0%} history"
+        text += f" ({report['why no history']})" if "why no history" in report else ""
     if report["groups"]:
         text += f", light groups {', '.join(report['groups'])}"
     if "metrics" in report:

@@ -1,12 +1,15 @@
 """``ngpt denoise --temporal``: which way a shot goes, and the way by windows, of the frames before and after."""
 
+import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ngpt.cli.reference import Reference
 from ngpt.errors import NgptError
-from ngpt.io.exr import layers_in
+from ngpt.io.exr import layers_in, read
+from ngpt.io.resolution import propose
+from ngpt.sequence.history import NO_MOTION
 from ngpt.sequence.wcv_windows import LENGTH, LINK, reconstruct_shot
 from ngpt.stack import GradientStack
 
@@ -34,6 +37,26 @@ def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tupl
     return False, f"{history}; windows need {', '.join(LINK)} in all frames but the first{those}"
 
 
+def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], args: argparse.Namespace) -> str:
+    """What to say of a shot without motion, and of layers that may hold it; "" for a shot with motion."""
+    why = [report["why no history"] for report in reports[1:] if "why no history" in report]
+    if not why or any(reason != NO_MOTION for reason in why):
+        return ""
+    stack = read(pairs[-1][0], dict(args.layer), args.untrusted, view=args.view)
+    proposed = propose(stack.source.view.parts, stack.source.resolution).get("motion") if stack.source else None
+    found = f"; if these lead to the next frame, y up: --layer motion={proposed}" if proposed else ""
+    return f"--temporal: without the layer 'motion' each frame is denoised by itself{found}; see docs, shots.md#motion"
+
+
+def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
+    """What there is of one view only, by the options; "" if nothing."""
+    if target.suffix.lower() != ".exr":
+        return f"{target} shows one"
+    if args.ref:
+        return "--ref is of one"
+    return f"--{next(iter(files))} is of one" if files else ""
+
+
 def windowed(
     pairs: Sequence[tuple[Path, Path]],
     read: Callable[[tuple[Path, Path]], Any],
@@ -51,6 +74,8 @@ def windowed(
         for number, pair in enumerate(pairs):
             try:
                 frames[number] = read(pair)
+                if frames[number].others:
+                    raise NgptError(f"{pair[0]}: has several views, and windows are of one; choose it with --view")
             except NgptError as error:
                 told[number] = error
                 yield None

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
+from ngpt.cli.arguments import add_json, add_layers, add_untrusted, add_view, assignment, print_json
 from ngpt.errors import NgptError
-from ngpt.io.aliases import format_aliases, propose
-from ngpt.io.exr import pass_through, read
+from ngpt.io.aliases import format_aliases
+from ngpt.io.exr import pass_through, read, views_in
+from ngpt.io.resolution import layers_held, propose
 from ngpt.layers import LAYERS
 from ngpt.measure.gains import Gain, gains
 from ngpt.merging import DIAGNOSTICS
@@ -42,6 +43,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )
     add_layers(parser)
+    add_view(parser, "default: the first")
     add_untrusted(parser)
     add_json(parser)
 
@@ -62,7 +64,22 @@ def run(args: argparse.Namespace, console: Console) -> int:
     elif Path(args.file).suffix.lower() == ".xml" or not Path(args.file).exists():
         show(other(args.file, dict(args.define)), args.json)
     else:
-        show(stack(read(args.file, dict(args.layer), args.untrusted)), args.json)
+        return file(args, console)
+    return 0
+
+
+def file(args: argparse.Namespace, console: Console) -> int:
+    """An image file; where not all of it is understood, what is in it all the same."""
+    views = views_in(args.file)
+    names = {"views": [view.name for view in views]} if len(views) > 1 else {}
+    try:
+        report = stack(read(args.file, dict(args.layer), args.untrusted, view=args.view))
+    except NgptError as error:
+        console.error(error)
+        held = {f"layers of {view.name}" if names else "layers": layers_held(view.parts) for view in views}
+        show({"file": args.file} | names | held, args.json)
+        return 1
+    show(report | names, args.json)
     return 0
 
 
@@ -156,8 +173,7 @@ def stack(stack: GradientStack) -> dict:
             name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples", "dt", "dt_var")
         ],
         "proposed": [
-            f'--layer {name}="{layer}"'
-            for name, layer in propose([(part.name, list(part.channels)) for part in parts], resolution).items()
+            f'--layer {name}="{layer}"' for name, layer in propose(stack.source.view.parts, resolution).items()
         ],
         "methods": [
             name

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force
+from ngpt.cli.arguments import add_force, add_view
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_picture
+from ngpt.io.frames import is_shot, remarks, shot_files
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
@@ -22,7 +23,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "Of a stack the noisy image is shown, of a result the result. A picture has the pixels of the data window that "
         "lie in the display window; frames of a folder have all of their display window, and one exposure."
     )
-    parser.add_argument("image", metavar="IMAGE.exr", help="an image of any renderer, or a folder of frames")
+    parser.add_argument(
+        "image",
+        metavar="IMAGE.exr",
+        help="an image of any renderer; or a folder of frames, or a pattern of their names",
+    )
     parser.add_argument(
         "-o",
         "--output",
@@ -31,39 +36,40 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help=f"picture to write ({' '.join(PICTURES)}); of a folder a film ({' '.join(SHOTS)}), or a folder for PNGs",
     )
     add_look(parser)
+    add_view(parser, "default: the first")
     parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
     add_force(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
     source, target = Path(args.image), Path(args.output)
-    if source.is_dir():
-        return shot(args, source, target, console)
+    if is_shot(args.image):
+        return shot(args, args.image, target, console)
     check_kind(target, PICTURES)
     check_output(target, args.force)
-    image = in_picture(*read_picture(source))
+    image = in_picture(*read_picture(source, view=args.view))
     write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
     console.say(f"{source} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
 
-def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console) -> int:
-    """A film of a folder's frames, or a picture of each."""
-    files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
-    if not files:
-        raise NgptError(f"{folder}: no .exr files there")
+def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) -> int:
+    """A film of the frames of a folder or a pattern, or a picture of each."""
+    files = shot_files(folder)
     film = bool(target.suffix)
     if film:
         check_kind(target, SHOTS)
         check_output(target, args.force)
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
-    stops = exposed(args.exposure, in_picture(*read_picture(files[0])))
+    for remark in remarks(folder, files):
+        console.say(remark)
+    stops = exposed(args.exposure, in_picture(*read_picture(files[0], view=args.view)))
 
     def pictures():
         for done, file in enumerate(files):
             progress(done, len(files))
-            pixels, place = read_picture(file)
+            pixels, place = read_picture(file, view=args.view)
             yield file, shown(put(pixels, place.data, place.display), args.transform, stops)
         progress(len(files), len(files))
 

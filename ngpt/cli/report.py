@@ -9,6 +9,7 @@ import numpy as np
 from ngpt.cli.arguments import add_force
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read, read_picture
+from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
@@ -49,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "images",
         nargs="+",
         metavar="IMAGE.exr",
-        help="images of one place and size, of any renderer; or folders of frames, or of training runs",
+        help="images of one place and size, of any renderer; or folders of frames, patterns of their names, or runs",
     )
     parser.add_argument(
         "--ref",
@@ -69,7 +70,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if any(is_run(Path(path)) for path in args.images):
         return run_trainings(args, target, console)
     names = labels(args.images)
-    if any(os.path.isdir(path) for path in args.images):
+    if any(is_shot(path) for path in args.images):
         return run_shots(args, names, target, console)
     paths = [*args.images, *([args.ref] if args.ref else [])]
     whole, places = zip(*map(read_picture, paths), strict=True)
@@ -128,8 +129,12 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
     """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
     folders = [*args.images, *([args.ref] if args.ref else [])]
-    frames = frames_of(folders)
-    start = str(Path(folders[0]) / frames[0])
+    shots = [shot_files_of(folder) for folder in folders]
+    frames = frames_of(folders, shots)
+    for folder, files in zip(folders, shots, strict=True):
+        for remark in remarks(folder, files):
+            console.say(remark)
+    start = str(frames[0][0])
     first = read_picture(start).place.display
     metrics, lacks = available(first.height, first.width) if args.ref else ([], [])
     for lack in lacks:
@@ -142,7 +147,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
             progress(done, len(frames))
-            paths = [str(Path(folder) / frame) for folder in folders]
+            paths = [str(path) for path in frame]
             whole, places = zip(*map(read_picture, paths), strict=True)
             all_have, display = overlap(paths, places), places[0].display
             both = all_have.common.common(display)
@@ -160,8 +165,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
                 for entry, path in zip(entries, paths, strict=False):
                     add_errors(entry, metrics, reference, path, paths[-1], both.within(display))
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
-            caption = f"{frame}, {first.width}x{first.height}"
-            scenes.append(Scene(Path(frame).stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
+            caption = f"{frame[0].name}, {first.width}x{first.height}"
+            scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
     if partly:
         console.say(f"{partly} of {len(frames)} frames: compared are the pixels that all images have")
@@ -176,6 +181,8 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
             add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
+        if all(motion is None for motion in motions[1:]):
+            console.say("flicker is nan: no frame has motion vectors (layer 'motion'), to tell it from what moves")
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
             tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
@@ -218,20 +225,23 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
     return None
 
 
-def frames_of(folders: list[str]) -> list[str]:
-    """The names of the frames, which all folders must have. Raises NgptError for files among folders, and lacks."""
-    found = []
-    for folder in folders:
-        if not os.path.isdir(folder):
-            raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
-        found.append({path.name for path in Path(folder).iterdir() if path.suffix.lower() == ".exr"})
-        if not found[-1]:
-            raise NgptError(f"{folder}: no .exr files there")
-        if differ := found[-1] ^ found[0]:
-            name = min(differ)
-            has, lacks = (folder, folders[0]) if name in found[-1] else (folders[0], folder)
-            raise NgptError(f"{has} has {name} and {lacks} has not; give folders of the same frames")
-    return sorted(found[0])
+def shot_files_of(folder: str) -> list[Path]:
+    """The frames of a shot; raises NgptError for files, of which a shot has several."""
+    if not is_shot(folder):
+        raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+    return shot_files(folder)
+
+
+def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
+    """The file of each frame in every shot, in the order of the first; raises NgptError where one lacks a frame."""
+    found = [{frame_name(path): path for path in files} for files in shots]
+    for folder, files in zip(folders, found, strict=True):
+        if differ := files.keys() ^ found[0].keys():
+            name = min(differ, key=natural)
+            has, lacks = (folder, folders[0]) if name in files else (folders[0], folder)
+            path = files.get(name) or found[0][name]
+            raise NgptError(f"{has} has {path.name} and {lacks} has not; give folders of the same frames")
+    return [tuple(files[name] for files in found) for name in found[0]]
 
 
 def labels(paths: list[str]) -> list[str]:

@@ -42,6 +42,9 @@ from ngpt.windows import Place
 LONGEST = 16
 # Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
 FAST = 0.005
+# Mean weights of history below this are none: 0 %.
+NOTHING = 0.005
+NO_MOTION = "no layer 'motion'"
 
 
 @dataclass(frozen=True)
@@ -69,6 +72,7 @@ class Temporal:
         self._history: _History | None = None
         self.blend: Blend | None = None  # what the last frame was made of; None for a restart
         self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
+        self.reason = ""  # why history did not count in the last frame; "" where it did
 
     @property
     def share(self) -> float:
@@ -92,6 +96,7 @@ class Temporal:
         features = data.features
         self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
         before = self._history
+        self.reason = "the first frame" if before is None else _cut(stack, before)
         if previous is not None:
             given = repair(GradientStack({"primal": previous}), gradients=False).image
             if before is None or before.light.shape != given.shape:
@@ -124,6 +129,7 @@ class Temporal:
                 now, b = self.blend.by(self.corrections(self.blend.inputs()))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
+            self.reason = _doubt(b, found, trust)
             # They have noise as well, and are blended as the light is, that they stay those of its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
         # In the units of the stack: the next one may be of another magnitude.
@@ -142,3 +148,24 @@ def _shift(stack: GradientStack, before: _History) -> tuple[int, int] | None:
     previous = stack.number("ngpt:previousFrame")
     follows = previous is None or before.frame is None or previous == before.frame
     return stack.place.shift_in(before.place) if follows and "motion" in stack else None
+
+
+def _cut(stack: GradientStack, before: _History) -> str:
+    """Why the last frame is not the one that the stack's motion leads to."""
+    if "motion" not in stack:
+        return NO_MOTION
+    previous = stack.number("ngpt:previousFrame")
+    if previous is not None and before.frame is not None and previous != before.frame:
+        return f"is made after frame {previous:g}, and the frame before is {before.frame:g}"
+    return f"is {stack.place}, and the frame before {before.place}"
+
+
+def _doubt(weight: np.ndarray, found: np.ndarray, trust: np.ndarray) -> str:
+    """Why history counts for nothing, where ``weight`` says so: where it was found, and where features agree."""
+    if weight.mean() >= NOTHING:
+        return ""
+    if not found.any():
+        return "motion is not known, or leads out of the frame before"
+    if trust.mean() < NOTHING:
+        return "albedo, normal or depth are not those of the frame before, where motion leads"
+    return "the light differs from the frame before by more than its noise"

@@ -8,6 +8,7 @@ import numpy as np
 
 from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
+from ngpt.io.frames import natural
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -92,8 +93,9 @@ class StackFolder(Sequence[StackCrop]):
 
     def __init__(self, folder: str | Path):
         self._crops = []
-        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
-            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
+        views = [path for path in Path(folder).iterdir() if path.is_dir() and not path.name.startswith(".")]
+        for view in sorted(views, key=natural):
+            stacks = sorted((path for path in view.glob("[!.]*.exr") if path.name != "reference.exr"), key=natural)
             reference = view / "reference.exr"
             if not stacks:
                 continue

@@ -65,9 +65,9 @@ def test_three_frames_are_in_memory_at_most(frames, tmp_path, monkeypatch):
             alive.add(id(stack))
             most.append(len(alive))
         weakref.finalize(stack, alive.discard, id(stack))
-        return stack
+        return [stack]
 
-    monkeypatch.setattr("ngpt.cli.denoise.read", counted)
+    monkeypatch.setattr("ngpt.cli.denoise.read_views", counted)
     (frames / "2.exr").write_bytes(b"not an image")
     assert main(["denoise", str(frames), "-o", str(tmp_path / "out"), "-m", "l2", "-q"]) == 1
     assert len(most) == 5 and max(most) <= 3 and not alive

@@ -200,3 +200,30 @@ def test_pictures_of_other_sizes_have_no_history(rng, history):
     temporal = history()
     temporal.next(stack, smooth(stack))
     assert np.array_equal(temporal.next(small, smooth(small)), smooth(small))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda frame: frame, ""),
+        (lambda frame: without(frame, "motion"), "no layer 'motion'"),
+        (lambda frame: frame.replace(motion=np.full((*SIZE, 2), 99.0)), "motion is not known, or leads out of"),
+        (lambda frame: frame.replace(motion=np.full((*SIZE, 2), np.nan)), "motion is not known, or leads out of"),
+        (lambda frame: frame.replace(albedo=1 - frame["albedo"], depth=9 + 0 * frame["depth"]), "albedo, normal or"),
+        (lambda frame: frame.replace(primal=9 * frame["primal"]), "the light differs"),
+        (
+            lambda frame: GradientStack({k: v[:-4] for k, v in frame.layers.items()}),
+            "is ",
+        ),
+        (lambda frame: GradientStack(frame.layers, {"ngpt:previousFrame": 4}), "is made after frame 4, and the frame"),
+    ],
+)
+def test_history_that_counts_for_nothing_has_a_reason(rng, change, reason):
+    image, features = view()
+    frames = [frame_of(image, features, rng, **{"ngpt:frame": i}) for i in (6, 7)]
+    temporal = Temporal(None)
+    temporal.next(frames[0], smooth(frames[0]))
+    assert temporal.reason == "the first frame" and temporal.share == 0
+    last = change(frames[1])
+    temporal.next(last, smooth(last))
+    assert temporal.reason.startswith(reason) and bool(temporal.reason) == (temporal.share < 0.005) == bool(reason)
