@@ -23,6 +23,7 @@ import numpy as np
 
 import ngpt
 from bench.common import metadata, save
+from ngpt.io.frames import shot_files
 from ngpt.measure.metrics import relmse_trimmed
 from ngpt.methods import METHODS
 from ngpt.sequence.flicker import flicker
@@ -68,7 +69,7 @@ def main() -> None:
                 continue
             kinds = render_stacks(args, scene, shot, folder)
             stacks, paired, references, plain = (
-                [ngpt.read(f) for f in sorted((folder / k).glob("*.exr"))] for k in (*kinds, "plain")
+                [ngpt.read(f) for f in shot_files(str(folder / k))] for k in (*kinds, "plain")
             )
             found = []
             for method in args.methods:

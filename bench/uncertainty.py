@@ -7,7 +7,9 @@ is a built-in one, or a folder with scene.xml in it. References have noise; of t
 it is a part: their half-width is sqrt(error² + variance of the reference). Pixels that show a lamp are left out.
 
 Each method's factor is chosen on --scenes, so that both coverages are closest to 68.3 and 95 %; --checked are scenes
-that it is then checked on. A table is printed; the numbers are written as JSON.
+that it is then checked on. With --halves, each stack is merged of two with half of the samples each, which the error
+goes by, too. Two rows are printed for each method: coverages, and the tail: the share of values that are more than five
+errors off, and the sum of all squared errors over the claimed one. The numbers are written as JSON.
 """
 
 import argparse
@@ -16,10 +18,11 @@ from pathlib import Path
 import numpy as np
 
 from bench.common import metadata, save
-from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
+from ngpt.api.uncertainty import FACTOR, FACTORS, reconstruct_with_error
 from ngpt.errors import NgptError
 from ngpt.io.exr import read, write
-from ngpt.methods import METHODS, reconstruct
+from ngpt.merging import merge
+from ngpt.methods import METHODS
 from ngpt.stack import GradientStack
 
 INTERVALS = {"68": (1.0, 0.683), "95": (1.96, 0.95)}
@@ -31,6 +34,7 @@ def main() -> None:
     parser.add_argument("--checked", nargs="*", default=["glossy", "environment"], help="that they are checked on")
     parser.add_argument("--methods", nargs="*", default=[name for name, m in METHODS.items() if not m.missing()])
     parser.add_argument("--spp", type=int, nargs="*", default=[4, 16])
+    parser.add_argument("--halves", action="store_true", help="the error goes by two halves of the samples, too")
     parser.add_argument("--reference", type=int, default=1024, metavar="SPP")
     parser.add_argument("--size", type=int, nargs=2, default=(192, 108), metavar=("WIDTH", "HEIGHT"))
     parser.add_argument("--cache", type=Path, required=True, help="folder of stacks and references")
@@ -58,18 +62,22 @@ def main() -> None:
         row = {"best factor": round(float(best), 3), "factor": used}
         row |= {"chosen": mean(chosen, used), "checked": mean(checked, used)}
         row["cases"] = {f"{scene}, {spp} spp": covered(c, used) for (scene, spp), c in cases.items()}
+        row["tails"] = {f"{scene}, {spp} spp": tail(c, used) for (scene, spp), c in cases.items()}
         result["methods"][method] = row
         print(line(method, row), flush=True)
+        print(tail_line(method, row), flush=True)
         save(args.output, result)
 
 
-def images(scene: str, spp: int, args: argparse.Namespace) -> tuple[GradientStack, GradientStack]:
-    """The stack and the reference, rendered where they are not in the cache."""
+def images(scene: str, spp: int, args: argparse.Namespace) -> list[GradientStack]:
+    """The reference, the stack and, where they are wanted, its halves; rendered where they are not in the cache."""
     name, found = Path(scene).name, []
-    for file, count, sampler in (
-        (f"{name}-{spp}.exr", spp, "auto"),
-        (f"{name}-reference.exr", args.reference, "primal"),
-    ):
+    files = [(f"{name}-reference.exr", args.reference, "primal", spp)]
+    if args.halves:
+        files += [(f"{name}-{spp}-half{i}.exr", spp // 2, "auto", 2 * spp + i) for i in (0, 1)]
+    else:
+        files.append((f"{name}-{spp}.exr", spp, "auto", spp))
+    for file, count, sampler, seed in files:
         path = args.cache / file
         if not path.exists():
             from data_gen.backend import use_variant
@@ -81,15 +89,15 @@ def images(scene: str, spp: int, args: argparse.Namespace) -> tuple[GradientStac
             at = Path(scene) / "scene.xml"
             loaded = load_scene(str(at) if at.exists() else scene, tuple(args.size))
             args.cache.mkdir(parents=True, exist_ok=True)
-            write(path, render_stack(loaded, count, spp, sampler))
+            write(path, render_stack(loaded, count, seed, sampler))
         found.append(read(path))
-    return found[0], found[1]
+    return [found[0], merge(found[1:]), *found[1:]] if args.halves else found
 
 
-def case(method: str, stack: GradientStack, reference: GradientStack) -> tuple[np.ndarray, ...]:
+def case(method: str, reference: GradientStack, stack: GradientStack, *halves: GradientStack) -> tuple[np.ndarray, ...]:
     """Of all values that show no lamp: difference to the reference, change by more noise, variance of the reference."""
-    image = reconstruct(stack, method).image
-    changed = change(image, reconstruct(noisier(stack), method).image)
+    result = reconstruct_with_error(stack, method, halves=halves or None)
+    image, changed = result.image, result.error / FACTORS.get(method, FACTOR)
     shown = ~stack["direct"].any(axis=-1) if "direct" in stack else np.ones(image.shape[:2], bool)
     variance = np.nan_to_num(reference["primal_var"])
     return tuple(a[shown].astype(np.float64) for a in (image - reference["primal"], changed, variance))
@@ -100,6 +108,17 @@ def covered(one: tuple[np.ndarray, ...], factor: float) -> dict[str, float]:
     difference, changed, variance = one
     width = np.sqrt((factor * changed) ** 2 + variance)
     return {name: round(float(np.mean(np.abs(difference) <= k * width)), 4) for name, (k, _) in INTERVALS.items()}
+
+
+def tail(one: tuple[np.ndarray, ...], factor: float) -> dict[str, float]:
+    """The share of values that are more than 5 errors off, and the sum of all squared errors over the claimed one."""
+    difference, changed, variance = one
+    width = np.sqrt((factor * changed) ** 2 + variance)
+    squares = (np.square(difference) - variance).sum() / np.square(factor * changed).sum()
+    return {
+        "beyond 5 errors": round(float(np.mean(np.abs(difference) > 5 * width)), 5),
+        "squares over claimed": round(float(squares), 3),
+    }
 
 
 def mean(cases: list, factor: float) -> dict[str, float]:
@@ -119,6 +138,15 @@ def line(method: str, row: dict) -> str:
         each = [one[name] for one in row["cases"].values()]
         mean = (row["checked"] or row["chosen"])[name]
         cells.append(f"{100 * mean:.0f} | {100 * min(each):.0f} .. {100 * max(each):.0f}")
+    return " | ".join(cells) + " |"
+
+
+def tail_line(method: str, row: dict) -> str:
+    """A row of the table of tails: share beyond 5 errors in percent, then squares; both the mean, least to most."""
+    cells = [f"| `{method}`"]
+    for name, unit in (("beyond 5 errors", 100), ("squares over claimed", 1)):
+        each = [unit * one[name] for one in row["tails"].values()]
+        cells.append(f"{np.mean(each):.2f} | {min(each):.2f} .. {max(each):.2f}")
     return " | ".join(cells) + " |"
 
 

@@ -14,6 +14,7 @@ from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
+from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
@@ -81,7 +82,7 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    limits["look"] = lambda film: newest(lambda: stack_of(film, seed, sampler, start, False, {}))
+    limits["look"] = lambda film: newest(lambda: stack_of(film, sensor, seed, sampler, start, False, {}))
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
@@ -97,7 +98,7 @@ def render_stack(
             film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
     if adaptive is not None:
         chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
-    return stack_of(film, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))
+    return stack_of(film, sensor, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:
@@ -107,9 +108,18 @@ def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, st
 
 
 def stack_of(
-    film: GradientFilm, seed: int, sampler: str, start: float, diagnostics: bool, more: dict[str, Any]
+    film: GradientFilm,
+    sensor: mi.Sensor,
+    seed: int,
+    sampler: str,
+    start: float,
+    diagnostics: bool,
+    more: dict[str, Any],
 ) -> GradientStack:
-    """The stack of a film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes."""
+    """The stack of a sensor's film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes.
+
+    It lies where the crop window of the sensor does, in a picture of the whole size.
+    """
     layers = film.develop()
     attributes = {
         "ngpt:spp": film.samples,
@@ -120,7 +130,7 @@ def stack_of(
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
     } | more
-    stack = GradientStack(layers, attributes=attributes)
+    stack = GradientStack(layers, attributes=attributes, place=place_of(sensor))
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 
 

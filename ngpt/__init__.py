@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from ngpt.api.arrays import Denoiser, denoise
     from ngpt.api.uncertainty import reconstruct_with_error
     from ngpt.errors import NgptError
-    from ngpt.io.exr import read, read_image, write
+    from ngpt.io.exr import read, read_image, read_views, write
     from ngpt.merging import merge
     from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.sequence.history import Temporal
@@ -47,6 +47,7 @@ __all__ = [
     "merge",
     "read",
     "read_image",
+    "read_views",
     "reconstruct",
     "reconstruct_with_error",
     "write",
@@ -56,7 +57,7 @@ __all__ = [
 # have been loaded, which comes with this package otherwise.
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
-_HOMES |= dict.fromkeys(("read", "read_image", "write"), "io.exr")
+_HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")
 _HOMES |= {"reconstruct_with_error": "api.uncertainty", "Temporal": "sequence.history"}
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 

@@ -1,4 +1,4 @@
-"""Merging of independent stacks of one scene: more samples, without rendering them together.
+"""Merging of independent stacks of one image: more samples, or more pixels, without rendering them together.
 
 With n_i samples per pixel, means m_i and variances of the mean v_i, the stack of all N = Σ n_i samples has
 
@@ -9,9 +9,13 @@ With n_i samples per pixel, means m_i and variances of the mean v_i, the stack o
 
 Its expectation is the variance of m for any weights n_i that no sample has a say in, whatever the v_i: so it holds for
 differences too, whose two directions may have samples in different numbers.
+
+Stacks that lie in different places of one picture are tiles: each counts in its own pixels.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -20,6 +24,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
 from ngpt.layers import DIFFERENCES
 from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
 
 # Layers with a variance, and the layers that hold it.
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
@@ -30,7 +35,7 @@ _MOST = 2.0**31
 
 
 def merge(stacks: Sequence[GradientStack]) -> GradientStack:
-    """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds.
+    """The stack of all samples of ``stacks``: same scene, camera and sampler, different seeds or different places.
 
     Means are weighted by ``ngpt:spp``, or by the layer ``samples`` where a stack has it: one of differences by the
     harmonic mean of the samples of both its pixels, as their variances would be. The merged ``samples`` are sums, and
@@ -44,41 +49,89 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
     of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
 
-    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp``, ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all
-    other attributes are those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in
-    size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are
-    negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no numbers, results of a reconstruction, and
-    channels of unknown meaning.
+    Tiles (``GradientStack.place``) give the smallest rectangle that holds them all, and must fill it. They may overlap,
+    and have the same seed where they do not. The difference from a tile's last column or row to the pixel beyond it
+    was not sampled: it is NaN where no other tile knows it, and counts nothing in a reconstruction. All differences
+    are known of tiles that overlap by a pixel.
+
+    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all other attributes are those of the first stack. Raises
+    NgptError for fewer than two stacks, stacks that differ in layers or sampler, or are of pictures of different size,
+    tiles that leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``,
+    ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no numbers, results of
+    a reconstruction, and channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
     spp = [_samples(stack) for stack in stacks]
     _check(stacks, spp)
-    counts = [_counts(stack, n) for stack, n in zip(stacks, spp, strict=True)]
-    total = np.sum(counts, axis=0)
+    canvas = reduce(Window.around, (stack.place.data for stack in stacks))
+    tiles = [_Tile(stack, n, canvas) for stack, n in zip(stacks, spp, strict=True)]
+    if hole := _hole(tiles, canvas):
+        have = ", ".join(f"{tile.stack.path} {tile.stack.place.data}" for tile in tiles)
+        raise NgptError(f"no stack has all pixels of {hole}: {have}; render those too")
+    total = _total(tiles)
     layers = {}
     for name in stacks[0].names:
         if name not in (*VARIANCES.values(), "samples"):
-            layers[name] = _mean([stack[name] for stack in stacks], _of_layer(counts, name))
+            layers[name] = _mean(tiles, {tile: tile.stack[name] for tile in tiles}, name)
     for name, variance in VARIANCES.items():
-        known = all(variance in stack or n == 1 for stack, n in zip(stacks, spp, strict=True))
-        if name in layers and known:
-            means = [_varies(stack, name) for stack in stacks]
-            layers[variance] = _variance(means, stacks, _of_layer(counts, name), variance)
+        if name in layers and all(variance in tile.stack or tile.spp == 1 for tile in tiles):
+            layers[variance] = _variance(tiles, name, variance)
     if np.ptp(total):
         layers["samples"] = total
+    seeds = dict.fromkeys(seed for stack in stacks for seed in _seeds(stack))
     attributes = dict(stacks[0].attributes) | {
         "ngpt:spp": max(1, round(float(total.mean()))),
-        "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
+        "ngpt:seed": " ".join(seeds),
     }
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)
-    merged = GradientStack({name: layer.astype(np.float32) for name, layer in layers.items()}, attributes)
-    further = [pass_through(stack) for stack in stacks]
-    if not further[0]:
+    place = Place(canvas, stacks[0].place.display)
+    layers = {name: layer.astype(np.float32) for name, layer in layers.items()}
+    merged = GradientStack(layers, attributes, place=place)
+    further = {tile: pass_through(tile.stack) for tile in tiles}
+    names = further[tiles[0]]
+    if not names:
         return merged
-    return with_channels(merged, {name: _mean([channels[name] for channels in further], counts) for name in further[0]})
+    return with_channels(merged, {name: _mean(tiles, {tile: further[tile][name] for tile in tiles}) for name in names})
+
+
+@dataclass(frozen=True, eq=False)
+class _Tile:
+    """A stack of ``spp`` samples per pixel, in the ``canvas`` of all of them."""
+
+    stack: GradientStack
+    spp: int
+    canvas: Window
+
+    @property
+    def part(self) -> tuple[slice, slice]:
+        """Its rows and columns in the canvas."""
+        return self.stack.place.data.within(self.canvas)
+
+    @cached_property
+    def counts(self) -> np.ndarray:
+        """Samples of each pixel, (H, W, 1) double precision."""
+        return _counts(self.stack, self.spp)
+
+    def weights(self, name: str) -> np.ndarray:
+        """What the mean of a layer is weighted by, (H, W, 1): of a difference the harmonic mean of both its pixels'
+        counts, and 0 where the other pixel is beyond the tile, and not beyond the canvas."""
+        if name not in DIFFERENCES:
+            return self.counts
+        x, y, _ = DIFFERENCES[name]
+        n, weight = self.counts, self.counts.copy()
+        height, width = n.shape[0] - y, n.shape[1] - x
+        here, there = n[:height, :width], n[y:, x:]
+        weight[:height, :width] = 2 * here * there / np.maximum(here + there, 1)
+        rows, columns = self.part
+        if rows.stop < self.canvas.height:
+            weight[height:] = 0
+        if columns.stop < self.canvas.width:
+            weight[:, width:] = 0
+        return weight
 
 
 def _counts(stack: GradientStack, spp: int) -> np.ndarray:
@@ -98,30 +151,30 @@ def _counts(stack: GradientStack, spp: int) -> np.ndarray:
     return np.full((stack.height, stack.width, 1), float(spp))
 
 
-def _of_layer(counts: Sequence[np.ndarray], name: str) -> Sequence[np.ndarray]:
-    """What the mean of a layer is weighted by: of a difference the harmonic mean of both its pixels' counts."""
-    if name not in DIFFERENCES:
-        return counts
-    x, y, _ = DIFFERENCES[name]
-    weights = [n.copy() for n in counts]
-    for weight, n in zip(weights, counts, strict=True):
-        here, there = n[: n.shape[0] - y, : n.shape[1] - x], n[y:, x:]
-        weight[: n.shape[0] - y, : n.shape[1] - x] = 2 * here * there / np.maximum(here + there, 1)
-    return weights
+def _total(tiles: Sequence[_Tile]) -> np.ndarray:
+    """Samples of all tiles in each pixel of the canvas, (H, W, 1)."""
+    total = np.zeros((tiles[0].canvas.height, tiles[0].canvas.width, 1))
+    for tile in tiles:
+        total[tile.part] += tile.counts
+    return total
 
 
-def _like(counts: np.ndarray, layer: np.ndarray) -> np.ndarray:
-    """Counts (H, W, 1) for a layer (H, W, C), or a channel (H, W)."""
-    return counts if layer.ndim == 3 else counts[..., 0]
+def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str = "") -> np.ndarray:
+    """Mean of layers (h, w, C), or channels (h, w), over the values that are not NaN; in double precision.
 
-
-def _mean(layers: Sequence[np.ndarray], counts: Sequence[np.ndarray]) -> np.ndarray:
-    """Mean weighted by ``counts``, over the values that are not NaN; in double precision."""
-    weights = [_like(n, layer) * ~np.isnan(layer) for layer, n in zip(layers, counts, strict=True)]
-    # Products of infinite values and zero weights are left out, not added.
-    total = sum(np.where(w > 0, w * layer.astype(np.float64), 0) for w, layer in zip(weights, layers, strict=True))
+    Weighted as layer ``name``; of the whole canvas.
+    """
+    canvas = tiles[0].canvas
+    total = np.zeros((canvas.height, canvas.width, *values[tiles[0]].shape[2:]))
+    weight = np.zeros(total.shape)
+    for tile in tiles:
+        layer, n = values[tile], tile.weights(name)
+        w = (n if layer.ndim == 3 else n[..., 0]) * ~np.isnan(layer)
+        # Products of infinite values and zero weights are left out, not added.
+        total[tile.part] += np.where(w > 0, w * layer.astype(np.float64), 0)
+        weight[tile.part] += w
     with np.errstate(invalid="ignore", divide="ignore"):
-        return total / sum(weights)
+        return total / weight
 
 
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
@@ -133,28 +186,44 @@ def _varies(stack: GradientStack, name: str) -> np.ndarray:
     return values
 
 
-def _variance(
-    means: Sequence[np.ndarray], stacks: Sequence[GradientStack], counts: Sequence[np.ndarray], variance: str
-) -> np.ndarray:
-    mean = _mean(means, counts)
+def _variance(tiles: Sequence[_Tile], name: str, variance: str) -> np.ndarray:
+    """The variance of the mean of a layer over all tiles, of the whole canvas."""
+    means = {tile: _varies(tile.stack, name) for tile in tiles}
+    mean = _mean(tiles, means, name)
     squares, total = np.zeros(mean.shape), np.zeros(mean.shape)
     with np.errstate(invalid="ignore", divide="ignore"):
-        for values, stack, n in zip(means, stacks, counts, strict=True):
-            there = ~np.isnan(values)
+        for tile in tiles:
+            values, n, stack = means[tile], tile.weights(name), tile.stack
+            there = ~np.isnan(values) & (n > 0)
             within = np.where(n > 1, n * (n - 1) * stack[variance], 0) if variance in stack else 0.0
-            squares += np.where(there, within + n * (values - mean) ** 2, 0)
-            total += n * there
+            squares[tile.part] += np.where(there, within + n * (values - mean[tile.part]) ** 2, 0)
+            total[tile.part] += n * there
         return np.where(total > 1, squares / (total * (total - 1)), np.nan)
+
+
+def _hole(tiles: Sequence[_Tile], canvas: Window) -> Window | None:
+    """The rectangle around the pixels that no tile has; None where there are none."""
+    # Tiles may lie so far apart that no memory holds what is between them.
+    if canvas.width * canvas.height > 4 * sum(tile.stack.width * tile.stack.height for tile in tiles):
+        return canvas
+    empty = np.ones((canvas.height, canvas.width), bool)
+    for tile in tiles:
+        empty[tile.part] = False
+    if not empty.any():
+        return None
+    rows, columns = (np.flatnonzero(empty.any(axis=axis)) for axis in (1, 0))
+    left, top = canvas.left + int(columns[0]), canvas.top + int(rows[0])
+    return Window(left, top, int(np.ptp(columns)) + 1, int(np.ptp(rows)) + 1)
 
 
 def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
     first = stacks[0]
-    seen: dict[str, str] = {}
+    seen: dict[str, list[GradientStack]] = {}
     for stack, n in zip(stacks, counts, strict=True):
-        if (stack.width, stack.height) != (first.width, first.height):
+        if stack.place.display != first.place.display:
             raise NgptError(
-                f"{stack.path} is {stack.width}x{stack.height} but {first.path} is {first.width}x{first.height}; only "
-                "stacks of one size can be merged"
+                f"{stack.path} is {stack.place} but {first.path} is {first.place}; only stacks of one image can be "
+                "merged: its tiles, or its seeds"
             )
         for name in _means(stack) ^ _means(first):
             has, lacks = (stack, first) if name in _means(stack) else (first, stack)
@@ -164,7 +233,7 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
         if ours != theirs:
             raise NgptError(
                 f"{stack.path} was made by sampler '{ours}' and {first.path} by '{theirs}'; their variances cannot be "
-                "merged"
+                "merged: name one with --sampler"
             )
         ours, theirs = (str(s.attributes.get("ngpt:frame")) for s in (stack, first))
         if ours != theirs:
@@ -176,12 +245,13 @@ def _check(stacks: Sequence[GradientStack], counts: Sequence[int]) -> None:
             if n > 1 and name not in stack and any(name in other for other in stacks):
                 raise NgptError(f"{stack.path} has no '{name}' though it has {n} samples per pixel; render it again")
         for seed in _seeds(stack):
-            if seed in seen:
-                raise NgptError(
-                    f"{stack.path} and {seen[seed]} were both rendered with seed {seed}: the same samples twice are no "
-                    "more than once; render one of them with another --seed"
-                )
-            seen[seed] = stack.path
+            for other in seen.setdefault(seed, []):
+                if stack.place.data.common(other.place.data):
+                    raise NgptError(
+                        f"{stack.path} and {other.path} were both rendered with seed {seed}: the same samples twice "
+                        "are no more than once; render one of them with another --seed"
+                    )
+            seen[seed].append(stack)
     for stack in stacks:
         strange = next((name for name in pass_through(stack) if not name.startswith(DIAGNOSTICS)), None)
         if strange is not None:

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike
 from ngpt.errors import NgptError, did_you_mean
 from ngpt.layers import LAYERS
 from ngpt.report.notebook import stack_html
+from ngpt.windows import Place
 
 
 @dataclass(eq=False, repr=False)
@@ -25,7 +26,8 @@ class GradientStack:
 
     ``attributes`` are the header attributes beyond those that OpenEXR itself needs, ``ngpt:spp`` and the like.
     ``source`` is the file the stack was read from (``ngpt.io.exr.StackSource``), for what passes through it.
-    ``path`` is for messages.
+    ``path`` is for messages. ``place`` is where the pixels lie in the whole picture; by default, and where it is
+    of another size, they are all of it.
 
     Raises NgptError for unknown layers, types that are not real numbers, wrong shapes, layers that differ in size,
     images without pixels, and finite numbers that float32 cannot hold.
@@ -35,6 +37,7 @@ class GradientStack:
     attributes: dict[str, Any] = field(default_factory=dict)
     source: Any = None
     path: str = "stack"
+    place: Place = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         if not self.layers:
@@ -44,6 +47,8 @@ class GradientStack:
         first = "primal" if "primal" in self.layers else next(iter(self.layers))
         for name, array in self.layers.items():
             _check_size(self.path, name, array.shape, first, self.layers[first].shape)
+        if self.place is None or self.place.data.size != (self.width, self.height):
+            self.place = Place.whole(self.width, self.height)
 
     @classmethod
     def from_arrays(
@@ -136,9 +141,9 @@ class GradientStack:
             )
 
     def replace(self, **layers: ArrayLike) -> "GradientStack":
-        """Returns a stack with these layers replaced or added, and the same attributes and source."""
+        """Returns a stack with these layers replaced or added, and the same attributes, source and place."""
         new = {name: np.asarray(array) for name, array in layers.items()}
-        return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path)
+        return GradientStack({**self.layers, **new}, self.attributes, self.source, self.path, self.place)
 
 
 # Where the largest variance is below this, float32 would lose digits of those that are 2^-40 of it.

@@ -3,6 +3,7 @@
 import numpy as np
 
 from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
 
 SIZE = (40, 56)
 SIGMA = 0.2
@@ -40,6 +41,18 @@ def wall(rng, count, size=(16, 20, 3), growth=0.1):
         layers["motion"] = np.zeros((*size[:2], 2))
         found.append(GradientStack(layers, {"ngpt:frame": i, "ngpt:previousFrame": i - 1}))
     return found
+
+
+def part_of(stack, left, top, width, height):
+    """The pixels of a window, in place."""
+    place, window = stack.place, Window(left, top, width, height)
+    layers = {name: stack[name][window.within(place.data)] for name in stack.names}
+    for name, border in (("dx", np.s_[:, -1]), ("dy", np.s_[-1])):
+        if name in layers:  # as renders of a part have it
+            for layer in (name, f"{name}_var"):
+                layers[layer] = layers[layer].copy()
+                layers[layer][border] = 0
+    return GradientStack(layers, stack.attributes, path=stack.path, place=Place(window, place.display))
 
 
 def without(stack, *names):

@@ -8,8 +8,8 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.denoisers import caustic
-from ngpt.io.aliases import resolve
 from ngpt.io.exr import read, read_exr, write
+from ngpt.io.resolution import resolve
 from ngpt.merging import merge
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network.run import WEIGHTS

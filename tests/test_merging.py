@@ -4,13 +4,17 @@ import json
 
 import numpy as np
 import pytest
+from shots import part_of
 
 import ngpt
+from ngpt.api.uncertainty import known_noise
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
 from ngpt.merging import merge
+from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
 
 SHAPE = (5, 4, 3)
 
@@ -270,3 +274,147 @@ def test_names_that_are_vectors_differ_from_others(rng, name):
     b.attributes[name] = np.ones(2, np.float32)
     with pytest.raises(NgptError, match="merged"):
         merge([a, b])
+
+
+def parts(stack, seed, *windows):
+    """Tiles of a stack, with seeds and names of their own."""
+    tiles = [part_of(stack, *window) for window in windows]
+    for i, tile in enumerate(tiles):
+        tile.attributes["ngpt:seed"], tile.path = str(seed + i), f"tile{i}.exr"
+    return tiles
+
+
+LARGE = (9, 12, 3)
+
+
+@pytest.mark.parametrize("overlap", [0, 1])
+def test_tiles_are_put_together(rng, overlap):
+    """They are the whole, but for the differences across their borders, which none of them knows."""
+    whole = stack_of(rng.random((4, *LARGE)), 0)
+    for layer in (whole["dx"][:, -1], whole["dx_var"][:, -1], whole["dy"][-1], whole["dy_var"][-1]):
+        layer[:] = 0
+    windows = [(x, y, 6 + overlap * (x == 0), 4 + (y > 0) + overlap * (y == 0)) for y in (0, 4) for x in (0, 6)]
+    merged = merge(parts(whole, 7, *windows))
+    assert merged.place == whole.place and merged.attributes["ngpt:seed"] == "7 8 9 10"
+    assert merged.attributes["ngpt:seconds"] == 4 * whole.attributes["ngpt:seconds"]
+    seams = {"dx": np.s_[:, 5], "dy": np.s_[3]}
+    inside = np.ones(LARGE[:2], bool)
+    for seam in seams.values():
+        inside[seam] = inside[:, 6] = inside[4] = False
+    for name in whole.names:
+        expected = whole[name].copy()
+        if not overlap and name[:2] in seams:
+            expected[seams[name[:2]]] = np.nan
+            assert np.array_equal(merged[name], expected, equal_nan=True), name
+        elif not overlap or not name.endswith("_var"):
+            assert np.allclose(merged[name], expected, rtol=1e-6), name
+        else:  # where they overlap, the same samples were counted twice here
+            assert np.allclose(merged[name][inside], expected[inside], rtol=1e-6), name
+    assert ("samples" in merged) == bool(overlap)
+
+
+def test_tiles_that_overlap_are_averaged_by_samples(rng):
+    few, many = rng.normal(5, 1, (3, *LARGE)), rng.normal(5, 1, (8, *LARGE))
+    (left,), (right,) = parts(stack_of(few, 0), 1, (0, 0, 8, 9)), parts(stack_of(many, 0), 2, (5, 0, 7, 9))
+    merged, both = merge([left, right]), stack_of(np.concatenate([few, many]), 0)
+    assert merged["samples"][0, :, 0].tolist() == 5 * [3] + 3 * [11] + 4 * [8]
+    assert merged.attributes["ngpt:spp"] == round((5 * 3 + 3 * 11 + 4 * 8) / 12)
+    for name in ("primal", "primal_var", "dy"):
+        for columns, known in ((np.s_[:5], left), (np.s_[5:8], both), (np.s_[8:], None)):
+            expected = (right[name][:, 3:] if known is None else known[name][:, columns])[:-1]
+            assert np.allclose(merged[name][:-1, columns], expected, rtol=1e-5), name
+    # What a tile does not know at its border, the other does.
+    assert np.allclose(merged["dx"][:, 7], right["dx"][:, 2], rtol=1e-5)
+    assert np.allclose(merged["dx_var"][:, 7], right["dx_var"][:, 2], rtol=1e-5)
+    assert np.allclose(merged["dx"][:, 4], left["dx"][:, 4], rtol=1e-5)
+
+
+def test_tiles_with_seeds_of_their_own_are_merged_like_others(rng):
+    whole, other = (stack_of(rng.random((4, *LARGE)), seed) for seed in (0, 50))
+    tiles, more = parts(whole, 7, (0, 0, 5, 9), (5, 0, 7, 9)), parts(other, 20, (0, 0, 5, 9), (5, 0, 7, 9))
+    at_once, in_turn = merge([*tiles, *more]), merge([merge(tiles), merge(more)])
+    for name in at_once.names:
+        assert np.allclose(at_once[name], in_turn[name], rtol=1e-5, atol=1e-7, equal_nan=True), name
+    for tile in tiles:
+        tile.attributes["ngpt:seed"] = "3"
+    assert merge(tiles).attributes["ngpt:seed"] == "3"  # of one seed, and not the same samples
+    part = part_of(whole, 5, 0, 7, 9)
+    assert merge([part, other, tiles[0]]).place == whole.place
+
+
+@pytest.mark.parametrize(
+    ("windows", "message"),
+    [
+        ([(0, 0, 5, 9), (5, 0, 7, 5)], r"no stack has all pixels of 7x4 at \(5, 5\): tile0.exr 5x9 at \(0, 0\), tile1"),
+        ([(0, 0, 5, 9), (4, 0, 8, 9)], "both rendered with seed 3"),
+    ],
+)
+def test_tiles_that_do_not_fit_are_refused(rng, windows, message):
+    tiles = parts(stack_of(rng.random((4, *LARGE)), 0), 1, *windows)
+    for tile in tiles if "seed" in message else ():
+        tile.attributes["ngpt:seed"] = "3"
+    with pytest.raises(NgptError, match=message):
+        merge(tiles)
+
+
+def test_tiles_that_lie_far_apart_are_refused_at_once(rng):
+    tiles = [stack_of(rng.random((4, *LARGE)), seed) for seed in range(2)]
+    for tile, far in zip(tiles, (0, 2**30), strict=True):
+        tile.place = Place(Window(far, far, 12, 9), Window(0, 0, 2**31, 2**31))
+    with pytest.raises(NgptError, match=r"no stack has all pixels of 1073741836x1073741833 at \(0, 0\)"):
+        merge(tiles)
+
+
+def test_tiles_of_other_pictures_are_refused(rng):
+    (tile,) = parts(stack_of(rng.random((4, *LARGE)), 0), 1, (0, 0, 4, 5))
+    with pytest.raises(
+        NgptError, match=r"2.exr is 4x5 but tile0.exr is 4x5 at \(0, 0\) of 12x9; only stacks of one image"
+    ):
+        merge([tile, stack_of(rng.random((4, 5, 4, 3)), 2)])
+
+
+@pytest.mark.parametrize("method", ["l2", "l1", "cv", "wcv", "wl2", "ngpt-fast", "ngpt-combine"])
+def test_merged_tiles_have_no_seams(rng, method):
+    """A slope of 0 across a border would show as a step of 0.05 to 0.08. Of tiles that overlap all slopes are known."""
+    if method.startswith("ngpt"):
+        pytest.importorskip("onnxruntime")
+    y, x = np.mgrid[:32, :48]
+    truth = np.repeat((1 + 0.08 * x + 0.05 * y)[..., None], 3, axis=-1)
+    layers = {"primal": truth, "dx": np.diff(truth, axis=1, append=truth[:, -1:])}
+    layers["dy"] = np.diff(truth, axis=0, append=truth[-1:])
+    noise = {"primal": 0.2, "dx": 0.02, "dy": 0.02}
+    layers = {name: layer + rng.normal(0, noise[name], truth.shape) for name, layer in layers.items()}
+    layers |= {f"{name}_var": np.full(truth.shape, sigma**2) for name, sigma in noise.items()}
+    layers |= {"albedo": np.full(truth.shape, 0.5), "normal": np.broadcast_to([0.0, 0.0, 1.0], truth.shape)}
+    layers["depth"] = np.ones(truth.shape[:2])
+    known = {"ngpt:spp": 4, "ngpt:seed": "0", "ngpt:sampler": "gpt"}
+    whole = GradientStack({name: layer.astype(np.float32) for name, layer in layers.items()}, known)
+    expected = reconstruct(whole, method).image
+    for overlap in (0, 1):
+        windows = [(x, y, 24 + overlap * (x == 0), 16 + overlap * (y == 0)) for y in (0, 16) for x in (0, 24)]
+        merged = merge(parts(whole, 1, *windows))
+        image = reconstruct(merged, method).image
+        for axis, seam in ((1, 23), (0, 15)):
+            assert np.abs(np.diff(image - truth, axis=axis).mean(axis=(1 - axis, 2)))[seam] < 0.035
+        assert np.square(image - truth).mean() < (1.1 if overlap else 1.5) * np.square(expected - truth).mean()
+        assert known_noise(merged).all()  # that of differences which are left out does not matter
+
+
+def test_tiles_from_files_keep_what_else_they_carry(rng, tmp_path):
+    """Diagnostics, samples that differ, motion; of frames that lie beyond the display window too."""
+    whole = stack_of(rng.random((4, *LARGE)), 0, **{"ngpt:frame": 2})
+    motion = rng.normal(size=(*LARGE[:2], 2)).astype(np.float32)
+    motion[2, 7] = np.nan
+    whole = whole.replace(motion=motion, samples=rng.integers(2, 9, LARGE[:2]))
+    whole.place = Place(Window(-2, -3, 12, 9), Window(0, 0, 8, 4))
+    rates, files = rng.random(LARGE[:2]).astype(np.float32), []
+    for tile in parts(whole, 1, (-2, -3, 5, 9), (3, -3, 7, 9)):
+        there = tile.place.data.within(whole.place.data)
+        tile = with_channels(tile, {"diagnostics.discarded": rates[there]})
+        files.append(str(ngpt.write(tmp_path / tile.path, tile)))
+    assert main(["merge", *files, "-o", str(tmp_path / "merged.exr")]) == 0
+    merged = ngpt.read(tmp_path / "merged.exr")
+    assert merged.place == whole.place and merged.attributes["ngpt:frame"] == 2
+    assert np.array_equal(merged["motion"], motion, equal_nan=True)
+    assert np.array_equal(merged["samples"], whole["samples"])
+    assert np.array_equal(pass_through(merged)["diagnostics.discarded"], rates)

@@ -18,7 +18,7 @@ ngpt.errors ngpt.version
 ngpt.system ngpt.options
 ngpt.report.display ngpt.report.png
 ngpt.report.transforms ngpt.report.pictures
-ngpt.api.tensors ngpt.layers ngpt.testing ngpt.sequence.warp ngpt.report.notebook
+ngpt.api.tensors ngpt.layers ngpt.windows ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack
 ngpt.renderer ngpt.repair ngpt.magnitude ngpt.io
 ngpt.merging

@@ -63,7 +63,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
         "too. --time is then that of pilot, render and method",
     )
-    parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
+    parser.add_argument(
+        "--size",
+        type=size,
+        metavar="WxH",
+        help="pixels of the film, of which a crop window stays the same part (default: the scene's own)",
+    )
     first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
     others = ", ".join(by_standing("niche"))
     parser.add_argument(
@@ -217,7 +222,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
     if interrupted := ended() and done != wanted:
         tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{how}: {target} holds the {done} samples per pixel done by then")
-    console.say(f"{args.scene} -> {target}: {stack.width}x{stack.height}, {done} spp, {took:.2f} s")
+    console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s")
     if args.time is not None and took > _LATE * args.time and done <= _FEW:
         console.say(
             f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "

@@ -10,6 +10,7 @@ from typing import Any
 from data_gen.samplers import check_options, find
 from data_gen.scenes.procedural.variety import SHARES
 from ngpt.errors import NgptError
+from ngpt.io.frames import natural
 from ngpt.methods import METHODS
 from ngpt.system.records import from_table, read_toml
 
@@ -132,7 +133,7 @@ class Config:
         """
         sources: list[tuple] = [(made_name(turn * self.scenes + i), self.crops) for i in range(self.scenes)]
         for source in self.files:
-            paths = sorted(glob(source.pattern, recursive=True))
+            paths = sorted(glob(source.pattern, recursive=True), key=natural)
             if not paths:
                 raise NgptError(f"data configuration: no scene file matches '{source.pattern}'")
             for path in paths:

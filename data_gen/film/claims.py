@@ -1,24 +1,24 @@
-"""What the noise of points is, where samples are none that are independent of each other.
+"""What the noise of points is, where samples are not independent of each other.
 
 Samples of a pixel that are points of one net (``data_gen.paths.streams``) keep apart from each other: the sample
 variance, which takes them for independent, overstates the noise of their mean. How much is seen in the render itself.
-The later part of a pixel's samples, from the last number on that is a power of two, is held against those before. With
-n1 and n2 samples and means a and b,
+The samples of a pixel are split into two parts of similar size (``data_gen.film.nets.split``), n1 and n2 of n samples
+with means a and b, and held against each other by their *contrast*
 
-    E (a - b)² n1 n2 / n² = variance of the mean
+    (b - a) sqrt(n1 n2) / n,
 
-where both parts are independent, as rounds of points are; for two halves it is (Va + Vb) / 4, whatever these are. Where
-all samples are of one net its halves are not independent, and a law for how the variance falls has to help. One square
-says little of a pixel, but pixels of about the same noise say together by which factor their sample variances are to be
-taken: where little light is found by luck, points help much, and where all is, not at all.
+whose expected square is the variance of the pixel's mean where samples are independent. What it is where they are
+points of nets, and what the variance of the mean is then, ``data_gen.film.nets.law`` says for each way in which noise
+may fall. One square says little of a pixel, but pixels of about the same noise together show which: where little light
+is found by luck, points help much, and where all is, not at all.
 """
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 from scipy.ndimage import uniform_filter
+
+from data_gen.film.nets import law
 
 # Pixels of about the same noise: so many groups at most, of so many pixels at least
 _GROUPS, _LEAST = 64, 64
@@ -28,40 +28,37 @@ _AROUND = 5
 _PRIOR = 4.0
 
 
-def factors(seen: np.ndarray, variance: np.ndarray, of_one_net: int) -> np.ndarray:
+def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
     """By how much the sample ``variance`` of the mean is to be multiplied, (H, W, 1).
 
-    ``seen`` is the later samples against the earlier ones, as above, without the square; both (H, W, C). Pixels where
-    one of them is NaN say nothing. ``of_one_net`` is the number of samples where all of a pixel are of one net, else 0.
+    ``contrast`` is that of the samples, as above; both (H, W, C). Pixels where one of them is NaN say nothing.
+    ``samples`` (H, W) is the number of samples of each pixel, and ``net`` that of the first round of points.
     """
-    squares, variances = np.square(seen).sum(axis=-1), variance.sum(axis=-1)
+    squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)
     # Without the pixel itself: its own variance is large where a rare sample is among its own, and such samples are
     # the ones that are independent of the others. Groups by a pixel's own variance would have them all in one.
     filled = np.where(good, variances, 0)
     around = np.where(good, np.maximum(_AROUND**2 * uniform_filter(filled, _AROUND) - filled, 0), np.inf).ravel()
-    found = np.ones(around.shape)
     order = np.argsort(around, kind="stable")
     order = order[: np.count_nonzero(good)]
+    squares, variances = squares.ravel(), variances.ravel()
+    numbers, kind = np.unique(samples.ravel(), return_inverse=True)
+    laws = [law(max(int(n), 2), net) for n in numbers]
+    seen, truth = (np.array(each) for each in zip(*laws, strict=True))
+    found = np.ones(around.shape)
     for group in np.array_split(order, max(1, min(_GROUPS, len(order) // _LEAST))):
-        total = variances.ravel()[group].sum()
+        claimed = np.bincount(kind[group], variances[group], len(numbers))
+        total = claimed.sum()
         if total > 0:
             prior = _PRIOR / len(group) * total
-            ratio = float((squares.ravel()[group].sum() + prior) / (total + prior))
-            found[group] = _of_one_net(ratio, of_one_net) if of_one_net else ratio
+            ratio = (squares[group].sum() + prior) / (total + prior)
+            # What is seen falls from law to law, and np.interp wants it to rise.
+            which = np.interp(-ratio, -(claimed @ seen) / total, np.arange(seen.shape[1]))
+            found[group] = (truth @ _hat(which, seen.shape[1]))[kind[group]]
     return found.reshape(*good.shape, 1)
 
 
-def _of_one_net(ratio: float, n: int) -> float:
-    """The factor where both halves are of one net of ``n``, and the ``ratio`` is that of halves which are not
-    independent.
-
-    Were the variance of n points c / n^a, halves of a net would differ by 4 c (2^a - 1) / n^a in the mean square. The
-    ratio would be (2^a - 1)(n - 1) / (n^a - 1), and the factor n^(1 - a): a power of the ratio, whose exponent hardly
-    depends on a. It is taken at a = 3/2, the rate of steps.
-    """
-    if n < 3:
-        return ratio
-    rate = 1.5
-    exponent = math.log(n ** (1 - rate)) / math.log((2**rate - 1) * (n - 1) / (n**rate - 1))
-    return ratio**exponent
+def _hat(place: float, n: int) -> np.ndarray:
+    """Weights that interpolate linearly between ``n`` values at a ``place`` from 0 to n - 1."""
+    return np.maximum(1 - np.abs(np.arange(n) - place), 0)

@@ -8,6 +8,7 @@ import numpy as np
 
 from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
+from data_gen.film.nets import split
 from data_gen.film.splats import SPLAT_BYTES, Splats
 from ngpt.layers import DIFFERENCES
 
@@ -29,8 +30,9 @@ _WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS})
 # Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
 # one name once more.
 _STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
-# Per strand, of samples before: double means of 15 channels, and counts of all names
-_HALVES_BYTES = 15 * 8 + 10 * 8
+# Per strand, of two sets of earlier samples: single means of 15 channels, and counts of the five names they belong to,
+# with the number of bits
+_HALVES_BYTES = 2 * 15 * 4 + 5 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
@@ -50,7 +52,7 @@ class GradientFilm:
     ``net`` of so many for each pixel, variances are brought to the noise that is seen: ``data_gen.film.claims``. Where
     samples of a pass share photons, reservoirs or the state of a chain, or lanes splat onto pixels of others, the film
     is made with ``batches``: each pass is one batch, a pixel's value is its mean over the batch, and variances are over
-    batches.
+    batches. A batch counts by its samples: the last one may have fewer than those before it.
     """
 
     def __init__(self, width: int, height: int, batches: bool = False, net: int = 0):
@@ -59,6 +61,7 @@ class GradientFilm:
         self.strands = 1 if batches else max(1, _STRANDS // self.pixels)
         self.samples = 0  # per pixel; of those that were in all passes alone
         self.blocks = 0  # of samples, each of which goes to one strand
+        self.batch = 0  # samples per pixel of all batches but the last, which may have fewer
         # The same of each pixel, where they may differ
         self.counts: np.ndarray | None = None
         self._blocks_each = np.zeros(0, np.int64)
@@ -174,6 +177,9 @@ class GradientFilm:
 
     def _add_batch(self, values: dict, splats: dict, spp: int) -> None:
         """One more value for each pixel and name: the mean over the pass, splats included."""
+        self.batch = self.batch or spp
+        if spp > self.batch:
+            raise ValueError(f"a batch of {spp} samples after batches of {self.batch}: only the last may be smaller")
         first = dr.arange(mi.UInt32, self.pixels) * opaque(spp)
         strands = Strands(first, first + opaque(spp), opaque(spp), opaque(spp), opaque(0), opaque(spp))
         for name in dict.fromkeys((*values, *splats)):
@@ -189,7 +195,7 @@ class GradientFilm:
                 mean = [(m if mean else 0) + s * share for m, s in zip(mean or sums, sums, strict=True)]
                 lost = lost + lost_splats
             number = opaque(self.blocks) + dr.zeros(mi.UInt32, self.pixels)
-            moments = one_more(self._moments(name, len(mean)), mean, exists, number)
+            moments = one_more(self._moments(name, len(mean)), mean, exists, number, opaque(spp))
             moments.lost += lost
             dr.eval(moments)
             self.moments[name] = moments
@@ -257,14 +263,15 @@ class GradientFilm:
         }
 
     def _statistics(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Count (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
+        """How many values (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
 
-        Unknown must not look like zero: the mean of no sample is NaN, and so is the variance of fewer than two. Chan,
-        Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
+        Values are samples, or batches. Unknown must not look like zero: the mean of no sample is NaN, and so is the
+        variance of fewer than two. Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
         """
         moments, shape = self.moments[name], (self.strands, self.pixels)
         counts = np.array(moments.count, np.float64).reshape(shape)
         count = counts.sum(axis=0)
+        values = np.ceil(count / self.batch) if self.batches else count
         means, variances = [], []
         with np.errstate(invalid="ignore", divide="ignore"):
             for channel in moments.mean:
@@ -276,8 +283,8 @@ class GradientFilm:
                     m2 = np.array(moments.m2[len(variances)]).reshape(shape).sum(axis=0)
                     if self.strands > 1:
                         m2 += (counts * np.square(strands - mean)).sum(axis=0)
-                    variances.append(np.where(count > 1, m2 / (count - 1) / count, np.nan))
-        return count[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
+                    variances.append(np.where(values > 1, m2 / (values - 1) / count, np.nan))
+        return values[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
 
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
@@ -309,33 +316,43 @@ class GradientFilm:
         sum of ``terms``: name, which pixels, factor."""
         if not self.net:
             return variance
-        seen = sum(factor * self._image(self._halves(name))[pixels] for name, pixels, factor in terms)
-        n = int(self.samples_each.max())
-        of_one_net = (self.blocks if self.batches else n) if n <= self.net else 0
+        contrast = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
         where = terms[0][1]
         claimed = variance.copy()
-        claimed[where] *= claims.factors(seen, variance[where], of_one_net)
+        samples = self._image(self._numbers)[where][..., 0]
+        claimed[where] *= claims.factors(contrast, variance[where], samples, self._net_of_numbers)
         return claimed
 
-    def _halves(self, name: str) -> np.ndarray:
-        """The later samples of each pixel against the earlier ones, (pixels, C): what has the variance of the mean as
-        its expected square where both are independent."""
+    @property
+    def _numbers(self) -> np.ndarray:
+        """Of each pixel, how many values variances are over, (pixels): its samples, or its batches."""
+        return np.full(self.pixels, self.blocks) if self.batches else self.samples_each
+
+    @property
+    def _net_of_numbers(self) -> int:
+        """How many of these values the first round of points has, a power of two: a batch is a block of points."""
+        net = self.net // self.batch if self.batches else self.net
+        return 1 << max(net.bit_length() - 1, 0)
+
+    def _contrast(self, name: str) -> np.ndarray:
+        """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it."""
         moments, shape = self.moments[name], (self.strands, self.pixels)
-        counts, earlier, bits = (
-            np.array(field, np.int64).reshape(shape) for field in (moments.count, moments.earlier, moments.bits)
-        )
-        # Strands that have no sample of the last part have all of theirs before it.
-        old = bits < bits.max(axis=0)
-        earlier = np.where(old, counts, earlier)
-        n, n1 = counts.sum(axis=0), earlier.sum(axis=0)
+        earlier = moments.earlier[0]
+        counts = [np.array(each, np.int64).reshape(shape) for each in (*earlier.counts[::-1], moments.count)]
+        bits = np.array(earlier.bits, np.int64).reshape(shape)
+        numbers, kind = np.unique(self._numbers, return_inverse=True)
+        splits = np.array([split(max(int(n), 2)) for n in numbers])[kind]
+        # The samples of a strand whose numbers are less than ``splits``: all, or as many as one of ``earlier``.
+        which = np.clip(np.log2(splits).astype(np.int64) + 2 - bits, 0, 2)
+        before, n = np.choose(which, counts), counts[-1].sum(axis=0)
+        n1 = before.sum(axis=0)
         columns = []
         with np.errstate(invalid="ignore", divide="ignore"):
-            for mean, before in zip(moments.mean, moments.before, strict=True):
-                means, befores = np.array(mean).reshape(shape), np.array(before).reshape(shape)
-                befores = np.where(old, means, befores)
-                first = (earlier * befores).sum(axis=0) / n1
+            for channel in zip(*earlier.means[::-1], moments.mean, strict=True):
+                means = [np.array(each, np.float64).reshape(shape) for each in channel]
+                first = (before * np.choose(which, means)).sum(axis=0) / n1
                 # last - first, times sqrt(n1 (n - n1)) / n
-                columns.append(((counts * means).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
+                columns.append(((counts[-1] * means[-1]).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
         return np.stack(columns, axis=-1)
 
     def _image(self, columns: np.ndarray) -> np.ndarray:

@@ -6,7 +6,8 @@ squares would lose all digits where the variance is small beside the mean.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
 
 import drjit as dr
 import mitsuba as mi
@@ -16,45 +17,67 @@ import mitsuba as mi
 class Moments:
     """Running statistics of one value, for all strands: counts UInt32, a Float64 for each channel of the others."""
 
-    count: mi.UInt32  # samples that count
+    count: mi.UInt32  # samples that count, the weights added up
     lost: mi.UInt32  # samples left out because they were not finite
     mean: list
-    m2: list  # sum of squared deviations from the mean; empty where nobody asks for a variance
-    # Of samples before the last one whose number is a power of two (see ``data_gen.film.claims``): how many, their
-    # mean, which is empty where nobody asks for it, and how many bits the number of the last sample has
-    earlier: mi.UInt32
-    before: list
+    m2: list  # weighted sum of squared deviations from the mean; empty where nobody asks for a variance
+    # Of earlier samples, see ``Earlier``; empty where nobody asks for it
+    earlier: list
+
+
+@dataclass
+class Earlier:
+    """The samples of a strand before the last one whose number is a power of two, and those before half that number.
+
+    Two of the first ones for each: how many count, UInt32, and their means, a Float32 for each channel: beside the
+    noise of a mean its rounding is nothing. ``bits`` is how many bits the number of the last sample has.
+    """
+
     bits: mi.UInt32
+    counts: list
+    means: list
 
 
 def no_moments(width: int, channels: int, variance: bool, halves: bool = False) -> Moments:
-    """The statistics of no sample, for ``width`` strands; with ``halves``, also of those ``before``."""
-    Float64 = dr.float64_array_t(mi.Float)
-    mean, m2, before = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(3))
-    count, lost, earlier, bits = (dr.zeros(mi.UInt32, width) for _ in range(4))
-    return Moments(count, lost, mean, m2 if variance else [], earlier, before if halves else [], bits)
+    """The statistics of no sample, for ``width`` strands; with ``halves``, also of ``Earlier`` ones."""
+    Float64, Float32 = dr.float64_array_t(mi.Float), dr.float32_array_t(mi.Float)
+    mean, m2 = ([dr.zeros(Float64, width) for _ in range(channels)] for _ in range(2))
+    count, lost, bits, *counts = (dr.zeros(mi.UInt32, width) for _ in range(5))
+    means = [[dr.zeros(Float32, width) for _ in range(channels)] for _ in range(2)]
+    return Moments(count, lost, mean, m2 if variance else [], [Earlier(bits, counts, means)] if halves else [])
 
 
-def one_more(old: Moments, x: list, exists, number: mi.UInt32) -> Moments:
+def one_more(old: Moments, x: list, exists, number: mi.UInt32, weight: mi.UInt32 | int = 1) -> Moments:
     """The statistics with one more sample ``x``, which has this ``number``, for each strand where it ``exists``; one
-    that is not finite is lost."""
+    that is not finite is lost. A mean of several samples counts as many times: its ``weight``."""
     Float64 = dr.float64_array_t(mi.Float)
     finite = dr.all([dr.isfinite(component) for component in x])
     good = exists & finite
-    count = dr.select(good, old.count + 1, old.count)
+    count = dr.select(good, old.count + weight, old.count)
     lost = dr.select(exists & ~finite, old.lost + 1, old.lost)
-    share = 1 / Float64(dr.maximum(count, 1))
+    share = Float64(weight) / Float64(dr.maximum(count, weight))
     deviations = [dr.select(good, Float64(c) - m, 0) for c, m in zip(x, old.mean, strict=True)]
     mean = [dr.fma(d, share, m) for d, m in zip(deviations, old.mean, strict=True)]
-    # (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
-    m2 = [dr.fma(d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
-    if not old.before:
-        return Moments(count, lost, mean, m2, old.earlier, [], old.bits)
+    # weight (x - old mean)(x - new mean), where x - new mean = (x - old mean)(1 - share).
+    m2 = [dr.fma(Float64(weight) * d * d, 1 - share, m) for d, m in zip(deviations, old.m2, strict=False)]
+    return Moments(count, lost, mean, m2, [_one_later(each, old, number) for each in old.earlier])
+
+
+def _one_later(earlier: Earlier, old: Moments, number: mi.UInt32) -> Earlier:
+    """What is earlier than the sample with this ``number``, before which the statistics were the ``old`` ones."""
+    Float32 = dr.float32_array_t(mi.Float)
     bits = 32 - dr.lzcnt(number)
-    begins = bits != old.bits
-    earlier = dr.select(begins, old.count, old.earlier)
-    before = [dr.select(begins, m, b) for m, b in zip(old.mean, old.before, strict=True)]
-    return Moments(count, lost, mean, m2, earlier, before, bits)
+    begins = bits != earlier.bits
+    # A strand without a sample between the two numbers has all of its samples before half the number, too.
+    follows = bits == earlier.bits + 1
+    last, half = earlier.counts
+    counts = [dr.select(begins, old.count, last), dr.select(begins, dr.select(follows, last, old.count), half)]
+    means: list[list] = [[], []]
+    for mean, last_mean, half_mean in zip(old.mean, *earlier.means, strict=True):
+        now = Float32(mean)
+        means[0].append(dr.select(begins, now, last_mean))
+        means[1].append(dr.select(begins, dr.select(follows, last_mean, now), half_mean))
+    return Earlier(bits, counts, means)
 
 
 @dataclass
@@ -91,31 +114,30 @@ def accumulate(moments: Moments, components: list, active, strands: Strands) -> 
 
 def taken(moments: Moments, place: mi.UInt32) -> Moments:
     """The statistics of the strands at each ``place``."""
-
-    def gather(values: list) -> list:
-        return [dr.gather(type(value), value, place) for value in values]
-
-    counts = gather([moments.count, moments.lost, moments.earlier, moments.bits])
-    return _of(counts, gather(moments.mean), gather(moments.m2), gather(moments.before))
+    return _each(moments, lambda value: dr.gather(type(value), value, place))
 
 
 def put_back(moments: Moments, some: Moments, place: mi.UInt32) -> Moments:
     """``moments`` with the statistics of ``some`` strands, each at its own ``place``."""
 
-    def scatter(values: list, new: list) -> list:
-        for value, part in zip(values, new, strict=True):
-            dr.scatter(value, part, place)
-        dr.eval(values)
-        return values
+    def scatter(value, part):
+        dr.scatter(value, part, place)
+        dr.eval(value)
+        return value
 
-    counts = scatter(
-        [moments.count, moments.lost, moments.earlier, moments.bits], [some.count, some.lost, some.earlier, some.bits]
-    )
-    return _of(
-        counts, scatter(moments.mean, some.mean), scatter(moments.m2, some.m2), scatter(moments.before, some.before)
-    )
+    return _each(moments, scatter, some)
 
 
-def _of(counts: list, mean: list, m2: list, before: list) -> Moments:
-    count, lost, earlier, bits = counts
-    return Moments(count, lost, mean, m2, earlier, before, bits)
+def _each(moments: Moments, f: Callable, *others: Moments) -> Moments:
+    """The statistics whose arrays are those that ``f`` makes of the arrays of ``moments`` and of the ``others``."""
+
+    def of(value, *more):
+        if isinstance(value, list):
+            return [of(*parts) for parts in zip(value, *more, strict=True)]
+        if is_dataclass(value):
+            return type(value)(
+                *(of(*(getattr(each, field.name) for each in (value, *more))) for field in fields(value))
+            )
+        return f(value, *more)
+
+    return of(moments, *others)

@@ -20,9 +20,10 @@ import numpy as np
 
 from data_gen.passes import recording
 from data_gen.paths.features import first_nonspecular_vertex
-from data_gen.scenes.cameras import camera_name
+from data_gen.scenes.cameras import camera_name, place_of
 from data_gen.scenes.geometry import Geometry, Mesh, geometry, matrix
 from ngpt.errors import NgptError
+from ngpt.windows import Place
 
 # Of the path's length: where a hit lies off the straight ray by more, there was a mirror or a lens on the way.
 _OFF_RAY = 1e-3
@@ -34,17 +35,20 @@ class Snapshot:
 
     ``shapes``  in the order of ``scene.shapes()``
     ``film``    (4, 4): homogeneous points of the world to (x, y, -, 1) in pixels, the last positive in front
+    ``place``   where the pixels lie
     """
 
     shapes: tuple[Geometry, ...]
     film: np.ndarray
+    place: Place
 
 
 def snapshot(scene: mi.Scene, shapes: tuple[Geometry, ...] | None = None) -> Snapshot:
     """The state of a scene; ``shapes`` where they are known to be those of an earlier snapshot."""
     if shapes is None:
         shapes = tuple(geometry(shape) for shape in scene.shapes())
-    return Snapshot(shapes, _film(scene.sensors()[0]))
+    sensor = scene.sensors()[0]
+    return Snapshot(shapes, _film(sensor), place_of(sensor))
 
 
 def _film(sensor: mi.Sensor) -> np.ndarray:
@@ -133,6 +137,8 @@ def depth(scene: mi.Scene, now: Snapshot, what: Seen) -> np.ndarray:
 def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen | None = None) -> np.ndarray:
     """(H, W, 2) float32: pixels from each pixel to where what it shows was in the frame ``before``; x right, y down.
 
+    It leads from pixel to pixel of the two arrays. Where crop windows move from frame to frame, the motion in the whole
+    picture is the sum of it and ``window_moved``.
     ``now`` is the snapshot of ``scene``, ``what`` its ``seen(scene)`` if that is known. NaN where motion is not known:
     behind the camera of before, or on a shape that was not there. Raises NgptError for a camera without a projection.
     """
@@ -154,6 +160,12 @@ def motion_vectors(scene: mi.Scene, now: Snapshot, before: Snapshot, what: Seen 
     motion[unknown | ~front | ~front_before] = np.nan
     width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
     return motion.reshape(height, width, 2).astype(np.float32)
+
+
+def window_moved(now: Snapshot, before: Snapshot) -> tuple[int, int]:
+    """Pixels (x, y) by which the crop window of ``before`` lies further to the right and down than the one now."""
+    (x, y), (x_before, y_before) = now.place.data.corner, before.place.data.corner
+    return x_before - x, y_before - y
 
 
 def _displacement(now: Geometry, old: Geometry, what: Seen, here: np.ndarray) -> np.ndarray | None:

@@ -12,7 +12,7 @@ import numpy as np
 
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.frame_sampler import Remembering
-from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot
+from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot, window_moved
 from data_gen.frames.time_differences import difference, light
 from data_gen.render import render_stack
 from data_gen.samplers import FRAME_SAMPLERS
@@ -108,7 +108,8 @@ def render_shot(
     """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
 
     Stacks have the layer ``motion`` to the frame before in ``frames``; of the first, to the one that a shot of the same
-    step would have before it, all NaN where there is none. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
+    step would have before it, all NaN where there is none. It is motion in the picture, of which crop windows may show
+    another part in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
     frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
     ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
 
@@ -143,9 +144,14 @@ def render_shot(
             now = shot.snapshot(frame)
             scene = shot.at(frame)
             width, height = (int(n) for n in scene.sensors()[0].film().crop_size())
-            motion, what = np.full((height, width, 2), np.nan), None
+            motion, what, shift = np.full((height, width, 2), np.nan), None, (0, 0)
             if before is not None:
-                what = seen(scene)
+                if (dt or remembers) and now.place.data.size != before.place.data.size:
+                    raise NgptError(
+                        f"frame {frame} is {now.place.data} and frame {previous} {before.place.data}: differences to "
+                        "the frame before, and samplers that reuse it, need crop windows of one size; move them alone"
+                    )
+                what, shift = seen(scene), window_moved(now, before)
                 motion = motion_vectors(scene, now, before, what)
             if remembering is not None:
                 far = None if what is None else depth(scene, now, what)
@@ -155,16 +161,23 @@ def render_shot(
             before, last = now, frame
         done = i + 1
         stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-        stack = stack.replace(motion=motion)
+        stack = stack.replace(motion=motion + np.float32(shift))
         del scene  # two scenes in memory would make kernels larger
-        yield frame, _with_dt(stack, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1)) if dt else stack
+        if dt:
+            stack = _with_dt(stack, motion, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1))
+        yield frame, stack
 
 
 def _with_dt(
-    stack: GradientStack, here: tuple[Shot, int], before: tuple[Shot, int], pairs: int, seed: int
+    stack: GradientStack,
+    motion: np.ndarray,
+    here: tuple[Shot, int],
+    before: tuple[Shot, int],
+    pairs: int,
+    seed: int,
 ) -> GradientStack:
-    """The stack with ``dt`` and ``dt_var``; ``here`` and ``before`` are what has the scene, and the frame's number."""
-    motion = stack["motion"]
+    """The stack with ``dt`` and ``dt_var``, by the ``motion`` from array to array; ``here`` and ``before`` are what has
+    the scene, and the frame's number."""
     mean = variance = np.full((*motion.shape[:2], 3), np.nan, np.float32)
     if np.isfinite(motion).any():
         scene, begun = here[0].at(here[1]), time.perf_counter()

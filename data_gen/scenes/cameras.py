@@ -1,4 +1,4 @@
-"""Cameras of Mitsuba: what they are called, and which no sampler renders."""
+"""Cameras of Mitsuba: what they are called, which part of a picture they show, and which no sampler renders."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import mitsuba as mi
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.windows import Place, Window
 
 # By the names of their classes, since a loaded camera does not know its plugin
 _PLUGINS = {
@@ -25,6 +26,13 @@ def camera_name(sensor: mi.Sensor) -> str:
     """The plugin name of a camera, or the name of its class."""
     name = sensor.class_name()
     return _PLUGINS.get(name, name)
+
+
+def place_of(sensor: mi.Sensor) -> Place:
+    """The crop window of a sensor's film, in the whole film."""
+    film = sensor.film()
+    (left, top), size, whole = ([int(n) for n in pair] for pair in (film.crop_offset(), film.crop_size(), film.size()))
+    return Place(Window(left, top, *size), Window(0, 0, *whole))
 
 
 def check_camera(sensor: mi.Sensor) -> None:

@@ -21,10 +21,10 @@ def load_scene(
 ) -> mi.Scene:
     """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
 
-    ``size`` is (width, height) in pixels and replaces that of the scene's film, crop window included; ``parameters``
-    sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which renders the same and
-    starts much sooner; where they are to move, or to be found by name, they must not be. Raises NgptError with the file
-    and Mitsuba's own complaint when it cannot.
+    ``size`` is (width, height) in pixels and replaces that of the scene's film; a crop window stays the same part of
+    it. ``parameters`` sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which
+    renders the same and starts much sooner; where they are to move, or to be found by name, they must not be. Raises
+    NgptError with the file and Mitsuba's own complaint when it cannot.
     """
     parameters = parameters or {}
     try:
@@ -74,11 +74,27 @@ def complaint(error: Exception) -> str:
 
 
 def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:
-    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels, without a crop window."""
+    """Sets the film of the scene's first sensor to ``size`` = (width, height) pixels.
+
+    A crop window stays the same part of it: its edges are rounded to pixels, so that parts which meet still do.
+    """
     sensor = scene.sensors()[0]
+    film = sensor.film()
+    crop = [_scaled(*each) for each in zip(film.crop_offset(), film.crop_size(), film.size(), size, strict=True)]
     params = mi.traverse(sensor)
     params["film.size"] = list(size)
+    # A new size makes the whole film the window, so the window comes after it.
     params.update()
+    if crop != [(0, length) for length in size]:
+        params["film.crop_offset"], params["film.crop_size"] = ([*each] for each in zip(*crop, strict=True))
+        params.update()
+
+
+def _scaled(begin: int, length: int, whole: int, new: int) -> tuple[int, int]:
+    """Begin and length of a part of ``new`` pixels that was one of a ``whole``: a pixel at least."""
+    first, end = ((2 * int(edge) * new + int(whole)) // (2 * int(whole)) for edge in (begin, begin + length))
+    first = min(first, new - 1)
+    return first, max(end - first, 1)
 
 
 def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:

@@ -14,7 +14,7 @@ import numpy as np
 
 from ngpt.api.tensors import Bitmap, Image, Kind, Tensor, Transform, is_bitmap, layer, like, to_numpy
 from ngpt.errors import NgptError, did_you_mean
-from ngpt.io.aliases import resolve
+from ngpt.io.resolution import resolve
 from ngpt.methods import METHODS, by_standing, reconstruct, unknown_method
 from ngpt.options import Value
 from ngpt.sequence.history import Temporal
@@ -331,6 +331,8 @@ def _by_name(bitmap: Any) -> dict[str, np.ndarray]:
     names, pixels = _names(bitmap), to_numpy(bitmap, "denoise: image")
     found = resolve([("", names)], path="denoise: bitmap")
     layers = {name: pixels[..., [names.index(c) for c in where.channels]] for name, where in found.items()}
+    scaled = {name: np.asarray(where.factors, np.float32) for name, where in found.items() if where.factors}
+    layers |= {name: layers[name] * factors for name, factors in scaled.items()}
     image = layers.pop("primal"), layers.pop("alpha", pixels[..., :0])
     return {"image": np.concatenate(image, axis=-1), **layers}
 

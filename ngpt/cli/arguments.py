@@ -1,25 +1,19 @@
 """Arguments that several verbs share, and their conversion."""
 
 import argparse
-import glob
 import json
 import logging
-import os
 import re
 from collections.abc import Mapping
 from pathlib import Path
 
-from ngpt.cli.framenames import frames_named, varies
-from ngpt.errors import NgptError
+from ngpt.io.frames import input_files, is_shot
 from ngpt.layers import LAYERS
 from ngpt.system import configs
 from ngpt.system.console import Console, by_names
 from ngpt.system.files import check_output, make_folder
 
 _LOG = logging.getLogger(__name__)
-
-# What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
-RESULT_SUFFIX = "_denoised"
 
 # Layers that many renderers write into files of their own.
 FILES = ("albedo", "normal", "depth")
@@ -74,8 +68,13 @@ def add_layers(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=LAYER",
-        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file; may be repeated",
+        help=f"read NAME ({', '.join(LAYERS)}) from this layer of the file, or from channels with signs and factors "
+        '("-velocity.R,velocity.G"); may be repeated',
     )
+
+
+def add_view(parser: argparse.ArgumentParser, default: str) -> None:
+    parser.add_argument("--view", metavar="NAME", help=f"a view of stereo files, such as left or right ({default})")
 
 
 def assignment(text: str) -> tuple[str, str]:
@@ -120,38 +119,11 @@ def duration(text: str) -> float:
 def stack_files(names: list[str]) -> list[Path]:
     """The files meant by names, folders (every .exr in them) and patterns, in order and without repeats.
 
-    Patterns are those of shells, and names of frames (``ngpt.cli.framenames``); folders and files of that very name
-    win, also within one. Folders and patterns leave out results of earlier runs. Raises NgptError for a folder or
+    Folders and patterns (``ngpt.io.frames``) leave out results of earlier runs. Raises NgptError for a folder or
     pattern without a file; a plain name is taken as it is, for its reader to complain about.
     """
-    files: dict[Path, None] = {}
-    for name in names:
-        path = Path(name)
-        if path.is_dir():
-            found = sorted(p for p in path.iterdir() if p.suffix.lower() == ".exr")
-        elif varies(name):
-            found = list(frames_named(name).values())
-        elif glob.has_magic(name) and not path.exists():
-            found = sorted(Path(p) for p in glob.glob(_with_literals(path), recursive=True))
-        else:
-            files[path] = None
-            continue
-        inputs = [p for p in found if not p.stem.endswith(RESULT_SUFFIX) and not p.name.startswith(".")]
-        if not inputs:
-            raise NgptError(f"{name}: no .exr files to denoise there; other formats by their names, such as '*.pfm'")
-        files.update(dict.fromkeys(inputs))
-    return list(files)
-
-
-def _with_literals(path: Path) -> str:
-    """A pattern in which folders that exist by the very names it begins with are no patterns: ``dir[1]/*.exr``."""
-    known, parts = Path(), []
-    for part in path.parts:
-        if not (known / part).exists():
-            break
-        known /= part
-        parts.append(glob.escape(part))
-    return os.path.join(*parts, *path.parts[len(parts) :])
+    files = [path for name in names for path in (input_files(name) if is_shot(name) else [Path(name)])]
+    return list(dict.fromkeys(files))
 
 
 def tell_lacks(lacks: Mapping[str, str], console: Console) -> None:

@@ -1,53 +1,46 @@
 """``ngpt denoise``: from gradient stacks to images."""
 
 import argparse
-import os
 import time
-from collections.abc import Container, Mapping
+from collections import defaultdict
+from collections.abc import Container
 from contextlib import closing, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import Any
 
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
-    RESULT_SUFFIX,
     add_files,
     add_force,
     add_json,
     add_layers,
     add_untrusted,
+    add_view,
     assignment,
     given_files,
     output_file,
     print_json,
     stack_files,
 )
-from ngpt.cli.denoise_shot import way, windowed
-from ngpt.cli.framenames import named, number_of, varies
-from ngpt.cli.picture import add_look, check_picture, exposed
+from ngpt.cli.denoise_files import Frame, describe, output_paths, write_frame
+from ngpt.cli.denoise_shot import motion_hint, one_view_only, way, windowed
+from ngpt.cli.picture import add_look, check_picture
+from ngpt.cli.reference import Reference
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read, read_image, write
-from ngpt.io.foreign.pfm import write_pfm
-from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.exr import read_views
+from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
-from ngpt.measure.metrics import compare
-from ngpt.methods import METHODS, Result, by_standing, reconstruct
+from ngpt.methods import METHODS, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
-from ngpt.report.pictures import write_picture
-from ngpt.report.transforms import shown
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
-from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.pipeline import overlapped
-from ngpt.version import __version__
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -118,10 +111,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--ref",
         metavar="REF",
-        help="reference image: report the error against it, relMSE and trimmed: without the worst 0.1 %% of the pixels",
+        help="reference image: report the error in the pixels that both have, relMSE and trimmed: without the worst "
+        "0.1 %% of the pixels",
     )
     add_files(parser)
     add_layers(parser)
+    add_view(parser, "default: all of them")
     add_look(parser)
     add_untrusted(parser)
     existing = parser.add_mutually_exclusive_group()
@@ -157,7 +152,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     # Their results are there, but later frames are made of them.
     missing = [i for i, (_, target) in enumerate(pairs) if not finished(target)] if args.temporal else []
     again = {target for _, target in pairs[: missing[-1]]} if missing else set()
-    reference = read_image(args.ref, args.untrusted) if args.ref else None
+    reference = Reference.read(args.ref, args.untrusted) if args.ref else None
     options = {
         name: value for name in ("alpha", "weights", "device", "memory") if (value := getattr(args, name)) is not None
     }
@@ -171,6 +166,9 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         by_wcv = args.method == "wcv" and not options
         windows, told = way([source for source, _ in pairs], dict(args.layer), by_wcv)
         console.say(f"--temporal: {told}")
+        for name in filter(is_shot, args.stacks):
+            for remark in remarks(name, stack_files([name]), results=False):
+                console.say(remark)
     if windows:
         everything = {target for _, target in pairs}
         frames = windowed(pairs, partial(read_frame, args=args, files=files, again=everything), overwrite, reference)
@@ -183,7 +181,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
                 args=args,
                 options=options,
                 reference=reference,
-                temporal=Temporal() if args.temporal else None,
+                temporal=defaultdict(Temporal) if args.temporal else None,
             ),
             overwrite,
         )
@@ -200,6 +198,8 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
                     console.say(f"{source}: the error of {unknown} pixels is NaN, for their variances are not finite")
             reports.append(report)
             progress(i, len(pairs))
+    if args.temporal and (hint := motion_hint(pairs, reports, args)):
+        console.say(hint)
     failed = sum("error" in report for report in reports)
     skipped = sum("skipped" in report for report in reports)
     if failed and len(pairs) > 1:
@@ -215,24 +215,6 @@ def _unseen(done: int, total: int) -> None:
     """Progress that nobody is shown."""
 
 
-class Frame(NamedTuple):
-    """A stack on its way from its file to that of its result; with ``there`` its result was there already.
-
-    ``cut`` says that a file is in its place that is not whole.
-    ``over_time`` is what other frames were to the result, as header attributes.
-    """
-
-    source: Path
-    target: Path
-    stack: GradientStack | None
-    result: Result | None = None
-    metrics: dict[str, float] | None = None
-    groups: tuple[str, ...] = ()
-    there: bool = False
-    cut: bool = False
-    over_time: Mapping[str, Any] = {}
-
-
 def read_frame(
     pair: tuple[Path, Path], args: argparse.Namespace, files: dict[str, str], again: Container[Path]
 ) -> Frame:
@@ -243,112 +225,40 @@ def read_frame(
     if there and target not in again:
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
-    return Frame(source, target, read(source, dict(args.layer), args.untrusted, files), there=there, cut=cut)
+    stacks = read_views(source, dict(args.layer), args.untrusted, files, args.view)
+    first, *others = (Frame(source, target, stack, there=there, cut=cut) for stack in stacks)
+    if others and (what := one_view_only(target, args, files)):
+        raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
+    return first._replace(others=tuple(others))
 
 
 def compute_frame(
     frame: Frame,
     args: argparse.Namespace,
     options: dict,
-    reference: np.ndarray | None,
-    temporal: Temporal | None,
+    reference: Reference | None,
+    temporal: dict[str, Temporal] | None,
 ) -> Frame:
+    """The frame with its result, and those of its other views; ``temporal`` is the history of each view."""
     stack = frame.stack
     if stack is None:
         return frame
+    others = tuple(compute_frame(other, args, options, None, temporal) for other in frame.others)
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
     result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
-    over_time = {}
+    over_time, reason = {}, ""
     if temporal is not None:
-        begun = time.perf_counter()
-        image = temporal.next(stack, result.image)
+        begun, history = time.perf_counter(), temporal[frame.view]
+        image = history.next(stack, result.image)
         result = replace(result, image=image, seconds=result.seconds + time.perf_counter() - begun)
-        over_time = {"ngpt:temporal": "history", "ngpt:history": temporal.share}
-        if isinstance(temporal.corrections, Network):
-            over_time["ngpt:historyWeights"] = str(identify(temporal.corrections.path))
-    light = converted(result.image, to_rec709(stack.attributes))
-    metrics = compare(light, reference) if reference is not None else None
+        over_time, reason = {"ngpt:temporal": "history", "ngpt:history": history.share}, history.reason
+        if isinstance(history.corrections, Network):
+            over_time["ngpt:historyWeights"] = str(identify(history.corrections.path))
+    errors = reference.errors(result.image, stack) if reference is not None else None
     if groups:
         parts = lightgroups.denoised(stack, groups, result.image, args.method, **options)
         stack = lightgroups.with_groups(stack, parts)
     if result.error is not None:
         stack = stack.replace(error=result.error)
-    return frame._replace(stack=stack, result=result, metrics=metrics, groups=tuple(groups), over_time=over_time)
-
-
-def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
-    """Writes the result, and returns what there is to report."""
-    source, target, stack, result, metrics, groups, there, cut, over_time = frame
-    report: dict[str, Any] = {"input": str(source), "output": str(target)}
-    if there or stack is None or result is None:
-        return report | {"skipped": True}
-    made = {**result.attributes, **over_time}
-    if target.suffix.lower() == ".exr":
-        write(target, result.image, like=stack, overwrite=overwrite or cut, attributes=made)
-    elif target.suffix.lower() == ".pfm":
-        write_pfm(target, converted(result.image, to_rec709(stack.attributes)), overwrite)
-    else:
-        light = converted(result.image, to_rec709(stack.attributes))
-        write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
-    report |= {
-        "method": result.method,
-        "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,
-        "options": result.options,
-        "estimated": list(result.estimated),
-        "version": __version__,
-        "seconds": result.seconds,
-        "width": stack.width,
-        "height": stack.height,
-        "repaired": result.repaired,
-        "untrusted": result.untrusted,
-        "standard error": result.error is not None,
-        "groups": list(groups),
-    }
-    if result.error is not None:
-        report["pixels without standard error"] = int(np.isnan(result.error).any(axis=-1).sum())
-    report |= {"in place of": "a file that was not whole"} if cut else {}
-    report |= {name: over_time[f"ngpt:{name}"] for name in ("temporal", "history") if f"ngpt:{name}" in over_time}
-    return report | ({"metrics": metrics} if metrics else {})
-
-
-def describe(report: dict) -> str:
-    """One line about one file."""
-    if "skipped" in report:
-        return f"{report['input']} -> {report['output']}: skipped, exists already"
-    text = f"{report['input']} -> {report['output']}: {report['method']}"
-    if report["weights"] and report["method"] not in METHODS:
-        text += f", sha256 {report['weights']['sha256'][:12]}"
-    text += f", {report['seconds']:.2f} s"
-    if report["repaired"] or report["untrusted"]:
-        text += f", repaired {report['repaired']} pixels"
-        text += f", left out {report['untrusted']} gradients" if report["untrusted"] else ""
-    if "in place of" in report:
-        text += f", in place of {report['in place of']}"
-    if "history" in report:
-        text += f", {report['history']:.0%} history"
-    if report["groups"]:
-        text += f", light groups {', '.join(report['groups'])}"
-    if "metrics" in report:
-        text += ", " + ", ".join(f"{name} {report['metrics'][name]:.5g}" for name in ("relMSE", "relMSE trimmed"))
-    return text
-
-
-def output_paths(sources: list[Path], output: str | None) -> list[tuple[Path, Path]]:
-    """Where the result of each source goes."""
-    if output is None:
-        targets = [path.with_name(f"{path.stem}{RESULT_SUFFIX}.exr") for path in sources]
-    elif varies(output):
-        targets = [Path(named(output, number_of(path, output))) for path in sources]
-    elif len(sources) == 1 and Path(output).suffix and not Path(output).is_dir() and not output.endswith(("/", os.sep)):
-        targets = [Path(output)]
-    else:
-        folder = Path(output)
-        named_file = folder.suffix.lower() == ".exr" and not output.endswith(("/", os.sep))
-        if not folder.is_dir() and (folder.exists() or named_file):
-            kind = "is a file" if folder.exists() else "is the name of a file"
-            raise WrongUse(f"{folder}: {kind}; the results of {len(sources)} stacks need a folder")
-        targets = [folder / (path.name if path.suffix.lower() == ".exr" else f"{path.stem}.exr") for path in sources]
-    repeated = next((t for i, t in enumerate(targets) if t in targets[:i]), None)
-    if repeated:
-        raise WrongUse(f"{repeated}: would be the result of two stacks of that name; denoise them one by one")
-    return list(zip(sources, targets, strict=True))
+    frame = frame._replace(stack=stack, result=result, errors=errors, groups=tuple(groups), others=others)
+    return frame._replace(over_time=over_time, reason=reason)

@@ -1,15 +1,15 @@
 """``ngpt denoise --temporal``: which way a shot goes, and the way by windows, of the frames before and after."""
 
+import argparse
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
+from ngpt.cli.reference import Reference
 from ngpt.errors import NgptError
-from ngpt.io.exr import layers_in
-from ngpt.io.primaries import converted, to_rec709
-from ngpt.measure.metrics import compare
+from ngpt.io.exr import layers_in, read_views
+from ngpt.io.resolution import propose
+from ngpt.sequence.history import NO_MOTION
 from ngpt.sequence.wcv_windows import LENGTH, LINK, reconstruct_shot
 from ngpt.stack import GradientStack
 
@@ -37,11 +37,31 @@ def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tupl
     return False, f"{history}; windows need {', '.join(LINK)} in all frames but the first{those}"
 
 
+def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], args: argparse.Namespace) -> str:
+    """What to say of a shot without motion, and of layers that may hold it; "" for a shot with motion."""
+    why = [report["why no history"] for report in reports[1:] if "why no history" in report]
+    if not why or any(reason != NO_MOTION for reason in why):
+        return ""
+    stack = read_views(pairs[-1][0], dict(args.layer), args.untrusted, view=args.view)[0]
+    proposed = propose(stack.source.view.parts, stack.source.resolution).get("motion") if stack.source else None
+    found = f"; if these lead to the next frame, y up: --layer motion={proposed}" if proposed else ""
+    return f"--temporal: without the layer 'motion' each frame is denoised by itself{found}; see docs, shots.md#motion"
+
+
+def one_view_only(target: Path, args: argparse.Namespace, files: Mapping[str, str]) -> str:
+    """What there is of one view only, by the options; "" if nothing."""
+    if target.suffix.lower() != ".exr":
+        return f"{target} is of one"
+    if args.ref:
+        return "--ref is of one"
+    return f"--{next(iter(files))} is of one" if files else ""
+
+
 def windowed(
     pairs: Sequence[tuple[Path, Path]],
     read: Callable[[tuple[Path, Path]], Any],
     write: Callable[[Any], dict],
-    reference: np.ndarray | None,
+    reference: Reference | None,
 ) -> Iterator[dict | NgptError]:
     """What there is to report of each pair, in order: files that cannot be read are cuts, and reported.
 
@@ -54,6 +74,8 @@ def windowed(
         for number, pair in enumerate(pairs):
             try:
                 frames[number] = read(pair)
+                if frames[number].others:
+                    raise NgptError(f"{pair[0]}: has several views, and windows are of one; choose it with --view")
             except NgptError as error:
                 told[number] = error
                 yield None
@@ -65,10 +87,9 @@ def windowed(
         while done < number:
             yield told[done] if done in told else write(frames.pop(done))
             done += 1
-        light = converted(result.image, to_rec709(frames[number].stack.attributes))
-        metrics = compare(light, reference) if reference is not None else None
+        errors = reference.errors(result.image, frames[number].stack) if reference is not None else None
         over_time = {"ngpt:temporal": "windows"}
-        yield write(frames.pop(number)._replace(result=result, metrics=metrics, over_time=over_time))
+        yield write(frames.pop(number)._replace(result=result, errors=errors, over_time=over_time))
         done = number + 1
     while done < len(pairs):
         yield told[done] if done in told else write(frames.pop(done))

@@ -1,16 +1,19 @@
 """``ngpt diff``: every metric between two images; the exit status says whether they agree."""
 
 import argparse
+from collections.abc import Sequence
 
 from ngpt.cli.arguments import add_json, print_json, tell_lacks
 from ngpt.cli.streams import standard_input
-from ngpt.io.exr import read_image
+from ngpt.io.exr import read_picture
 from ngpt.measure.metrics import compare
 from ngpt.measure.shown import available, judge
 from ngpt.system.console import Console
+from ngpt.windows import overlap
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.epilog = "Images are compared in the pixels that both have, by their data windows."
     parser.add_argument("image", metavar="A", help="the image to judge: its root R G B, i.e. the result if it has one")
     parser.add_argument("reference", metavar="B", help="the image to judge it by")
     parser.add_argument(
@@ -25,11 +28,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     with standard_input([args.image, args.reference]) as names:
-        return compare_files(names[0], names[1], args, console)
+        return compare_files(names, args, console)
 
 
-def compare_files(first: str, second: str, args: argparse.Namespace, console: Console) -> int:
-    image, reference = read_image(first), read_image(second)
+def compare_files(names: Sequence[str], args: argparse.Namespace, console: Console) -> int:
+    """Compares the first with the second."""
+    images, places = zip(*map(read_picture, names), strict=True)
+    both = overlap(names, places)
+    image, reference = both.of(images)
+    if both.line:
+        console.say(both.line)
     metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
     metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]

@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.cli.arguments import add_json, add_layers, add_untrusted, assignment, print_json
+from ngpt.cli.arguments import add_json, add_layers, add_untrusted, add_view, assignment, print_json
 from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError
-from ngpt.io.aliases import format_aliases, propose
-from ngpt.io.exr import pass_through, read
+from ngpt.io.aliases import format_aliases
+from ngpt.io.exr import pass_through, read, views_in
+from ngpt.io.resolution import layers_held, propose
 from ngpt.layers import LAYERS
 from ngpt.measure.gains import Gain, gains
 from ngpt.merging import DIAGNOSTICS
@@ -43,6 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
     )
     add_layers(parser)
+    add_view(parser, "default: the first")
     add_untrusted(parser)
     add_json(parser)
 
@@ -55,10 +57,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         show(overview(), args.json)
         return 0
     with standard_input([args.file]) as (args.file,):
-        return told(args)
+        return told(args, console)
 
 
-def told(args: argparse.Namespace) -> int:
+def told(args: argparse.Namespace, console: Console) -> int:
     """What there is to say of a file, a folder or a name."""
     path = Path(args.file)
     if is_run(path):
@@ -72,7 +74,22 @@ def told(args: argparse.Namespace) -> int:
     elif path.suffix.lower() == ".xml" or not path.exists():
         show(other(args.file, dict(args.define)), args.json)
     else:
-        show(stack(read(args.file, dict(args.layer), args.untrusted)), args.json)
+        return file(args, console)
+    return 0
+
+
+def file(args: argparse.Namespace, console: Console) -> int:
+    """An image file; where not all of it is understood, what is in it all the same."""
+    views = views_in(args.file)
+    names = {"views": [view.name for view in views]} if len(views) > 1 else {}
+    try:
+        report = stack(read(args.file, dict(args.layer), args.untrusted, view=args.view))
+    except NgptError as error:
+        console.error(error)
+        held = {f"layers of {view.name}" if names else "layers": layers_held(view.parts) for view in views}
+        show({"file": args.file} | names | held, args.json)
+        return 1
+    show(report | names, args.json)
     return 0
 
 
@@ -127,7 +144,9 @@ def stack(stack: GradientStack) -> dict:
     assert stack.source is not None
     parts, resolution = stack.source.image.parts, stack.source.resolution
     main = parts[resolution["primal"].part]
-    window = [[int(n) for n in corner] for corner in main.header["dataWindow"]]
+    data, display = (
+        [[int(n) for n in corner] for corner in main.header[f"{name}Window"]] for name in ("data", "display")
+    )
     further = pass_through(stack)
     rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}
     layers = {}
@@ -147,7 +166,8 @@ def stack(stack: GradientStack) -> dict:
     report = {
         "file": stack.path,
         "size": [stack.width, stack.height],
-        "data window": window,
+        "data window": data,
+        "display window": display,
         "parts": len(parts),
         "layers": layers,
         "diagnostics": {
@@ -163,8 +183,7 @@ def stack(stack: GradientStack) -> dict:
             name for name in LAYERS if name not in stack and name not in ("error", "motion", "samples", "dt", "dt_var")
         ],
         "proposed": [
-            f'--layer {name}="{layer}"'
-            for name, layer in propose([(part.name, list(part.channels)) for part in parts], resolution).items()
+            f'--layer {name}="{layer}"' for name, layer in propose(stack.source.view.parts, resolution).items()
         ],
         "methods": [
             name

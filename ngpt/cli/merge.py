@@ -1,4 +1,4 @@
-"""``ngpt merge``: one gradient stack of several, with the samples of all of them."""
+"""``ngpt merge``: one gradient stack of several, with the samples and the pixels of all of them."""
 
 import argparse
 
@@ -9,7 +9,9 @@ from ngpt.system.console import Console
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("stacks", nargs="+", metavar="STACK", help="stacks of one scene, rendered with different seeds")
+    parser.add_argument(
+        "stacks", nargs="+", metavar="STACK", help="stacks of one image: different seeds, or tiles of it"
+    )
     parser.add_argument("-o", "--output", metavar="FILE", required=True, help="stack to write")
     add_force(parser)
     add_json(parser)
@@ -20,7 +22,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     merged = merge([read(path) for path in args.stacks])
     write(target, merged, overwrite=args.force)
     spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]
-    console.say(f"{len(args.stacks)} stacks -> {target}: {merged.width}x{merged.height}, {spp} spp, seeds {seed}")
+    console.say(f"{len(args.stacks)} stacks -> {target}: {merged.place}, {spp} spp, seeds {seed}")
     if args.json:
         print_json({"output": str(target), "inputs": args.stacks, "spp": spp, "seed": seed, "layers": merged.names})
     return 0

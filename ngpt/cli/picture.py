@@ -6,26 +6,29 @@ from pathlib import Path
 
 import numpy as np
 
-from ngpt.cli.arguments import add_force, output_file
-from ngpt.cli.framenames import frames_named, named, number_of, varies
+from ngpt.cli.arguments import add_force, add_view, output_file
 from ngpt.cli.streams import standard_input
-from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read_image
+from ngpt.errors import WrongUse
+from ngpt.io.exr import read_picture
+from ngpt.io.framenames import named, number_of, varies
+from ngpt.io.frames import is_shot, remarks, shot_files
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.system.console import Console
 from ngpt.system.files import make_folder
+from ngpt.windows import Place, put
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
-        "Of a stack the noisy image is shown, of a result the result. All frames of a folder have one exposure."
+        "Of a stack the noisy image is shown, of a result the result. A picture has the pixels of the data window that "
+        "lie in the display window; frames of a folder have all of their display window, and one exposure."
     )
     parser.add_argument(
         "image",
         metavar="IMAGE",
-        help="an image of any renderer (-: standard input), a folder of frames, or shot.%%04d.exr",
+        help="an image of any renderer (-: standard input); of frames a folder, a pattern, or shot.%%04d.exr",
     )
     parser.add_argument(
         "-o",
@@ -36,31 +39,27 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "names as pic.%%04d.png",
     )
     add_look(parser)
+    add_view(parser, "default: the first")
     parser.add_argument("--fps", type=frames_a_second, default=24.0, help="frames a second of a film (default: 24)")
     add_force(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    source, target = Path(args.image), Path(args.output)
-    if source.is_dir() or varies(args.image):
-        return shot(args, source, target, console)
+    target = Path(args.output)
+    if is_shot(args.image):
+        return shot(args, args.image, target, console)
     check_kind(target, PICTURES)
     output_file(target, args)
     with standard_input([args.image]) as (name,):
-        image = read_image(name)
+        image = in_picture(*read_picture(name, view=args.view))
         write_picture(target, shown(image, args.transform, exposed(args.exposure, image)), args.force)
         console.say(f"{name} -> {target}: {image.shape[1]}x{image.shape[0]}")
     return 0
 
 
-def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console) -> int:
-    """A film of a folder's frames, or a picture of each."""
-    if folder.is_dir():
-        files = sorted(path for path in folder.iterdir() if path.suffix.lower() == ".exr")
-    else:
-        files = list(frames_named(str(folder)).values())
-    if not files:
-        raise NgptError(f"{folder}: no .exr files there")
+def shot(args: argparse.Namespace, folder: str, target: Path, console: Console) -> int:
+    """A film of the frames of a folder or a pattern, or a picture of each."""
+    files = shot_files(folder)
     each = varies(str(target))
     film = bool(target.suffix) and not each
     if film:
@@ -72,12 +71,15 @@ def shot(args: argparse.Namespace, folder: Path, target: Path, console: Console)
             output_file(named(str(target), number_of(file, str(target))), args)
     elif target.exists() and not target.is_dir():
         raise WrongUse(f"{target}: is a file; name a folder for the pictures, or a film ({' '.join(SHOTS)})")
-    stops = exposed(args.exposure, read_image(files[0]))
+    for remark in remarks(folder, files):
+        console.say(remark)
+    stops = exposed(args.exposure, in_picture(*read_picture(files[0], view=args.view)))
 
     def pictures():
         for done, file in enumerate(files):
             progress(done, len(files))
-            yield file, shown(read_image(file), args.transform, stops)
+            pixels, place = read_picture(file, view=args.view)
+            yield file, shown(put(pixels, place.data, place.display), args.transform, stops)
         progress(len(files), len(files))
 
     with console.progress("pictures", "frames") as progress:
@@ -98,6 +100,12 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
     for file, pixels in pictures:
         name = named(str(folder), number_of(file, str(folder))) if each else folder / f"{file.stem}.png"
         write_picture(Path(name), pixels, overwrite)
+
+
+def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
+    """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole."""
+    seen = place.data.common(place.display) or place.data
+    return image[seen.within(place.data)]
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 
 from ngpt.cli.arguments import add_force, output_file, tell_lacks
-from ngpt.cli.framenames import frames_named, varies
 from ngpt.cli.streams import standard_input
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read, read_image
+from ngpt.io.exr import read, read_picture
+from ngpt.io.framenames import frames_named, varies
+from ngpt.io.frames import frame_name, is_shot, natural, remarks, shot_files
 from ngpt.measure.metrics import METRICS, exposure_mismatch
 from ngpt.measure.shown import available, judge
 from ngpt.report.content import REFERENCE, Entry, Overview, Scene
@@ -23,6 +24,9 @@ from ngpt.system.files import atomic_output
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__
+from ngpt.windows import Place, overlap, put
+
+Slices = tuple[slice, slice]
 
 # Denoising moves the mean by a fraction of this.
 _STOPS = 0.5
@@ -41,15 +45,16 @@ MEANINGS = {
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
         "Of a stack the noisy image is shown, of a result the result. Pictures are named after their files. "
-        "Of one file alone all layers are shown. Folders are shots: the page plays them, and with a folder of "
-        "references there is a table of errors and flicker. Folders of training runs are compared: curves, pictures, "
-        "settings that differ."
+        "Of one file alone all layers are shown. Images are compared in the pixels that all have, by their data "
+        "windows. Folders are shots: the page plays their display windows, and with a folder of references there is a "
+        "table of errors and flicker. Folders of training runs are compared: curves, pictures, settings that differ."
     )
     parser.add_argument(
         "images",
         nargs="+",
         metavar="IMAGE",
-        help="images of one size, of any renderer (-: standard input); shots: folders, shot.%%04d.exr; training runs",
+        help="images of one place and size, of any renderer (-: standard input); shots: folders, patterns, "
+        "shot.%%04d.exr; training runs",
     )
     parser.add_argument(
         "--ref",
@@ -74,12 +79,15 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def images_or_shots(args: argparse.Namespace, target: Path, console: Console) -> int:
     names = labels(args.images)
-    if any(os.path.isdir(path) or varies(path) for path in args.images):
+    if any(is_shot(path) for path in args.images):
         return run_shots(args, names, target, console)
-    images = [read_image(path) for path in args.images]
-    reference = read_image(args.ref) if args.ref else None
-    for path, image in zip([*args.images[1:], args.ref], [*images[1:], reference], strict=True):
-        check_size(path, image, args.images[0], images[0])
+    paths = [*args.images, *([args.ref] if args.ref else [])]
+    whole, places = zip(*map(read_picture, paths), strict=True)
+    all_have = overlap(paths, places)
+    if all_have.line:
+        console.say(all_have.line)
+    images = all_have.of(whole)
+    reference = images.pop() if args.ref else None
     height, width = images[0].shape[:2]
     entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
     layers: dict[str, np.ndarray] = {}
@@ -127,44 +135,62 @@ def run_trainings(args: argparse.Namespace, target: Path, console: Console) -> i
 
 
 def run_shots(args: argparse.Namespace, names: list[str], target: Path, console: Console) -> int:
-    """Shots of the same frames: a page that plays them, and what is measured over all of them."""
-    shots = frames_of([*args.images, *([args.ref] if args.ref else [])])
-    frames = sorted(shots[0])
-    first = read_image(shots[0][frames[0]])
-    metrics, lacks = available(*first.shape[:2]) if args.ref else ([], {})
+    """Folders of frames of equal names: a page that plays them, and what is measured over all of them."""
+    folders = [*args.images, *([args.ref] if args.ref else [])]
+    shots = [shot_files_of(folder) for folder in folders]
+    frames = frames_of(folders, shots)
+    for folder, files in zip(folders, shots, strict=True):
+        for remark in remarks(folder, files):
+            console.say(remark)
+    start = str(frames[0][0])
+    first = read_picture(start).place.display
+    metrics, lacks = available(first.height, first.width) if args.ref else ([], {})
     tell_lacks(lacks, console)
-    scenes, motions = [], []
+    scenes: list[Scene] = []
+    motions: list[np.ndarray | None] = []
+    partly = 0
+    # Of each folder the frames as they are measured: NaN where the display window has no pixel of theirs.
+    known: list[list[np.ndarray]] = [[] for _ in folders]
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
             progress(done, len(frames))
-            paths = [str(shot[frame]) for shot in shots]
-            images = [read_image(path) for path in paths]
-            for path, image in zip(paths, images, strict=True):
-                check_size(path, image, str(shots[0][frames[0]]), first)
+            paths = [str(path) for path in frame]
+            whole, places = zip(*map(read_picture, paths), strict=True)
+            all_have, display = overlap(paths, places), places[0].display
+            both = all_have.common.common(display)
+            if both is None or display.size != first.size:
+                why = "render or crop them to one size" if both else "nothing of it is seen"
+                raise NgptError(f"{paths[0]} is {places[0]} and {start} is of {first}; {why}")
+            partly += bool(all_have.line)
+            images = [put(image, window, display) for image, window in zip(whole, all_have.windows, strict=True)]
+            for values, image, window in zip(known, whole, all_have.windows, strict=True):
+                values.append(put(image, window, display, np.nan))
             reference = images.pop() if args.ref else None
             entries = [Entry(name, image) for name, image in zip(names, images, strict=True)]
-            motions.append(motion_of(paths))
+            motions.append(motion_of(paths, places[0]))
             if reference is not None:
                 for entry, path in zip(entries, paths, strict=False):
-                    add_errors(entry, metrics, reference, path, paths[-1])
+                    add_errors(entry, metrics, reference, path, paths[-1], both.within(display))
             rising = [name for name, metric in METRICS.items() if metric.better == "higher"]
-            size = f"{first.shape[1]}x{first.shape[0]}"
-            caption = f"{shots[0][frame].name}, {size}"
-            scenes.append(Scene(shots[0][frame].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
+            caption = f"{frame[0].name}, {first.width}x{first.height}"
+            scenes.append(Scene(frame[0].stem, caption, reference, entries, rising=rising, meanings=MEANINGS))
         progress(len(frames), len(frames))
+    if partly:
+        console.say(f"{partly} of {len(frames)} frames: compared are the pixels that all images have")
     tables = {}
     for place in range(len(names)):
-        add_maps(scenes, place, "change", change_maps([scene.entries[place].image for scene in scenes], motions))
+        add_maps(scenes, place, "change", change_maps(known[place], motions))
     if args.ref and len(frames) > 1:
-        references = [np.asarray(scene.reference) for scene in scenes]
+        references = known[-1]
         rows = [["", *metrics, "flicker"]]
         for place, name in enumerate(names):
-            images = [scene.entries[place].image for scene in scenes]
+            images = known[place]
             add_maps(scenes, place, "flicker", flicker_maps(images, references, motions))
             means = [float(np.mean([scene.entries[place].metrics[metric] for scene in scenes])) for metric in metrics]
             rows.append([name, *(f"{value:.4g}" for value in (*means, flicker(images, references, motions)))])
-        if not any(motion is not None for motion in motions[1:]):
-            console.say("flicker is nan: no frame after the first has motion vectors to follow")
+        if all(motion is None for motion in motions[1:]):
+            what = "no frame after the first has motion vectors (layer 'motion'), to tell it from what moves"
+            console.say(f"flicker is nan: {what}")
         tables = {f"Means over {len(frames)} frames": rows}
         for row in rows:
             tell(f"{row[0]:{max(map(len, names))}}" + "".join(f"{cell:>16}" for cell in row[1:]))
@@ -197,38 +223,39 @@ def add_maps(scenes: list[Scene], place: int, name: str, changes: list[np.ndarra
         scene.entries[place].maps[name] = np.broadcast_to(values, image.shape[:2])
 
 
-def motion_of(paths: list[str]) -> np.ndarray | None:
-    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them."""
+def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
+    """The motion vectors of a frame, (H, W, 2), from the first of its files that has them; in its display window."""
     for path in paths:
-        layers = read(path).layers
-        if "motion" in layers:
-            return layers["motion"]
+        stack = read(path)
+        window = stack.place.seen_from(place)
+        if "motion" in stack and window is not None:
+            return put(stack["motion"], window, place.display, np.nan)
     return None
 
 
-def frames_of(names: list[str]) -> list[dict[Any, Path]]:
-    """The files of each shot by their frames, which are the same in all of them.
+def shot_files_of(folder: str) -> list[Path]:
+    """The frames of a shot; raises NgptError for files, of which a shot has several."""
+    if not is_shot(folder):
+        raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
+    return shot_files(folder)
 
-    Frames go by the names of their files, or by their numbers where all shots are names that vary. Raises NgptError for
-    files among shots, and for frames that one of them lacks.
+
+def frames_of(folders: list[str], shots: list[list[Path]]) -> list[tuple[Path, ...]]:
+    """The file of each frame in every shot, in the order of the first; raises NgptError where one lacks a frame.
+
+    Frames go by the names of their files, or by their numbers where all shots are names of frames.
     """
-    found: list[dict[Any, Path]] = []
-    numbered = not any(os.path.isdir(name) for name in names)
-    for name in names:
-        if varies(name):
-            frames = frames_named(name)
-            found.append(frames if numbered else {path.name: path for path in frames.values()})
-        elif os.path.isdir(name):
-            found.append({path.name: path for path in Path(name).iterdir() if path.suffix.lower() == ".exr"})
-        else:
-            raise NgptError(f"{name}: is no folder, and others are; give folders of frames, or images alone")
-        if not found[-1]:
-            raise NgptError(f"{name}: no .exr files there")
-        if differ := found[-1].keys() ^ found[0].keys():
-            frame = min(differ)
-            has, lacks = (name, names[0]) if frame in found[-1] else (names[0], name)
-            raise NgptError(f"{has} has {frame} and {lacks} has not; give folders of the same frames")
-    return found
+    found: list[dict[Any, Path]] = [{frame_name(path): path for path in files} for files in shots]
+    if all(map(varies, folders)):
+        numbers = {path: number for folder in folders for number, path in frames_named(folder).items()}
+        found = [{numbers[path]: path for path in files} for files in shots]
+    for folder, files in zip(folders, found, strict=True):
+        if differ := files.keys() ^ found[0].keys():
+            frame = min(differ, key=natural)
+            has, lacks = (folder, folders[0]) if frame in files else (folders[0], folder)
+            path = files.get(frame) or found[0][frame]
+            raise NgptError(f"{has} has {path.name} and {lacks} has not; give folders of the same frames")
+    return [tuple(files[frame] for files in found) for frame in found[0]]
 
 
 def labels(paths: list[str]) -> list[str]:
@@ -245,19 +272,17 @@ def labels(paths: list[str]) -> list[str]:
     return [str(place) for place in places]  # they differ in their endings only
 
 
-def check_size(path: str, image: np.ndarray | None, first: str, expected: np.ndarray) -> None:
-    """Raises NgptError unless the image is as large as the first."""
-    if image is not None and image.shape != expected.shape:
-        (height, width), (rows, columns) = image.shape[:2], expected.shape[:2]
-        raise NgptError(f"{path} is {width}x{height} but {first} is {columns}x{rows}; render or crop them to one size")
-
-
-def add_errors(entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str) -> None:
-    """Measures a picture of file ``path`` against the reference of file ``other``."""
+def add_errors(
+    entry: Entry, metrics: list[str], reference: np.ndarray, path: str, other: str, part: Slices = np.s_[:, :]
+) -> None:
+    """Measures ``part`` of a picture of file ``path`` against the reference of file ``other``."""
     try:
-        entry.metrics, entry.maps = judge(metrics, entry.image, reference)
+        entry.metrics, maps = judge(metrics, entry.image[part], reference[part])
     except NgptError as error:
         raise NgptError(f"{path} and {other}: {error}") from error
+    for name, values in maps.items():
+        entry.maps[name] = np.zeros(entry.image.shape[:2], values.dtype)
+        entry.maps[name][part] = values
 
 
 def print_table(entries: list[Entry]) -> None:

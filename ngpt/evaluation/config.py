@@ -9,6 +9,7 @@ from typing import Any
 
 from ngpt.errors import NgptError
 from ngpt.evaluation.renders import KINDS, Render
+from ngpt.io.frames import natural
 from ngpt.measure.metrics import METRICS
 from ngpt.methods import METHODS
 from ngpt.system.parts import find_renderer
@@ -140,7 +141,7 @@ class Config:
         """Name -> built-in scene, scene file or folder of stacks; patterns are resolved."""
         result: dict[str, str] = {}
         for entry in self.scenes:
-            found = sorted(glob(entry, recursive=True)) if has_magic(entry) else [entry]
+            found = sorted(glob(entry, recursive=True), key=natural) if has_magic(entry) else [entry]
             if not found:
                 raise NgptError(f"evaluation: no scene file matches '{entry}'")
             for file in found:

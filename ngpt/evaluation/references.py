@@ -15,6 +15,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import read
+from ngpt.io.frames import natural
 from ngpt.measure.images import check_size, middle
 from ngpt.measure.metrics import EPSILON, exposure_mismatch
 from ngpt.repair import variance_of_primal
@@ -115,7 +116,7 @@ def find_reference(folder: Path) -> Reference:
 
     Raises NgptError where there is none.
     """
-    found = sorted(folder.glob("reference*.exr"))
+    found = sorted(folder.glob("reference*.exr"), key=natural)
     for path in found:
         other = path.with_name(f"{path.stem.removesuffix(HALVES[0])}{HALVES[1]}.exr")
         if path.stem.endswith(HALVES[0]) and other in found:

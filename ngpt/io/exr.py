@@ -8,26 +8,30 @@ holds, layers the toolkit does not know included, passes through as ``ngpt.io.op
 
 import logging
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import OpenEXR
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import Found, Resolution, resolve, resolve_alone
-from ngpt.io.aliases import layers_of_light as find_light
+from ngpt.io.aliases import writer_of
 from ngpt.io.foreign.files import ENCODED, FROM, file_headers, read_file
 from ngpt.io.isolated import read_exr_isolated
+from ngpt.io.layout import StackSource, file_views, gather, is_half, place_of, scatter, taken
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 from ngpt.io.primaries import converted, to_rec709
+from ngpt.io.resolution import Found, Resolution, resolve, resolve_alone
+from ngpt.io.resolution import layers_of_light as find_light
+from ngpt.io.results import MADE_BY, STRUCTURE, image_of, leave_out_old_error, new_header, with_result
+from ngpt.io.views import Part, View, choose_views, views_of
 from ngpt.layers import LAYERS, RGB
 from ngpt.stack import GradientStack
 from ngpt.system.reading import regular_file
 from ngpt.system.threads import map_parts
 from ngpt.version import __version__
+from ngpt.windows import Place
 
 _LOG = logging.getLogger(__name__)
 
@@ -35,6 +39,7 @@ __all__ = [
     "MADE_BY",
     "ExrImage",
     "ExrPart",
+    "Picture",
     "StackSource",
     "channels_alone",
     "layers_in",
@@ -43,38 +48,14 @@ __all__ = [
     "read",
     "read_exr",
     "read_image",
+    "read_picture",
+    "read_views",
     "replace_layers_of_light",
+    "views_in",
     "with_channels",
     "write",
     "write_exr",
 ]
-
-# Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
-_STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
-    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
-}  # fmt: skip
-# Attributes that say what made a result; those of the stack are others, and stay.
-MADE_BY = (
-    "ngpt:method",
-    "ngpt:weights",
-    "ngpt:options",
-    "ngpt:estimated",
-    "ngpt:reconstructSeconds",
-    "ngpt:temporal",
-    "ngpt:history",
-    "ngpt:historyWeights",
-)
-_HALF_MAX = 65504.0
-_HALF_NORMAL_MIN = 2.0**-14
-_ROWS = 16  # that are gathered at a time
-
-
-@dataclass(frozen=True)
-class StackSource:
-    """The file a stack was read from, and where in it the layers are."""
-
-    image: ExrImage
-    resolution: Resolution
 
 
 def read(
@@ -82,13 +63,17 @@ def read(
     layers: Mapping[str, str] | None = None,
     isolated: bool = False,
     files: Mapping[str, str | os.PathLike] | None = None,
+    view: str | None = None,
 ) -> GradientStack:
     """Reads a gradient stack, or any render with an image in it.
 
     Layers are found by their names in the contract or in other renderers (``ngpt.io.aliases``). ``layers`` maps names
-    of the contract to names in the file: ``{"albedo": "ViewLayer.Denoising Albedo"}``. Half and uint channels are
-    converted to float32; layers the toolkit does not know stay in ``stack.source`` and come back on writing. In a
-    result file primal is the kept input, so that reconstructing a result gives the result again.
+    of the contract to names in the file, ``{"albedo": "ViewLayer.Denoising Albedo"}``, or to channels with signs and
+    factors, ``{"motion": "-velocity.R,velocity.G"}``. Half and uint channels are converted to float32; layers the
+    toolkit does not know stay in ``stack.source`` and come back on writing. In a result file primal is the kept input,
+    so that reconstructing a result gives the result again.
+
+    ``view`` is one of a stereo file (``ngpt.io.views``): by default the first.
 
     ``files`` maps names of the contract to files of their own, ``{"albedo": "albedo.exr"}``, which win over layers of
     that name in ``path``. Of several layers in such a file the one of a known name counts, else its root.
@@ -104,13 +89,60 @@ def read(
     such a file of a layer.
     """
     image = read_exr_isolated(path) if isolated else read_file(path)
-    ours = any("ngpt:sampler" in part.header for part in image.parts)
-    resolution = resolve([(part.name, list(part.channels)) for part in image.parts], layers, str(path), ours)
-    layers_found = map_parts(lambda found: _gather(image.parts[found.part], found.channels), resolution.values())
+    return _stack(image, _one_view(image, view, str(path)), layers, isolated, files, str(path))
+
+
+def read_views(
+    path: str | os.PathLike,
+    layers: Mapping[str, str] | None = None,
+    isolated: bool = False,
+    files: Mapping[str, str | os.PathLike] | None = None,
+    view: str | None = None,
+) -> list[GradientStack]:
+    """As ``read``, a stack for each view of the file, or for the one that is named; one for a file without views."""
+    image = read_exr_isolated(path) if isolated else read_file(path)
+    found = choose_views(file_views(image), view, str(path))
+    if len(found) == 1:
+        return [_stack(image, found[0], layers, isolated, files, str(path))]
+    return [_stack(image, one, layers, isolated, files, f"{path}, view {one.name}") for one in found]
+
+
+def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
+    """The view of that name, or the first; a warning says so where there are others."""
+    found = choose_views(file_views(image), wanted, path)
+    if len(found) > 1:
+        _LOG.warning("%s: of the views %s, %s is taken", path, ", ".join(view.name for view in found), found[0].name)
+    return found[0]
+
+
+def _resolved(
+    view: View, layers: Mapping[str, str] | None, attributes: Iterable[Mapping[str, Any]], path: str
+) -> Resolution:
+    """Where the layers of a view are; ``attributes`` are those of the parts."""
+    headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
+    origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
+    # In a result the input is elsewhere by now.
+    if origin and f".{origin}".endswith(f".{wanted.get('primal')}"):
+        del wanted["primal"]
+    writer = writer_of(name for header in headers for name in header)
+    return resolve(view.parts, wanted, path, writer, origin)
+
+
+def _stack(
+    image: ExrImage,
+    view: View,
+    layers: Mapping[str, str] | None,
+    isolated: bool,
+    files: Mapping[str, str | os.PathLike] | None,
+    path: str,
+) -> GradientStack:
+    """The stack of one view of a file."""
+    resolution = _resolved(view, layers, (part.header for part in image.parts), path)
+    layers_found = map_parts(lambda found: taken(image, found), resolution.values())
     arrays = dict(zip(resolution, layers_found, strict=True))
     main = image.parts[resolution["primal"].part]
-    attributes = {name: value for name, value in main.header.items() if name not in _STRUCTURE}
-    stack = GradientStack(arrays, attributes, StackSource(image, resolution), str(path))
+    attributes = {name: value for name, value in main.header.items() if name not in STRUCTURE}
+    stack = GradientStack(arrays, attributes, StackSource(image, resolution, view), path, place_of(main))
     for name, found in resolution.items():
         here, there = main.header["dataWindow"], image.parts[found.part].header["dataWindow"]
         if not np.array_equal(here, there):
@@ -126,9 +158,21 @@ def read(
 
 def layers_in(path: str | os.PathLike, layers: Mapping[str, str] | None = None) -> frozenset[str]:
     """The names of the layers that ``read`` would find, by the file's header; raises NgptError as it does for that."""
+    views, texts = _views_in(path)
+    return frozenset(_resolved(views[0], layers, texts, str(path)))
+
+
+def views_in(path: str | os.PathLike) -> list[View]:
+    """The views of a file, and the names of what they hold, by its header; raises NgptError for what is no image."""
+    return _views_in(path)[0]
+
+
+def _views_in(path: str | os.PathLike) -> tuple[list[View], list[dict[str, str]]]:
+    """The views of a file, and the attributes of its parts that are texts."""
     with regular_file(Path(path)) as file:
-        parts = [(part.name, list(part.channels)) for part in file_headers(file, str(path))]
-    return frozenset(resolve(parts, layers, str(path)))
+        headers = file_headers(file, str(path))
+    parts = [Part(part.name, list(part.channels), part.text("view"), part.texts("multiView")) for part in headers]
+    return views_of(parts), [{name: part.text(name) for name in part.attributes} for part in headers]
 
 
 def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: ExrPart, isolated: bool) -> np.ndarray:
@@ -139,7 +183,7 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     if name != "albedo" and (kind := parts[0].header.get(FROM, "")).endswith(ENCODED):
         raise NgptError(f"{file}: {name} is no light, and this is {kind}; save it as .exr or .pfm")
     found = resolve_alone([(part.name, list(part.channels)) for part in parts], name, str(file))
-    layer = _gather(parts[found.part], found.channels)
+    layer = gather(parts[found.part], found.channels)
     if layer.shape[:2] != (stack.height, stack.width):
         raise NgptError(
             f"{file}: {name} is {layer.shape[1]}x{layer.shape[0]} but {stack.path} is {stack.width}x{stack.height}; "
@@ -154,36 +198,58 @@ def _read_alone(file: str | os.PathLike, name: str, stack: GradientStack, main: 
     return layer
 
 
-def read_image(path: str | os.PathLike, isolated: bool = False) -> np.ndarray:
-    """Reads the picture that a viewer would show, (H, W, 3) float32: the root R G B of the first part.
+class Picture(NamedTuple):
+    """What a viewer shows of a file, (H, W, 3) float32, and where it lies."""
+
+    pixels: np.ndarray
+    place: Place
+
+
+def read_image(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> np.ndarray:
+    """Reads what a viewer would show of a file, (H, W, 3) float32: the pixels of ``read_picture``."""
+    return read_picture(path, isolated, view).pixels
+
+
+def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | None = None) -> Picture:
+    """Reads the picture that a viewer would show: the root R G B of the first part.
 
     That is the reconstruction in a result file and the primal in a stack; in a file without a root image, it is what
-    ``read`` takes for the primal. Unlike there, light of other primaries is converted to linear Rec. 709
-    (``ngpt.io.primaries``): pictures are looked at and compared.
+    ``read`` takes for the primal. ``view`` is one of a stereo file, by default the first. Unlike there, light of other
+    primaries is converted to linear Rec. 709 (``ngpt.io.primaries``): pictures are looked at and compared.
     """
-    part = (read_exr_isolated(path) if isolated else read_file(path)).parts[0]
-    if all(name in part.channels for name in RGB):
-        return converted(_gather(part, RGB), to_rec709(part.header))
-    stack = read(path, isolated=isolated)
-    return converted(stack["primal"], to_rec709(stack.attributes))
+    image = read_exr_isolated(path) if isolated else read_file(path)
+    part, chosen = image.parts[0], _one_view(image, view, str(path))
+    if view is None and all(name in part.channels for name in RGB):
+        return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
+    stack = _stack(image, chosen, None, isolated, None, str(path))
+    # That of a result is beside its input.
+    for place in (stack.source.resolution["primal"].part, chosen.first):
+        part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
+        if all(name in part.channels for name in root):
+            return Picture(converted(gather(part, root), to_rec709(part.header)), place_of(part))
+    return Picture(converted(stack["primal"], to_rec709(stack.attributes)), stack.place)
 
 
 def write(
     path: str | os.PathLike,
-    image: np.ndarray | GradientStack,
-    like: GradientStack | None = None,
+    image: np.ndarray | GradientStack | Sequence[np.ndarray],
+    like: GradientStack | Sequence[GradientStack] | None = None,
     overwrite: bool = False,
     attributes: Mapping[str, Any] | None = None,
 ) -> Path:
     """Writes a stack, a result or an image, and returns its path.
 
     A stack is written as the file it was read from with its layers and attributes brought up to date (they are never
-    removed), or else as one scanline part, compressed with ZIP, primal in the root R G B.
+    removed), or else as one scanline part at its ``place``, compressed with ZIP, primal in the root R G B.
 
     A result, ``image`` (H, W, 3) with ``like`` the stack it was made of, is that file with ``image`` in the root R G B
     of its first part, which is what viewers show, and the input in primal.R/G/B. Should the first part be another than
     the one that holds primal, or show something else in its root, then it stays as it is and a new part goes in front.
-    Alpha is copied into the root if the file has it elsewhere.
+    Alpha is copied into the root if the file has it elsewhere. ``image`` also replaces the layer that the input was
+    read from (``ViewLayer.Combined``), which the attribute ``ngpt:pass`` then names; a ``Noisy Image`` stays.
+
+    Results of the views of one file go together: lists of them, and of their stacks (``read_views``). Each is then the
+    root of its view.
 
     Channels keep their type, half or float, and become float where half cannot hold the values (above 65504, or all
     below 6.1e-5). Gradients, variances and depth are written as float. An ``image`` alone is written as float R G B.
@@ -192,28 +258,45 @@ def write(
     stack that is itself a result says of its own making (``MADE_BY``) is left out of the new result, and so is the
     layer ``error`` that was read with it. One that was put in its place (``like=stack.replace(error=...)``) is written.
     """
-    if structural := _STRUCTURE & (attributes or {}).keys():
+    if structural := STRUCTURE & (attributes or {}).keys():
         raise NgptError(f"{path}: attribute '{min(structural)}' is OpenEXR's own; give it another name")
     if isinstance(image, GradientStack):
         if like is not None:
             raise NgptError(f"{path}: `like` goes with an image, not with a stack; pass one of the two")
-        result, _, main = _image_of(image, str(path))
-    elif like is not None:
-        pixels = GradientStack.from_arrays(path=str(path), primal=image)["primal"]
-        if pixels.shape != like["primal"].shape:
+        result, _, main = image_of(image, str(path))
+        result.parts[main].header.update({**(attributes or {}), "ngpt:version": __version__})
+        return write_exr(path, result, overwrite)
+    if like is None:
+        return write(path, GradientStack.from_arrays(path=str(path), primal=image), None, overwrite, attributes)
+    pairs: list[tuple[Any, GradientStack]] = [(image, like)] if isinstance(like, GradientStack) else []
+    pairs = pairs or list(zip(image, like, strict=True))  # type: ignore[arg-type]
+    # The first view may get a part in front of all others, which then have other numbers.
+    pairs.sort(key=lambda pair: pair[1].source is None or pair[1].source.view.first == 0)
+    made: ExrImage | None = None
+    for one, stack in pairs:
+        pixels = GradientStack.from_arrays(path=str(path), primal=one)["primal"]
+        if pixels.shape != stack["primal"].shape:
             raise NgptError(
-                f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {like.path} is "
-                f"{like.width}x{like.height}; results are written at the size of their stack"
+                f"{path}: the result is {pixels.shape[1]}x{pixels.shape[0]} but the stack {stack.path} is "
+                f"{stack.width}x{stack.height}; results are written at the size of their stack"
             )
-        found, resolution, _ = _image_of(like, str(path))
-        _leave_out_old_error(like, found)
-        result, main = _with_result(found, resolution, pixels), 0
-        for name in MADE_BY:
-            result.parts[0].header.pop(name, None)
-    else:
-        result, _, main = _image_of(GradientStack.from_arrays(path=str(path), primal=image), str(path))
-    result.parts[main].header.update({**(attributes or {}), "ngpt:version": __version__})
-    return write_exr(path, result, overwrite)
+        made = _result(stack, pixels, made, attributes or {}, str(path))
+    assert made is not None
+    return write_exr(path, made, overwrite)
+
+
+def _result(
+    stack: GradientStack, pixels: np.ndarray, base: ExrImage | None, attributes: Mapping[str, Any], path: str
+) -> ExrImage:
+    """The file of a stack, with the results of other views as in ``base``, and ``pixels`` (H, W, 3) as its result."""
+    found, resolution, main = image_of(stack, path, base)
+    leave_out_old_error(stack, found)
+    view = stack.source.view if stack.source else file_views(found)[0]
+    for name in MADE_BY:
+        found.parts[main].header.pop(name, None)
+    result, main = with_result(found, resolution, view, pixels, str(stack.attributes.get("ngpt:pass", "")))
+    result.parts[main].header.update({**attributes, "ngpt:version": __version__})
+    return result
 
 
 def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> GradientStack:
@@ -223,13 +306,14 @@ def with_channels(stack: GradientStack, channels: Mapping[str, np.ndarray]) -> G
     a file are. ``pass_through`` reads them.
     """
     stack.require("primal", why="carrying further channels")
-    part, found = ExrPart("", {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, {}), {}
+    part, found = ExrPart("", new_header(stack), {}), {}
     for name in stack.names:
         prefix = "" if name in ("primal", "alpha") else f"{name}."
         found[name] = Found(0, tuple(prefix + suffix for suffix in LAYERS[name].channels), name)
-        _scatter(part, found[name].channels, stack[name], half=False)
+        scatter(part, found[name].channels, stack[name], half=False)
     part.channels.update({name: np.ascontiguousarray(image, np.float32) for name, image in channels.items()})
-    return GradientStack(stack.layers, stack.attributes, StackSource(ExrImage([part]), found), stack.path)
+    image = ExrImage([part])
+    return replace(stack, source=StackSource(image, found, file_views(image)[0]))
 
 
 def pass_through(stack: GradientStack) -> dict[str, np.ndarray]:
@@ -253,17 +337,17 @@ def channels_alone(stack: GradientStack) -> dict[str, np.ndarray]:
 
 def layers_of_light(stack: GradientStack) -> dict[str, np.ndarray]:
     """The layers of colour that a stack carries along beside those of the contract: name -> (H, W, 3) float32."""
-    return {name: _gather(part, names) for name, (part, names) in _light(stack).items()}
+    return {name: gather(part, names) for name, (part, names) in _light(stack).items()}
 
 
 def replace_layers_of_light(stack: GradientStack, layers: Mapping[str, np.ndarray]) -> GradientStack:
     """The stack with others in place of some of its ``layers_of_light``, (H, W, 3), of the type they have there."""
     image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
-    changed = GradientStack(stack.layers, stack.attributes, StackSource(image, stack.source.resolution), stack.path)
+    changed = replace(stack, source=replace(stack.source, image=image))
     places = _light(changed)
     for name, values in layers.items():
         part, names = places[name]
-        _scatter(part, names, values, _is_half(part, names))
+        scatter(part, names, values, is_half(part, names))
     return changed
 
 
@@ -272,112 +356,8 @@ def _light(stack: GradientStack) -> dict[str, tuple[ExrPart, tuple[str, ...]]]:
     if stack.source is None:
         return {}
     parts = stack.source.image.parts
-    found = find_light([(part.name, list(part.channels)) for part in parts], stack.source.resolution)
+    found = find_light(stack.source.view.parts, stack.source.resolution)
     return {name: (parts[place.part], place.channels) for name, place in found.items()}
-
-
-def _gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
-    """Returns the channels ``names`` as one array (H, W, C) float32."""
-    channels = [part.channels[name] for name in names]
-    layer = np.empty((*channels[0].shape, len(channels)), np.float32)
-    # Some rows at a time: what one channel wrote is then in the cache when the next comes between it.
-    for top in range(0, len(layer), _ROWS):
-        rows = slice(top, top + _ROWS)
-        for index, channel in enumerate(channels):
-            layer[rows, :, index] = channel[rows]
-    return layer
-
-
-def _holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray) -> bool:
-    """Whether the channels ``names`` are ``values`` (H, W, C), of those that are float32 bit for bit."""
-    if values.dtype != np.float32:
-        return False
-    return values.shape[:2] == part.channels[names[0]].shape and all(
-        np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
-        for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
-    )
-
-
-def _image_of(stack: GradientStack, path: str) -> tuple[ExrImage, Resolution, int]:
-    """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes."""
-    if stack.source is None:
-        stack.require("primal", why=f"writing {path}")
-        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-        image, resolution, main = ExrImage([ExrPart("", header, {})]), {}, 0
-    else:
-        image = ExrImage([replace(part, channels=dict(part.channels)) for part in stack.source.image.parts])
-        resolution = dict(stack.source.resolution)
-        main = resolution["primal"].part
-        size = next(iter(image.parts[main].channels.values())).shape
-        if (stack.height, stack.width) != size:
-            raise NgptError(
-                f"{path}: the stack is {stack.width}x{stack.height} but {stack.path}, which it was read from, is "
-                f"{size[1]}x{size[0]}; make a new stack of its layers with GradientStack.from_arrays"
-            )
-    header = {name: value for name, value in image.parts[main].header.items() if name in _STRUCTURE}
-    image.parts[main] = replace(image.parts[main], header={**header, **stack.attributes})
-    found = {name: (image.parts[resolution[name].part], resolution[name].channels) for name in resolution}
-    known = [name for name in stack.names if name in resolution]
-    unchanged = dict(zip(known, map_parts(lambda name: _holds(*found[name], stack[name]), known), strict=True))
-    for name in stack.names:
-        values, half = stack[name], False
-        if unchanged.get(name):
-            continue
-        if name in resolution:
-            part, names = found[name]
-            half = _is_half(part, names) and not LAYERS[name].float_on_disk
-        else:
-            prefix = "" if name in ("primal", "alpha") else f"{name}."
-            part, names = image.parts[main], tuple(prefix + suffix for suffix in LAYERS[name].channels)
-            resolution[name] = Found(main, names, name)
-        _scatter(part, names, values, half)
-    return image, resolution, main
-
-
-def _leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
-    """Removes the layer ``error`` that came with the file of a stack: it is that of an earlier result."""
-    place = stack.source.resolution.get("error") if stack.source else None
-    if place and "error" in stack and _holds(stack.source.image.parts[place.part], place.channels, stack["error"]):
-        for channel in place.channels:
-            image.parts[place.part].channels.pop(channel, None)
-
-
-def _with_result(image: ExrImage, resolution: Resolution, pixels: np.ndarray) -> ExrImage:
-    """Returns the file with ``pixels`` (H, W, 3) float32 as the root of its first part, the input as primal.R/G/B."""
-    primal, alpha = resolution["primal"], resolution.get("alpha")
-    source, parts = image.parts[primal.part], image.parts
-    root, kept = ("R", "G", "B"), ("primal.R", "primal.G", "primal.B")
-    shows_another = primal.channels not in (root, kept) and any(name in source.channels for name in root)
-    if primal.part != 0 or shows_another:
-        parts = [part if part.name else replace(part, name="source") for part in parts]
-        name = "ngpt"
-        while any(part.name == name for part in parts):
-            name += " result"
-        header = {key: value for key, value in source.header.items() if key not in ("channels", "lineOrder", "tiles")}
-        header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "name": name}
-        parts = [ExrPart(name, header, {}), *parts]
-    channels = parts[0].channels
-    half = _is_half(source, primal.channels)
-    channels.update(zip(kept, [source.channels[name] for name in primal.channels], strict=True))
-    if alpha:
-        channels.setdefault("A", image.parts[alpha.part].channels[alpha.channels[0]])
-    _scatter(parts[0], root, pixels, half)
-    return ExrImage(parts)
-
-
-def _scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
-    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float."""
-    if half:
-        peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
-        half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
-    # Variances in double precision may be beyond floats: they are infinite in files, which counts as not known.
-    with np.errstate(over="ignore"):
-        for index, name in enumerate(names):
-            part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)
-
-
-def _is_half(part: ExrPart, names: tuple[str, ...]) -> bool:
-    return all(part.channels[name].dtype == np.float16 for name in names)
 
 
 def _corner(window: tuple[np.ndarray, np.ndarray]) -> str:

@@ -43,6 +43,7 @@ class PartHeader:
     ``table``     entries of the table that says where pieces begin: those of smaller levels too, where that is told
     ``tiled``     whether pieces are tiles
     ``ratio``     the most bytes of image that one byte of the file can stand for
+    ``attributes``  name -> type and data, as they are in the file
     """
 
     name: str
@@ -54,6 +55,28 @@ class PartHeader:
     table: int
     tiled: bool
     ratio: int
+    attributes: dict[str, tuple[str, bytes]]
+
+    def number(self, attribute: str) -> float | None:
+        """An attribute that is a number; None where there is none."""
+        kind, data = self.attributes.get(attribute, ("", b""))
+        code = {"int": "<i", "float": "<f", "double": "<d"}.get(kind)
+        return struct.unpack(code, data)[0] if code and len(data) == struct.calcsize(code) else None
+
+    def text(self, attribute: str) -> str:
+        """An attribute that is a string; "" where there is none."""
+        kind, data = self.attributes.get(attribute, ("", b""))
+        return data.decode(errors="replace") if kind == "string" else ""
+
+    def texts(self, attribute: str) -> list[str]:
+        """An attribute that is a list of strings, as far as it is whole; none where there is none."""
+        kind, data = self.attributes.get(attribute, ("", b""))
+        found = []
+        while kind == "stringvector" and len(data) >= 4:
+            (length,) = struct.unpack_from("<i", data)
+            found.append(data[4 : 4 + max(length, 0)].decode(errors="replace"))
+            data = data[4 + max(length, 0) :]
+        return found
 
     @property
     def bytes(self) -> int:
@@ -171,7 +194,10 @@ def _part(index: int, attributes: dict[bytes, tuple[bytes, bytes]], flags: int) 
     table = max(struct.unpack("<i", data("chunkCount", "int"))[0], chunks) if b"chunkCount" in attributes else chunks
     channels = dict(_channels(data("channels", "chlist"), label))
     deep = kind.startswith(b"deep") or bool(flags & _DEEP)
-    return PartHeader(name, label, (width, height), channels, deep, chunks, table, tiled, ratio)
+    texts = {
+        key.decode(errors="replace"): (kind.decode(errors="replace"), data) for key, (kind, data) in attributes.items()
+    }
+    return PartHeader(name, label, (width, height), channels, deep, chunks, table, tiled, ratio, texts)
 
 
 def _channels(data: bytes, label: str) -> Iterator[tuple[str, tuple[int, tuple[int, int]]]]:

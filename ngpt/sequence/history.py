@@ -36,21 +36,27 @@ from ngpt.sequence.evidence import agreement, weighed
 from ngpt.sequence.network import Blend, Corrections, shipped
 from ngpt.sequence.warp import warped
 from ngpt.stack import GradientStack
+from ngpt.windows import Place
 
 # Frames that history may count for: what changes slowly, and is not seen by the evidence, lags by no more.
 LONGEST = 16
 # Image widths a frame, at which it counts for half as many: what is seen from elsewhere looks otherwise.
 FAST = 0.005
+# Mean weights of history below this are none: 0 %.
+NOTHING = 0.005
+NO_MOTION = "no layer 'motion'"
 
 
 @dataclass(frozen=True)
 class _History:
-    """What a frame hands on to the next: result without direct emission, that, relative variance, features, frame."""
+    """What a frame hands on to the next: result without direct emission, that, relative variance, features, where it
+    lies, frame."""
 
     light: np.ndarray
     direct: np.ndarray
     variance: np.ndarray
     features: dict[str, np.ndarray]
+    place: Place
     frame: object = None
 
 
@@ -66,6 +72,7 @@ class Temporal:
         self._history: _History | None = None
         self.blend: Blend | None = None  # what the last frame was made of; None for a restart
         self.weight = np.zeros((1, 1), np.float32)  # b of the last frame, (H, W)
+        self.reason = ""  # why history did not count in the last frame; "" where it did
 
     @property
     def share(self) -> float:
@@ -75,8 +82,9 @@ class Temporal:
     def next(self, stack: GradientStack, image: np.ndarray, previous: np.ndarray | None = None) -> np.ndarray:
         """The next frame's result, (H, W, 3) float32: ``image``, its result by any method, blended with those before.
 
-        It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is of
-        another size, or says that the frame before it was another one (``ngpt:previousFrame``). ``previous`` (H, W, 3)
+        It is ``image`` itself for a first frame, and after a cut: where the stack has no layer ``motion``, is a picture
+        of another size, or says that the frame before it was another one (``ngpt:previousFrame``). Frames may be parts
+        of a picture that move and change their size: history is looked up where they lie. ``previous`` (H, W, 3)
         is the last frame's result where it is not the one that was returned; also the one before a first frame, whose
         features are not known then.
         """
@@ -88,20 +96,26 @@ class Temporal:
         features = data.features
         self.weight, self.blend = np.zeros(now.shape[:2], np.float32), None
         before = self._history
+        self.reason = "the first frame" if before is None else _cut(stack, before)
         if previous is not None:
             given = repair(GradientStack({"primal": previous}), gradients=False).image
             if before is None or before.light.shape != given.shape:
-                before = _History(given, np.zeros_like(given), np.ones(given.shape[:2], np.float32), {})
+                place = Place.whole(*given.shape[1::-1])
+                before = _History(given, np.zeros_like(given), np.ones(given.shape[:2], np.float32), {}, place)
             before = replace(before, light=given - before.direct)
-        if before is not None and _follows(stack, before):
+        if before is not None and (shift := _shift(stack, before)) is not None:
             light_before = enlarged(before.light, -power)
             noisy = data.image
             if max(float(np.abs(light).max()) for light in (now, light_before, noisy)) > WIDE:
                 now, light_before, noisy = (light.astype(np.float64) for light in (now, light_before, noisy))
             motion = stack["motion"]
-            history, found = warped(light_before, motion, sharp=True)
-            spread = warped(before.variance[..., None], motion)[0][..., 0]
-            then = {name: warped(layer, motion)[0] for name, layer in before.features.items() if name in features}
+            history, found = warped(light_before, motion, sharp=True, shift=shift)
+            spread = warped(before.variance[..., None], motion, shift=shift)[0][..., 0]
+            then = {
+                name: warped(layer, motion, shift=shift)[0]
+                for name, layer in before.features.items()
+                if name in features
+            }
             trust = found * agreement(features, then, found)
             speed = np.linalg.norm(np.where(found[..., None], motion, 0), axis=-1) / motion.shape[1]
             spread = np.maximum(spread, (1 + speed / FAST) / LONGEST)
@@ -115,11 +129,12 @@ class Temporal:
                 now, b = self.blend.by(self.corrections(self.blend.inputs()))
             relative = (np.square(1 - b) + np.square(b) * spread).astype(np.float32)
             self.weight = b
+            self.reason = _doubt(b, found, trust)
             # They have noise as well, and are blended as the light is, that they stay those of its pixels.
             features = features | {name: features[name] + b[..., None] * (then[name] - features[name]) for name in then}
         # In the units of the stack: the next one may be of another magnitude.
         light, direct = enlarged(now, power), enlarged(data.direct, power)
-        self._history = _History(light, direct, relative, features, frame)
+        self._history = _History(light, direct, relative, features, stack.place, frame)
         return enlarged((now + data.direct).astype(np.float32), power)
 
     def assume(self, variance: float) -> None:
@@ -128,9 +143,29 @@ class Temporal:
             self._history = replace(self._history, variance=np.full_like(self._history.variance, variance))
 
 
-def _follows(stack: GradientStack, before: _History) -> bool:
-    """Whether the last frame is the one that the stack's motion leads to."""
-    if "motion" not in stack or stack["motion"].shape[:2] != before.light.shape[:2]:
-        return False
+def _shift(stack: GradientStack, before: _History) -> tuple[int, int] | None:
+    """Where the stack's first pixel lies in the last frame; None unless that is the one its motion leads to."""
     previous = stack.number("ngpt:previousFrame")
-    return previous is None or before.frame is None or previous == before.frame
+    follows = previous is None or before.frame is None or previous == before.frame
+    return stack.place.shift_in(before.place) if follows and "motion" in stack else None
+
+
+def _cut(stack: GradientStack, before: _History) -> str:
+    """Why the last frame is not the one that the stack's motion leads to."""
+    if "motion" not in stack:
+        return NO_MOTION
+    previous = stack.number("ngpt:previousFrame")
+    if previous is not None and before.frame is not None and previous != before.frame:
+        return f"is made after frame {previous:g}, and the frame before is {before.frame:g}"
+    return f"is {stack.place}, and the frame before {before.place}"
+
+
+def _doubt(weight: np.ndarray, found: np.ndarray, trust: np.ndarray) -> str:
+    """Why history counts for nothing, where ``weight`` says so: where it was found, and where features agree."""
+    if weight.mean() >= NOTHING:
+        return ""
+    if not found.any():
+        return "motion is not known, or leads out of the frame before"
+    if trust.mean() < NOTHING:
+        return "albedo, normal or depth are not those of the frame before, where motion leads"
+    return "the light differs from the frame before by more than its noise"

@@ -3,17 +3,18 @@
 import numpy as np
 
 
-def warped(image: np.ndarray, motion: np.ndarray, sharp: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """``image`` (H, W, C) of one frame at x + motion for the pixels x of another, and where that is in the image.
+def warped(
+    image: np.ndarray, motion: np.ndarray, sharp: bool = False, shift: tuple[int, int] = (0, 0)
+) -> tuple[np.ndarray, np.ndarray]:
+    """``image`` (h, w, C) of one frame at x + motion for the pixels x of another, and where that is in the image.
 
-    ``motion`` is (H, W, 2), pixels to the right and down; where it is not finite nothing is found. Between pixels the
+    ``motion`` is (H, W, 2), pixels to the right and down; where it is not finite nothing is found. ``shift`` is the
+    place (x, y) in the image at which the first pixel of the other frame lies. Between pixels the
     value is bilinear, or with ``sharp`` that of a Catmull-Rom spline within the range of the four pixels around: a
     bilinear image loses detail each time. Returns (H, W, C) of the image's type, 0 where nothing is found, and (H, W)
     booleans.
     """
-    height, width = motion.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float64)
-    x, y = x + motion[..., 0], y + motion[..., 1]
+    (x, y), (height, width) = _aims(motion, shift), image.shape[:2]
     with np.errstate(invalid="ignore"):
         found = (x >= -0.5) & (x <= width - 0.5) & (y >= -0.5) & (y <= height - 0.5)
     x, y = (np.where(found, v, 0) for v in (x, y))
@@ -38,14 +39,15 @@ def warped(image: np.ndarray, motion: np.ndarray, sharp: bool = False) -> tuple[
     return np.where(found[..., None], value, 0).astype(image.dtype, copy=False), found
 
 
-def bilinear_taps(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def bilinear_taps(
+    motion: np.ndarray, size: tuple[int, int], shift: tuple[int, int] = (0, 0)
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The four pixels, (4, N) numbers row by row, and weights of each place x + motion, and where it is among pixels.
 
-    Weights are those of ``warped``; N is H * W, the last array (H, W). Beside the outermost pixels nothing is found.
+    Weights and ``shift`` are those of ``warped``, of an image of ``size`` (h, w). N is H * W, the last array (H, W).
+    Beside the outermost pixels nothing is found.
     """
-    height, width = motion.shape[:2]
-    y, x = np.mgrid[:height, :width].astype(np.float64)
-    x, y = x + motion[..., 0], y + motion[..., 1]
+    (x, y), (height, width) = _aims(motion, shift), size
     with np.errstate(invalid="ignore"):
         found = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     x, y = (np.where(found, v, 0) for v in (x, y))
@@ -55,6 +57,12 @@ def bilinear_taps(motion: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarra
     places = [row * width + column for row in (top, below) for column in (left, right)]
     weights = [(1 - fx) * (1 - fy), fx * (1 - fy), (1 - fx) * fy, fx * fy]
     return np.stack(places).reshape(4, -1), np.stack(weights).reshape(4, -1), found
+
+
+def _aims(motion: np.ndarray, shift: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """x + motion, x and y (H, W)."""
+    y, x = np.mgrid[: motion.shape[0], : motion.shape[1]].astype(np.float64)
+    return x + shift[0] + motion[..., 0], y + shift[1] + motion[..., 1]
 
 
 def _catmull_rom(f: np.ndarray) -> list[np.ndarray]:

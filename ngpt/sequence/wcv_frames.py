@@ -41,11 +41,15 @@ DOUBT = 4
 
 @dataclass(frozen=True)
 class Link:
-    """What is known of a frame beside the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3), or NaN."""
+    """What is known of a frame beside the one before: ``motion`` (H, W, 2), ``dt``, ``dt_var`` (H, W, 3), or NaN.
+
+    ``shift`` is the place (x, y) in the frame before at which the first pixel of this one lies.
+    """
 
     motion: np.ndarray
     dt: np.ndarray
     dt_var: np.ndarray
+    shift: tuple[int, int] = (0, 0)
 
 
 @dataclass(frozen=True)
@@ -148,12 +152,11 @@ class _Step:
     """From a frame to the one before."""
 
     def __init__(self, link: Link, guess: np.ndarray, guess_before: np.ndarray, level: float, dtype: type):
-        self.shape = guess.shape
-        height, width = self.shape[:2]
-        pixels = height * width
-        places, weights, found = bilinear_taps(link.motion)
-        spline, _ = warped(guess_before, link.motion, sharp=True)
-        linear, _ = warped(guess_before, link.motion)
+        self.shape, self.shape_before = guess.shape, guess_before.shape
+        height, width = guess_before.shape[:2]
+        places, weights, found = bilinear_taps(link.motion, (height, width), link.shift)
+        spline, _ = warped(guess_before, link.motion, sharp=True, shift=link.shift)
+        linear, _ = warped(guess_before, link.motion, shift=link.shift)
         known = found & np.isfinite(link.dt).all(axis=-1) & np.isfinite(link.dt_var).all(axis=-1)
         apart: np.ndarray = np.where(known[..., None], spline - linear, 0).astype(dtype)
         noise = smoothed(np.where(known[..., None], link.dt_var, np.nan), True)
@@ -163,9 +166,9 @@ class _Step:
         self.variance: np.ndarray = variance[..., None].astype(dtype)
         self.known = known[..., None]
         # B, and what all pixels that look at one say of it: the mean by their variances.
-        rows = np.broadcast_to(np.arange(pixels), places.shape)
+        rows = np.broadcast_to(np.arange(known.size), places.shape)
         taps = (weights * known.ravel()).astype(dtype)
-        self.look = csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (pixels, pixels))
+        self.look = csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (known.size, height * width))
         back = self.look.T.tocsr()
         precision: np.ndarray = np.where(known, 1 / variance, 0).reshape(-1, 1).astype(dtype)
         self.precision, total = precision, back @ precision
@@ -191,7 +194,7 @@ class _Step:
         a = own / (own + self.variance)
         said[0][...] -= a * e
         said[1][...] += a
-        heard = ((self.back @ (self.precision * e.reshape(-1, 3))) / self.total).reshape(self.shape)
+        heard = ((self.back @ (self.precision * e.reshape(-1, 3))) / self.total).reshape(self.shape_before)
         a = self.cover * own_before / (own_before + self.variance_before)
         said_before[0][...] += a * heard
         said_before[1][...] += a

@@ -34,34 +34,35 @@ def reconstruct_shot(
 ) -> Iterator[tuple[int, GradientStack, Result]]:
     """(number, stack, result by ``wcv`` over time) of each of ``stacks`` that is ``wanted``, in their order.
 
-    There is a cut before a stack without ``LINK``, of another size, or whose ``ngpt:previousFrame`` is not
-    the stack before, and where a stack is None. At most ``LENGTH`` stacks are in memory. Raises NgptError for stacks
-    that lack a layer of ``wcv``.
+    There is a cut before a stack without ``LINK``, one that is a picture of another size, or whose
+    ``ngpt:previousFrame`` is not the stack before, and where a stack is None. At most ``LENGTH`` stacks are in memory.
+    Raises NgptError for stacks that lack a layer of ``wcv``.
     """
     run = _Run(wanted)
     before: GradientStack | None = None
     for number, stack in enumerate(stacks):
-        if stack is None or before is None or not _follows(stack, before):
+        shift = None if stack is None or before is None else _shift(stack, before)
+        if shift is None:
             yield from run.end()
             run = _Run(wanted)
         if stack is not None:
-            yield from run.add(_Member(number, stack))
+            yield from run.add(_Member(number, stack, shift or (0, 0)))
         before = stack
     yield from run.end()
 
 
-def _follows(stack: GradientStack, before: GradientStack) -> bool:
-    if any(name not in stack for name in LINK) or stack["primal"].shape != before["primal"].shape:
-        return False
+def _shift(stack: GradientStack, before: GradientStack) -> tuple[int, int] | None:
+    """Where the stack's first pixel lies in the one before; None at a cut."""
     frame, previous = before.number("ngpt:frame"), stack.number("ngpt:previousFrame")
-    return previous is None or frame is None or previous == frame
+    follows = previous is None or frame is None or previous == frame
+    return stack.place.shift_in(before.place) if follows and all(name in stack for name in LINK) else None
 
 
 class _Member:
     """A frame of a run, and the sum of its results so far, in 2^power of the light's units."""
 
-    def __init__(self, number: int, stack: GradientStack):
-        self.number, self.stack, self.power = number, stack, 0
+    def __init__(self, number: int, stack: GradientStack, shift: tuple[int, int]):
+        self.number, self.stack, self.shift, self.power = number, stack, shift, 0
         self.sum, self.weight, self.seconds = np.zeros(stack["primal"].shape), 0.0, 0.0
 
     @cached_property
@@ -71,7 +72,7 @@ class _Member:
         apart = np.zeros_like(light) if data.caustic is None else caustic.denoised(data)
         link = None
         if all(name in stack for name in LINK):
-            link = Link(*(stack[name] for name in LINK))
+            link = Link(stack["motion"], stack["dt"], stack["dt_var"], self.shift)
         return Frame(data.image, apart, data.dx, data.dy, data.variances, data.trusted, light + apart, link)
 
     @cached_property

@@ -169,9 +169,20 @@ def _own_stderr() -> Iterator[None]:
 
 
 class _Handler(logging.Handler):
-    """Log records as messages, each to where standard error leads then: above a bar, where there is one."""
+    """Log records as messages, each to where standard error leads then: above a bar, where there is one.
+
+    A warning is said once, however often the file that it is about is read.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._warnings: set[str] = set()
 
     def emit(self, record: logging.LogRecord) -> None:
+        if record.levelno == logging.WARNING:
+            if (text := record.getMessage()) in self._warnings:
+                return
+            self._warnings.add(text)
         print_line(self.format(record), sys.stderr)
 
 

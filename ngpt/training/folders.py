@@ -8,6 +8,7 @@ import numpy as np
 
 from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
+from ngpt.io.frames import natural
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -29,6 +30,13 @@ class StackCrop:
         self.scene, self.inputs = folder.name, len(stacks)
         self._stacks, self._reference = stacks, reference
         held = [read(str(path)) for path in stacks]
+        converged = read(str(reference))
+        for stack in held:
+            if stack.place.seen_from(converged.place) != converged.place.data:
+                raise NgptError(
+                    f"{stack.path} is {stack.place} but {reference} is {converged.place}; render them with one data "
+                    "window"
+                )
         self.spp = tuple(int(stack.number("ngpt:spp") or 0) for stack in held)
         self._caustic = ["caustic" in stack for stack in held]
         self._lit = any("caustic" in stack and bool(stack["caustic"].any()) for stack in held)
@@ -85,8 +93,9 @@ class StackFolder(Sequence[StackCrop]):
 
     def __init__(self, folder: str | Path):
         self._crops = []
-        for view in sorted(path for path in Path(folder).iterdir() if path.is_dir()):
-            stacks = sorted(path for path in view.glob("[!.]*.exr") if path.name != "reference.exr")
+        views = [path for path in Path(folder).iterdir() if path.is_dir() and not path.name.startswith(".")]
+        for view in sorted(views, key=natural):
+            stacks = sorted((path for path in view.glob("[!.]*.exr") if path.name != "reference.exr"), key=natural)
             reference = view / "reference.exr"
             if not stacks:
                 continue

@@ -51,6 +51,24 @@ def test_it_scales_with_the_image_and_is_the_same_again(stack, method):
         assert np.abs(scaled / k - error).max() < 0.01 * error.max()
 
 
+def test_halves_show_a_blotch_that_variances_do_not(stack, rng):
+    """A bright spot over several pixels in one half only, whose variance nobody has seen."""
+    spot = np.zeros_like(stack["primal"])
+    spot[10:14, 8:12] = 4.0
+    one, other = stack.replace(primal=stack["primal"] + spot), stack
+    merged = stack.replace(primal=stack["primal"] + spot / 2)
+    without, with_halves = (
+        ngpt.reconstruct_with_error(merged, "wcv", halves=halves).error for halves in (None, (one, other))
+    )
+    blotch = np.s_[10:14, 8:12]
+    true = np.abs(ngpt.denoise(merged, "wcv") - ngpt.denoise(stack, "wcv"))[blotch]
+    assert np.mean(without[blotch] < true / 5) > 0.3
+    assert np.mean(with_halves[blotch] < true / 5) == 0
+    with pytest.raises(NgptError, match=r"half of the samples is 20x32 and the stack 48x32"):
+        small = GradientStack({name: stack[name][:, :20] for name in stack.names})
+        ngpt.reconstruct_with_error(merged, "wcv", halves=(small, other))
+
+
 def test_without_noise_there_is_none(stack):
     silent = stack.replace(**{name: 0 * stack[name] for name in ("primal_var", "dx_var", "dy_var")})
     assert not ngpt.reconstruct_with_error(silent, "wcv").error.any()

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from exr_files import write_raw
 from shots import wall, without
 
 import ngpt
@@ -112,3 +113,86 @@ def test_one_frame_without_differences_in_time_makes_it_history_and_is_named(sho
 def test_what_history_does_not_hold_is_refused(rest, option, tmp_path, capsys):
     assert denoised(rest, tmp_path / "clean", *option) == 2
     assert "--temporal goes without" in capsys.readouterr().err
+
+
+def test_frames_are_blended_in_the_order_of_their_numbers(rest, tmp_path, capsys):
+    """Names of Houdini and of scripts: f.1 to f.12, without ``ngpt:frame``."""
+    plain, folder = ngpt.read(next(rest.iterdir())), tmp_path / "houdini"
+    folder.mkdir()
+    for i in (1, 2, 10, 11):
+        ngpt.write(folder / f"f.{i}.exr", ngpt.GradientStack(plain.layers))
+    (folder / "._f.1.exr").write_bytes(b"of macOS")
+    ngpt.write(folder / "f.2_denoised.exr", ngpt.GradientStack(plain.layers))
+    assert denoised(folder, tmp_path / "clean", "-m", "primal", "--json") == 0
+    told = capsys.readouterr()
+    reports = json.loads(told.out)["files"]
+    assert [report["input"] for report in reports] == [str(folder / f"f.{i}.exr") for i in (1, 2, 10, 11)]
+    assert reports[0]["history"] == 0 < reports[1]["history"] < reports[3]["history"]
+    assert f"{folder}: f.#.exr goes from 1 to 11 without 3 to 9" in told.err
+
+
+def test_why_history_is_nothing_is_said(rest, tmp_path, capsys):
+    """By Cycles' names of motion, by others that have to be chosen, and without any."""
+    stacks = [ngpt.read(path) for path in sorted(rest.iterdir())]
+    names = {"primal": "ViewLayer.Combined", "primal_var": "primal_var"}
+    for name, suffixes in (("Vector", "XYZW"), ("motionvector", "RGB"), ("nothing", "")):
+        (tmp_path / name).mkdir()
+        for path, stack in zip(sorted(rest.iterdir()), stacks, strict=True):
+            channels = {f"{other}.{c}": stack[k][..., i] for k, other in names.items() for i, c in enumerate("RGB")}
+            still = np.zeros(stack["primal"].shape[:2], np.float32)
+            channels |= {f"ViewLayer.{name}.{c}": still for c in suffixes}
+            write_raw(tmp_path / name / path.name, (channels,))
+
+    def shares(folder, *more):
+        out = tmp_path / f"{folder.name}{len(more)}"
+        assert denoised(folder, out, "-m", "primal", "--json", *more) == 0
+        told = capsys.readouterr()
+        files = json.loads(told.out)["files"]
+        return [f["history"] for f in files], [f.get("why no history", "") for f in files], told.err
+
+    found, why, _ = shares(tmp_path / "Vector")
+    assert found[0] == 0 and found[-1] > 0.5 and why == ["the first frame", "", "", "", ""]
+    found, why, told = shares(tmp_path / "motionvector")
+    assert found == [0] * 5 and why == ["the first frame"] + ["no layer 'motion'"] * 4
+    assert "0% history (no layer 'motion')" in told
+    remedy = "motion=-ViewLayer.motionvector.R,ViewLayer.motionvector.G"
+    assert f"y up: --layer {remedy}" in told
+    assert shares(tmp_path / "motionvector", "--layer", remedy)[0][-1] > 0.5
+    _, _, told = shares(tmp_path / "nothing")
+    assert "without the layer 'motion' each frame is denoised by itself; see" in told
+
+
+def test_each_view_has_a_history_of_its_own(rest, tmp_path, capsys):
+    folder = tmp_path / "stereo"
+    folder.mkdir()
+    for i, path in enumerate(sorted(rest.iterdir())):
+        stack = ngpt.read(path)
+        channels = {}
+        for view, scale in (("", 1), ("right.", 3)):
+            channels |= {f"{view}{c}": scale * stack["primal"][..., k] for k, c in enumerate("RGB")}
+            channels |= {f"{view}primal_var.{c}": scale**2 * stack["primal_var"][..., k] for k, c in enumerate("RGB")}
+            channels |= {f"{view}motion.{c}": stack["motion"][..., k] for k, c in enumerate("XY")}
+        write_raw(folder / f"f.{i}.exr", (channels, {"multiView": ["left", "right"]}))
+    assert denoised(folder, tmp_path / "clean", "-m", "primal", "--json") == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert all(f["views"] == ["left", "right"] for f in files) and files[-1]["history"] > 0.5
+    for view in ("left", "right"):
+        temporal = ngpt.Temporal()
+        for path in sorted(folder.iterdir()):
+            stack = ngpt.read(path, view=view)
+            image = temporal.next(stack, stack["primal"])
+        channels = read_exr(tmp_path / "clean" / path.name).parts[0].channels
+        assert np.array_equal(channels["right.G" if view == "right" else "G"], image[..., 1])
+    words = ["denoise", str(folder / "f.0.exr"), "-o"]
+    for target, more in (("a.png", []), ("a.exr", ["--ref", str(folder / "f.1.exr")])):
+        assert main([*words, str(tmp_path / target), *more, "-m", "primal"]) == 1
+        assert "has several views, and" in capsys.readouterr().err
+        assert main([*words, str(tmp_path / target), *more, "-m", "primal", "--view", "right"]) == 0
+
+
+def test_files_without_gradients_tell_of_none(tmp_path, capsys):
+    image = np.ones((8, 9, 3), np.float32)
+    image[3, 4] = np.nan
+    ngpt.write(tmp_path / "a.exr", image)
+    assert main(["denoise", str(tmp_path / "a.exr"), "-m", "primal"]) == 0
+    assert capsys.readouterr().err.endswith(", repaired 1 pixels\n")

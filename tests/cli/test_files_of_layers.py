@@ -85,3 +85,24 @@ def test_info_proposes_the_option_for_a_layer_that_looks_like_a_missing_one(apar
     assert json.loads(capsys.readouterr().out)["proposed"] == ['--layer albedo="base color"']
     assert main(["info", path, "--layer", "albedo=base color"]) == 0
     assert "proposed" not in capsys.readouterr().out
+
+
+def test_info_lists_layers_and_views_even_where_one_is_ambiguous(tmp_path, capsys):
+    image = np.ones((6, 8), np.float32)
+    near, both = tmp_path / "near.exr", tmp_path / "both.exr"
+    write_raw(near, ({f"{v}.Combined.{c}": image for v in ("Near", "Far") for c in "RGB"},))
+    write_raw(both, ({f"{v}{c}": image for v in ("", "right.") for c in "RGB"}, {"multiView": ["left", "right"]}))
+    assert main(["info", str(near), "--json"]) == 1
+    told = capsys.readouterr()
+    assert json.loads(told.out)["layers"] == {"Far.Combined": "R G B", "Near.Combined": "R G B"}
+    assert "layer 'primal' could be any of" in told.err
+    assert main(["info", str(both), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["views"] == ["left", "right"] and report["layers"]["primal"]["channels"] == "R G B"
+    assert main(["info", str(both), "--view", "right", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["layers"]["primal"]["channels"] == "right.R right.G right.B"
+    assert main(["info", str(both), "--layer", "albedo=x", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["layers of right"] == {"root": "R G B"}
+    assert main(["picture", str(both), "--view", "right", "-o", str(tmp_path / "right.png")]) == 0
+    assert main(["picture", str(both), "--view", "top", "-o", str(tmp_path / "top.png")]) == 1
+    assert "has no view 'top'; it has left, right" in capsys.readouterr().err

@@ -65,9 +65,9 @@ def test_three_frames_are_in_memory_at_most(frames, tmp_path, monkeypatch):
             alive.add(id(stack))
             most.append(len(alive))
         weakref.finalize(stack, alive.discard, id(stack))
-        return stack
+        return [stack]
 
-    monkeypatch.setattr("ngpt.cli.denoise.read", counted)
+    monkeypatch.setattr("ngpt.cli.denoise.read_views", counted)
     (frames / "2.exr").write_bytes(b"not an image")
     assert main(["denoise", str(frames), "-o", str(tmp_path / "out"), "-m", "l2", "-q"]) == 1
     assert len(most) == 5 and max(most) <= 3 and not alive
@@ -185,7 +185,6 @@ def test_names_of_frames_are_the_frames_there_are(tmp_path, monkeypatch, capsys,
     for frame, other in ((7, 7), (8, 8), (9, 10)):
         os.makedirs(f"{frame:02d}")
         ngpt.write(f"{frame:02d}/beauty.{other:02d}.exr", image)
-    monkeypatch.setattr("ngpt.cli.denoise.RESULT_SUFFIX", "_denoised")
     assert main(["denoise", name, "-o", output, "-m", "primal"]) == 0
     told = [line.split()[1] for line in capsys.readouterr().err.splitlines() if line.startswith("[")]
     number = [int("".join(filter(str.isdigit, os.path.basename(path)))) for path in told]

@@ -157,3 +157,32 @@ def test_folders_of_frames_are_shots(tmp_path, rng, capsys):
     assert "has 1.exr and" in capsys.readouterr().err
     assert main([words[0], words[1], str(tmp_path / "truth/0.exr"), "-o", str(tmp_path / "other.html")]) == 1
     assert "is no folder, and others are" in capsys.readouterr().err
+
+
+def test_frames_play_in_the_order_of_numbers_and_results_beside_them_are_compared(tmp_path, rng):
+    image = rng.gamma(2.0, 0.5, (24, 32, 3)).astype(np.float32)
+    folder = tmp_path / "shot"
+    folder.mkdir()
+    for i in (1, 2, 10):
+        write(folder / f"f.{i}.exr", image * np.float32(i))
+        write(folder / f"f.{i}_denoised.exr", image * np.float32(2 * i))
+    (folder / "._f.1.exr").write_bytes(b"of macOS")
+    page = tmp_path / "page.html"
+    for words, count in (([str(folder)], 1), ([str(folder), f"{folder}/*_denoised.exr"], 2)):
+        assert main(["report", *words, "-o", str(page), "--force", "-q"]) == 0
+        text = page.read_text()
+        assert list(dict.fromkeys(re.findall(r"f\.\d+", text))) == ["f.1", "f.2", "f.10"]
+        played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
+        assert [len(scene["pictures"]) for scene in played["scenes"]] == [count] * 3
+
+
+def test_flicker_without_motion_is_explained(tmp_path, capsys):
+    for folder in ("a", "truth"):
+        (tmp_path / folder).mkdir()
+        for i in range(2):
+            write(tmp_path / folder / f"{i}.exr", np.full((12, 16, 3), 1 + i, np.float32))
+    words = ["report", str(tmp_path / "a"), "--ref", str(tmp_path / "truth"), "-o", str(tmp_path / "page.html")]
+    assert main(words) == 0
+    told = capsys.readouterr()
+    assert told.out.splitlines()[-1].split()[-1] == "nan"
+    assert told.err.count("flicker is nan: no frame after the first has motion vectors (layer 'motion')") == 1

@@ -162,6 +162,26 @@ def test_batches_have_the_variance_of_their_means(renderer, film, rng):
     assert np.allclose(layers["primal_var"].reshape(6, 3), means.var(axis=0, ddof=1) / 24, rtol=1e-6)
 
 
+def test_a_last_batch_with_fewer_samples_counts_for_less(renderer, film, rng):
+    """Eight, eight and one samples: the mean is that of all 17, and its variance as for independent ones."""
+    claimed, real = [], []
+    for _ in range(400):
+        samples = rng.normal(size=(6, 17, 3)).astype(np.float32)
+        target = film(3, 2, batches=True)
+        for part in np.split(samples, (8, 16), axis=1):
+            fill(renderer, target, part)
+            target.end_pass(part.shape[1])
+        layers = target.develop()
+        assert np.allclose(layers["primal"].reshape(6, 3), samples.mean(axis=1), rtol=1e-4, atol=1e-6)
+        claimed.append(layers["primal_var"].mean())
+        real.append(np.square(layers["primal"]).mean())
+    assert np.mean(claimed) == pytest.approx(1 / 17, rel=0.1)
+    assert np.mean(real) == pytest.approx(1 / 17, rel=0.1)
+    with pytest.raises(ValueError, match="only the last may be smaller"):
+        fill(renderer, target, np.zeros((6, 9, 3), np.float32))
+        target.end_pass(9)
+
+
 def test_what_is_put_and_what_is_splatted_are_one_value(renderer, film):
     mi = renderer
     target = film(2, 1, batches=True)

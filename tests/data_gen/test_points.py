@@ -1,12 +1,16 @@
 """Points: nets of pixels and of blocks, uniform and independent where they must be, and less noise than without."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from scipy.stats import kstest
 from unbiased import load
 
 from data_gen.samplers import SAMPLERS
+from ngpt import GradientStack
 from ngpt.errors import NgptError
+from ngpt.merging import merge
 
 SIDE = 16
 # What gathers photons alone
@@ -212,7 +216,7 @@ def test_claims_follow_what_is_seen_between_rounds(renderer, rng, size):
 
 
 @pytest.mark.parametrize(("sampler", "scene"), [("primal", "glossy"), ("gpt", "diffuse"), ("gpt", "glossy")])
-@pytest.mark.parametrize("spp", [16, 48])
+@pytest.mark.parametrize("spp", [17, 48])
 def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
     from data_gen.render import render_stack
 
@@ -223,7 +227,7 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
         else render_stack(loaded, spp, seed, sampler)
         for seed in range(16)
     ]
-    for layer in ("primal", "dx", "dy"):
+    for layer in ("primal", "dx", "dy", "caustic"):
         if layer in stacks[0].names:
             part = "caustic" if layer == "primal" and "caustic" in stacks[0].names else None
             images = [stack[layer] - stack[part] if part else stack[layer] for stack in stacks]
@@ -233,14 +237,127 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
             assert 0.8 < seen.ravel()[quiet].mean() / told.ravel()[quiet].mean() < 1.25, layer
 
 
-def test_the_law_of_one_net(renderer):
-    from data_gen.film.claims import _of_one_net
+EXTENT = 48, 32
 
-    for a, near in ((1.0, 1e-9), (1.2, 0.1), (1.5, 1e-9), (2.0, 0.4)):
-        for n in (8, 16, 64):
-            halves = (2**a - 1) * (n - 1) / (n**a - 1)
-            assert np.isclose(_of_one_net(halves, n), n ** (1 - a), rtol=near)
-    assert _of_one_net(0.5, 2) == 0.5
+
+def pixel_samples(mi, seed, numbers, net):
+    """Steps in four dimensions, and rare bright samples; (pixels, C) for each of the ``numbers`` of samples."""
+    from data_gen.paths.streams import sample_streams
+
+    pixel = np.repeat(np.arange(EXTENT[0] * EXTENT[1], dtype=np.uint32), len(numbers))
+    sample = np.tile(np.asarray(numbers, np.uint32), EXTENT[0] * EXTENT[1])
+    stream = sample_streams(seed, mi.UInt32(pixel), mi.UInt32(sample), EXTENT[0], net)
+    p, q = (np.array(stream.next_2d()) for _ in range(2))
+    step = p[0] + 0.6 * p[1] < 0.3 + 0.9 * (pixel % EXTENT[0]) / EXTENT[0]
+    rare = 3.0 * ((q[0] < 0.1) & (p[0] < 0.1))
+    corner = (p[0] < 0.5) & (q[0] + q[1] < 1.1)
+    return np.stack([step, rare, corner], axis=-1).astype(np.float32)
+
+
+def put_samples(mi, film, seed, n, net):
+    """The first ``n`` samples of each pixel, in blocks of 16 and what is left over, as renders put them."""
+    for begin in range(0, n, 16):
+        numbers = range(begin, min(n, begin + 16))
+        film.put("primal", mi.Color3f(*pixel_samples(mi, seed, numbers, net).T))
+        film.end_pass(len(numbers))
+
+
+def put_unevenly(mi, film, seed, net):
+    """Blocks of 16 samples, 1 to 5 of them by the row of the pixel."""
+    each = 1 + np.arange(EXTENT[0] * EXTENT[1]) // EXTENT[0] % 5
+    for begin in range(5):
+        some = np.flatnonzero(each > begin).astype(np.uint32)
+        values = pixel_samples(mi, seed, range(16 * begin, 16 * begin + 16), net)
+        values = values.reshape(-1, 16, 3)[some].reshape(-1, 3)
+        film.put("primal", mi.Color3f(*values.T))
+        film.end_pass(16, some)
+
+
+def check_claims(images, variances, where):
+    real = np.var(images, axis=0, ddof=1, dtype=np.float64).sum()
+    assert 0.8 < real / np.mean(variances, axis=0, dtype=np.float64).sum() < 1.25, where
+
+
+@pytest.mark.parametrize("n", [7, 8, 9, 16, 17, 18, 24, 31, 33, 48, 63, 64, 65, 66, 100, 129])
+@pytest.mark.parametrize("kind", ["sobol", "rounds", "cut"])
+def test_claims_hold_at_any_number_of_samples(renderer, kind, n):
+    from data_gen.film import GradientFilm
+    from data_gen.paths.streams import first_round
+
+    net = 4096 if kind == "cut" else first_round(kind, n)
+    found = []
+    for seed in range(8):
+        film = GradientFilm(*EXTENT, net=net)
+        put_samples(renderer, film, seed, n, net)
+        found.append(film.develop())
+    images, variances = ([layers[name] for layers in found] for name in ("primal", "primal_var"))
+    check_claims(images, variances, n)
+
+
+@pytest.mark.parametrize("kind", ["adaptive", "merged"])
+def test_claims_hold_where_samples_come_in_parts(renderer, kind):
+    from data_gen.film import GradientFilm
+
+    found = []
+    for seed in range(10):
+        parts = []
+        for i, n in enumerate((17, 9, 4) if kind == "merged" else (0,)):
+            net = 16 if kind == "adaptive" else 32
+            film = GradientFilm(*EXTENT, net=net)
+            if kind == "adaptive":
+                put_unevenly(renderer, film, seed, net)
+            else:
+                put_samples(renderer, film, 100 * i + seed, n, net)
+            attributes = {"ngpt:spp": n, "ngpt:seed": str(i), "ngpt:sampler": "primal"}
+            parts.append(GradientStack(film.develop(), attributes=attributes))
+        found.append(merge(parts) if len(parts) > 1 else parts[0])
+    images, variances = ([stack[name] for stack in found] for name in ("primal", "primal_var"))
+    check_claims(images, variances, kind)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("scene", ["glossy", "diffuse", "environment"])
+@pytest.mark.parametrize("points", ["sobol", "rounds"])
+def test_claims_of_renders_hold_at_every_number_of_samples(renderer, scene, points):
+    from bench.claims import every
+
+    loaded = load(renderer, scene, (64, 40))
+    found = every(loaded, (64, 40), "gpt", points, range(8, 131), 10)
+    for n, layers in found.items():
+        for layer in ("primal", "caustic", "dx", "dy"):
+            if layer in layers:
+                assert 0.7 < layers[layer][0] < 1.4, (n, layer)
+    ordered = [found[n]["wcv"] for n in sorted(found)]
+    for (before, _), (error, deviation) in pairwise(ordered):
+        assert error < 1.1 * before + 3 * deviation
+
+
+@pytest.mark.parametrize("net", [1, 16, 64])
+def test_laws_are_sums_over_pairs_of_samples(net):
+    """For any number of samples: the covariances of all pairs, added up one by one."""
+    from data_gen.film.nets import RATES, SHARES, law, split
+
+    def variance_of(m):
+        return SHARES / m + (1 - SHARES) * m**-RATES
+
+    def covariance(i, j):
+        first, size = (0, net) if i < net else (1 << i.bit_length() - 1,) * 2
+        if not first <= j < first + size:
+            return 0 * RATES
+        together = 1 << ((i - first) ^ (j - first)).bit_length()
+        return 2 * variance_of(together) - variance_of(together / 2) if together > 1 else 1 + 0 * RATES
+
+    for n in (2, 3, 5, 16, 17, 31, 48, 65):
+        pairs = np.array([[covariance(i, j) for j in range(n)] for i in range(n)])
+        n1 = split(n)
+        assert n / 3 <= n1 <= 2 * n / 3
+        weights = np.where(np.arange(n) < n1, -1 / n1, 1 / (n - n1)) * np.sqrt(n1 * (n - n1)) / n
+        variance = pairs.mean(axis=(0, 1))
+        claimed = (1 - variance) / (n - 1)
+        assert np.allclose(law(n, net).truth, variance / claimed)
+        assert np.allclose(law(n, net).seen, np.einsum("i,j,ijr->r", weights, weights, pairs) / claimed)
+        # What is seen tells which law holds.
+        assert (np.diff(law(n, net).seen) < 1e-9).all()
 
 
 # ------------------------- Lamps -------------------------

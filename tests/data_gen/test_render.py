@@ -3,7 +3,11 @@
 import numpy as np
 import pytest
 
+import ngpt
+from ngpt.cli import main
 from ngpt.errors import NgptError
+from ngpt.measure.metrics import relmse
+from ngpt.windows import Place, Window
 
 SCENE = """<scene version="3.0.0">
   <default name="resx" value="40"/> <default name="depth" value="3"/>
@@ -36,17 +40,75 @@ def test_scene_file_with_its_own_size_a_given_size_and_parameters(scene_file):
     assert render_stack(load_scene(scene_file(), (17, 5)), 1)["primal"].shape == (5, 17, 3)
 
 
+def crop(*window):
+    names = ("offset_x", "offset_y", "width", "height")
+    return "".join(f'<integer name="crop_{n}" value="{v}"/>' for n, v in zip(names, window, strict=True))
+
+
 def test_crop_window_shows_its_part_of_the_image(scene_file):
     from data_gen.render import render_stack
     from data_gen.scenes.load import load_scene
 
-    names = ("offset_x", "offset_y", "width", "height")
-    crop = "".join(f'<integer name="crop_{n}" value="{v}"/>' for n, v in zip(names, (10, 5, 20, 15), strict=True))
     whole = render_stack(load_scene(scene_file()), 512)
-    part = render_stack(load_scene(scene_file(film=crop)), 512)
+    part = render_stack(load_scene(scene_file(film=crop(10, 5, 20, 15))), 512)
+    assert part.place == Place(Window(10, 5, 20, 15), whole.place.data)
     assert part["depth"].shape == (15, 20, 1)
     assert np.abs(part["depth"] - whole["depth"][5:20, 10:30]).mean() < 0.02
     assert np.abs(part["dx"][:, :-1] - whole["dx"][5:20, 10:29]).mean() < 0.01
+
+
+@pytest.mark.parametrize(
+    ("size", "window", "expected"),
+    [
+        ((80, 60), (10, 5, 20, 15), (20, 10, 40, 30)),
+        ((20, 15), (10, 5, 20, 15), (5, 3, 10, 7)),  # 2.5 and 10 become 3 and 10
+        ((20, 15), (0, 0, 10, 5), (0, 0, 5, 3)),  # which meets it
+        ((20, 15), (20, 15, 20, 15), (10, 8, 10, 7)),
+        ((4, 3), (39, 29, 1, 1), (3, 2, 1, 1)),
+        ((20, 15), (0, 0, 40, 30), (0, 0, 20, 15)),
+    ],
+)
+def test_a_crop_window_stays_the_same_part_of_a_film_of_another_size(scene_file, size, window, expected):
+    from data_gen.scenes.cameras import place_of
+    from data_gen.scenes.load import load_scene
+
+    scene = load_scene(scene_file(film=crop(*window)), size)
+    assert place_of(scene.sensors()[0]) == Place(Window(*expected), Window(0, 0, *size))
+
+
+def test_crops_keep_their_place_whatever_renders_them(scene_file, tmp_path):
+    """By the command, with diagnostics and samples shared out; and what it shows is that part."""
+    place = Place(Window(20, 10, 20, 20), Window(0, 0, 40, 30))
+    scene, whole, out = scene_file(film=crop(20, 10, 20, 20)), tmp_path / "whole.xml", str(tmp_path / "part.exr")
+    whole.write_text(SCENE.format(integrator="path", film="", bsdf="diffuse"))
+    for more in (["--diagnostics"], ["--adaptive", "--for", "wcv", "--spp", "32"], ["--time", "2"]):
+        command = ["render", scene, "--sampler", "gpt", "--spp", "16", "-o", out, "--force", *more]
+        assert main(command) == 0
+        assert ngpt.read(out).place == place, more
+    assert main(["render", str(whole), "--sampler", "gpt", "--spp", "16", "-o", str(tmp_path / "whole.exr")]) == 0
+    there = place.data.within(place.display)
+    part, image = ngpt.read(out), ngpt.read(tmp_path / "whole.exr")
+    assert np.abs(part["depth"] - image["depth"][there]).mean() < 0.1
+    assert main(["diff", out, str(tmp_path / "whole.exr"), "--tolerance", "0.5"]) == 0
+
+
+def test_tiles_of_an_image_are_merged_to_what_is_rendered_at_once(scene_file, tmp_path):
+    files, whole = [], tmp_path / "whole.exr"
+    for i, window in enumerate([(0, 0, 21, 16), (20, 0, 20, 16), (0, 15, 21, 15), (20, 15, 20, 15)]):
+        files.append(str(tmp_path / f"tile{i}.exr"))
+        command = ["render", scene_file(film=crop(*window)), "--sampler", "gpt", "--seed", str(i), "--spp", "64"]
+        assert main([*command, "-o", files[-1]]) == 0
+    assert main(["merge", *files, "-o", str(tmp_path / "merged.exr")]) == 0
+    assert main(["render", scene_file(), "--sampler", "gpt", "--spp", "64", "--seed", "9", "-o", str(whole)]) == 0
+    merged, image = ngpt.read(tmp_path / "merged.exr"), ngpt.read(whole)
+    assert merged.place == image.place and merged["samples"].max() == 4 * 64
+    assert np.isfinite(merged["dx"]).all() and np.isfinite(merged["dy"]).all()
+    for name in ("primal", "dx", "dy"):
+        scale = np.sqrt(merged[f"{name}_var"] + image[f"{name}_var"])
+        z = np.divide(merged[name] - image[name], scale, where=scale > 0, out=np.zeros_like(scale))
+        assert np.sqrt(np.square(z).mean()) < 1.3, name
+    results = [ngpt.denoise(stack, method="l1") for stack in (merged, image)]
+    assert relmse(*results) < 0.01
 
 
 def test_paths_alone_are_those_with_features(scene_file):

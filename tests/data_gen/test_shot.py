@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from data_gen.frames.camera_path import CameraPath, Key, horizontal, look_at, read_camera_path
 from ngpt.errors import NgptError
+from ngpt.windows import Place, Window
 
 XML = """<scene version="3.0.0"><default name="angle" value="0"/><integrator type="path"/>
 <sensor type="perspective"><transform name="to_world"><lookat origin="0,1,4" target="0,0,0" up="0,1,0"/></transform>
@@ -29,7 +30,7 @@ def shot(tmp_path, camera=None, update=None, moving=True):
 def rendered(shot, frames, **options):
     from data_gen.frames.shot import render_shot
 
-    return dict(render_shot(shot, frames, 2, 7, sampler="primal", **options))
+    return dict(render_shot(shot, frames, 2, 7, **{"sampler": "primal"} | options))
 
 
 def test_a_frame_is_the_same_whatever_others_are_rendered(renderer, tmp_path):
@@ -49,6 +50,40 @@ def test_frames_have_seeds_of_their_own_and_say_who_they_are(renderer, tmp_path)
     assert len({stack.attributes["ngpt:seed"] for stack in stacks.values()}) == 3
     found = [(s.attributes["ngpt:frame"], s.attributes["ngpt:previousFrame"]) for s in stacks.values()]
     assert found == [(0, -2), (2, 0), (5, 2)]
+
+
+CROP = """<integer name="crop_offset_x" value="$x"/><integer name="crop_offset_y" value="2"/>
+<integer name="crop_width" value="$width"/><integer name="crop_height" value="8"/></film>"""
+
+
+def cropped(tmp_path, x="{frame}", width="8"):
+    """A shot at rest, of which crop windows show a part: a farm's frames, or a subject that is followed."""
+    path = tmp_path / "cropped.xml"
+    path.write_text(XML.replace("</film>", CROP).replace("<integrator", '<default name="x" value="0"/><integrator', 1))
+    path.write_text(path.read_text().replace("<integrator", '<default name="width" value="8"/><integrator', 1))
+    from data_gen.frames.pattern import filled
+    from data_gen.frames.shot import Shot
+
+    return Shot(lambda frame: (str(path), {"x": filled(x, frame), "width": filled(width, frame)}))
+
+
+def test_motion_is_that_of_the_picture_where_crop_windows_move(renderer, tmp_path):
+    stacks = rendered(cropped(tmp_path, "{2 * frame}"), range(3), dt=4)
+    for frame, stack in stacks.items():
+        assert stack.place == Place(Window(2 * frame, 2, 8, 8), Window(0, 0, 16, 12))
+        assert frame == 0 or np.abs(stack["motion"]).max() < 1e-3
+        # Its partner is in the crop window of before, but for the last two columns.
+        known = np.isfinite(stack["dt"]).all(axis=(0, 2))
+        assert frame == 0 or (known.tolist() == 6 * [True] + 2 * [False] and np.abs(stack["dt"][:, :6]).max() < 1e-5)
+
+
+def test_crop_windows_of_other_sizes_move_too(renderer, tmp_path):
+    stacks = rendered(cropped(tmp_path, "{3 - frame}", "{6 + frame}"), range(3))
+    assert [stack.width for stack in stacks.values()] == [6, 7, 8]
+    assert all(np.abs(stack["motion"]).max() < 1e-3 for stack in stacks.values())
+    for options in ({"dt": 2}, {"sampler": "restir"}):
+        with pytest.raises(NgptError, match=r"frame 0 is 6x8 at \(3, 2\) and frame -1 5x8 at \(4, 2\): differences"):
+            rendered(cropped(tmp_path, "{3 - frame}", "{6 + frame}"), range(3), **options)
 
 
 def test_a_scene_is_loaded_again_only_where_its_parameters_change(renderer, tmp_path):

@@ -3,7 +3,8 @@
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.io.aliases import ALIASES, format_aliases, propose, resolve, resolve_alone
+from ngpt.io.aliases import ALIASES, format_aliases
+from ngpt.io.resolution import propose, resolve, resolve_alone
 from ngpt.layers import LAYERS
 
 
@@ -37,6 +38,7 @@ PRODUCERS = {
             "albedo": ["ViewLayer.Denoising Albedo.R", "ViewLayer.Denoising Albedo.G", "ViewLayer.Denoising Albedo.B"],
             "normal": ["ViewLayer.Denoising Normal.X", "ViewLayer.Denoising Normal.Y", "ViewLayer.Denoising Normal.Z"],
             "depth": ["ViewLayer.Denoising Depth.Z"],
+            "motion": ["ViewLayer.Vector.X", "ViewLayer.Vector.Y"],
             "alpha": ["ViewLayer.Noisy Image.A"],
         },
     ),
@@ -264,7 +266,24 @@ def test_two_view_layers_are_ambiguous_until_an_override_settles_it():
     found = resolve(TWO_VIEWS, {"primal": "Far.Combined"})
     assert found["primal"].channels[0] == "Far.Combined.R"
     assert found["alpha"].channels == ("Far.Combined.A",)
-    assert found["albedo"].name == "Near.Denoising Albedo"
+    assert found["depth"].name == "Far.Depth" and "albedo" not in found  # Near's is of another image
+    assert resolve(TWO_VIEWS, {"primal": "Far.Combined", "albedo": "Near.Denoising Albedo"})["albedo"].name[0] == "N"
+
+
+def test_the_layer_of_primal_decides_where_the_others_come_from():
+    both = ("Combined.RGBA", "Denoising Albedo.RGB", "Denoising Normal.XYZ", "Vector.XYZW")
+    layers = [f"{view}.{layer}" for view in ("Near", "Far") for layer in both]
+    parts = [(name.rpartition(".")[0], names(name)) for name in layers]  # as Blender 5 writes them
+    for listing in ([("", names(*layers))], parts):
+        for view in ("Near", "Far"):
+            found = resolve(listing, {"primal": f"{view}.Combined"})
+            assert {"albedo", "normal", "motion", "alpha"} < set(found)
+            assert all(where.name.startswith(f"{view}.") for where in found.values())
+            # A result keeps the input elsewhere, and says where it came from.
+            result = [*listing, ("ngpt", names("RGBA", "primal.RGB"))]
+            again = resolve(result, origin=f"{view}.Combined")
+            assert again["primal"].channels[0] == "primal.R" and again["albedo"] == found["albedo"]
+        assert propose([("", names("Near.Combined.RGB", "Far.Combined.RGB", "Far.albedo_x.RGB"))], found) == {}
 
 
 def test_an_ambiguous_feature_is_settled_by_its_own_override_only():
@@ -319,7 +338,9 @@ def test_bad_overrides_name_what_the_file_holds(overrides, expected):
         (names("RGB", "normal.XZ"), "layer 'normal' is incomplete: 'normal' lacks channel Y"),
         (names("RG"), "layer 'primal' is incomplete: 'root' lacks channel B"),
         ([*names("RGB", "dy.RGB"), "dy.red"], "layer 'dy' has one channel twice, dy.R and dy.red"),
-        (names("N.XYZ", "fog.RGB"), 'the file holds "N" (X Y Z), "fog" (R G B); name it with --layer primal="NAME"'),
+        (names("a.RGB", "fog.RGB"), 'the file holds "a" (R G B), "fog" (R G B); name it with --layer primal="NAME"'),
+        (names("N.XYZ", "albedo.RGB"), "no primal image"),
+        (names("CryptoObject00.rgba", "worldPosition.RGB", "beauty_var.RGB"), "no primal image"),
         (["Y"], "holds luminance (channel Y) but no colour"),
         (["Y", "RY", "BY"], "holds luminance and chroma (channels Y RY BY) but no colours R G B"),
         (["Y", "A"], "holds luminance (channel Y) but no colour"),
@@ -336,6 +357,50 @@ def test_the_root_of_a_part_called_albedo_is_no_primal():
     with pytest.raises(NgptError, match="no primal image"):
         resolve([("albedo", list("RGB")), ("N", list("XYZ"))])
     assert resolve([("albedo", list("RGB")), ("Combined", list("RGB"))])["primal"].part == 1
+
+
+@pytest.mark.parametrize("name", ["beauty", "rgba", "fog", "ViewLayer.Bild", "Normal lights.beauty"])
+def test_the_only_layer_of_colour_is_the_colour(name):
+    more = names("albedo.RGB", "N.XYZ", "CryptoObject00.rgba", "worldPosition.RGB", "albedo_var.RGB", "diffuse.RGB")
+    found = resolve([("", [*names(f"{name}.RGBA"), *more])])
+    assert found["primal"].name == name and found["alpha"].channels == (f"{name}.A",)
+    assert found["albedo"].name == "albedo"
+    parts = [("albedo", list("RGB")), (name, list("RGBA"))]
+    assert resolve(parts)["primal"].part == 1
+
+
+def test_small_letters_are_alpha_too():
+    found = resolve([("", names("C.rgba", "albedo.RGB"))])
+    assert found["primal"].channels == ("C.r", "C.g", "C.b") and found["alpha"].channels == ("C.a",)
+
+
+def test_motion_of_cycles_is_turned_to_ours():
+    """XY leads to the frame before with y up: seen in files of Blender 5.0."""
+    found = resolve([("", names("ViewLayer.Combined.RGB", "ViewLayer.Vector.XYZW"))])["motion"]
+    assert found.channels == ("ViewLayer.Vector.X", "ViewLayer.Vector.Y") and found.factors == (1, -1)
+    # A vector of somebody else is none.
+    assert "motion" not in resolve([("", names("RGB", "Vector.XYZ"))])
+
+
+@pytest.mark.parametrize(
+    ("text", "channels", "factors"),
+    [
+        ("-velocity.R,velocity.G", ("velocity.R", "velocity.G"), (-1, 1)),
+        ("-0.5*velocity.R, +1e2*velocity.G", ("velocity.R", "velocity.G"), (-0.5, 100)),
+        ("mv.x,-mv.y", ("beauty.mv.x", "beauty.mv.y"), (1, -1)),
+    ],
+)
+def test_channels_with_signs_and_factors_make_a_layer(text, channels, factors):
+    parts = [("", names("RGB", "velocity.RGB", "beauty.mv.xy", "N.XYZ"))]
+    found = resolve(parts, {"motion": text})["motion"]
+    assert (found.channels, found.factors) == (channels, factors)
+    with pytest.raises(NgptError, match="fits no layer with channels X Y"):
+        resolve(parts, {"motion": text + ",N.Z"})
+
+
+def test_diffuse_is_albedo_in_files_of_v_ray_and_light_in_those_of_others():
+    parts = [("", names("RGB", "diffuse.RGB"))]
+    assert "albedo" not in resolve(parts) and resolve(parts, writer="V-Ray")["albedo"].name == "diffuse"
 
 
 @pytest.mark.parametrize(
@@ -379,6 +444,9 @@ def test_a_file_without_the_layer_it_is_for(parts, message):
         (names("RGB", "albedo_variance.RGB", "diffuse.RGB", "emission.RGB"), {}),
         (names("RGB", "albedo.RGB", "my_albedo.RGB"), {}),
         (names("RGB", "myNormal.XZ"), {}),
+        (names("RGB", "ZDepth.Z", "VRayZDepth.RGB"), {}),
+        (names("RGB", "motionvector.RGB"), {"motion": "-motionvector.R,motionvector.G"}),
+        (names("RGB", "view.velocity.XYZ"), {"motion": "-view.velocity.X,view.velocity.Y"}),
     ],
 )  # fmt: skip
 def test_layers_that_look_like_missing_ones_are_proposed(channels, expected):
@@ -394,7 +462,7 @@ def test_direct_lighting_of_other_renderers_is_not_ngpts_direct():
     assert "direct" not in resolve([("", names("RGB", "direct.RGB"))])
     assert "direct" in resolve([("", names("RGB", "direct.RGB", "dy.RGB"))])
     assert "direct" in resolve([("", names("RGB", "direct.RGB"))], {"direct": "direct"})
-    assert "direct" in resolve([("", names("RGB", "direct.RGB"))], ours=True)
+    assert "direct" in resolve([("", names("RGB", "direct.RGB"))], writer="ngpt")
 
 
 def test_variances_of_a_sample_are_not_taken_for_variances_of_the_mean():
@@ -415,5 +483,5 @@ def test_parts_of_light_are_taken_in_files_of_ours_alone(name):
     """Elsewhere names like these are any light, or a colour."""
     channels = ["R", "G", "B", *(f"{name}.{c}" for c in "RGB")]
     assert name not in resolve([("", channels)])
-    assert name in resolve([("", channels)], ours=True) and name in resolve([("", channels)], {name: name})
+    assert name in resolve([("", channels)], writer="ngpt") and name in resolve([("", channels)], {name: name})
     assert name in resolve([("", [*channels, *(f"{name}_var.{c}" for c in "RGB")])])

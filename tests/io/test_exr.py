@@ -217,6 +217,50 @@ def test_a_primal_in_a_later_part_puts_the_result_in_a_new_first_part(tmp_path):
     )
 
 
+@pytest.mark.parametrize("name", ["ViewLayer.Combined", "C", "beauty"])
+@pytest.mark.parametrize("part", ["", "beauty"])
+def test_a_result_replaces_the_layer_that_its_input_came_from(tmp_path, name, part):
+    """Who loads that layer in a compositor wants the image; the input is kept to the bit, and is denoised again."""
+    before = small(*(f"{name}.{c}" for c in "RGBA"), "albedo.R", "albedo.G", "albedo.B", dtype=np.float16)
+    path, stack = None, read(write_raw(tmp_path / "0.exr", (before, {}, part)))
+    for number in (1, 2, 3):
+        path = write(tmp_path / f"{number}.exr", RESULT * number, like=stack)
+        ((_, header, channels),) = read_raw(path)
+        assert header["ngpt:pass"] == name
+        for i, (root, kept) in enumerate(zip(ROOT, PRIMAL, strict=True)):
+            expected = (RESULT[..., i] * number).astype(np.float16)
+            assert same_bits(channels[root], expected) and same_bits(channels[f"{name}.{root}"], expected)
+            assert same_bits(channels[kept], before[f"{name}.{root}"])
+        assert same_bits(channels[f"{name}.A"], before[f"{name}.A"])
+        again = read(path)
+        assert again.names == stack.names and all(same_bits(again[layer], stack[layer]) for layer in stack.names)
+        # Asked for by name, it is still the input that is meant.
+        stack = read(path, {"primal": name})
+        assert same_bits(stack["primal"], again["primal"])
+
+
+def test_what_is_called_noisy_stays_noisy(tmp_path):
+    before = small(*(f"V.{layer}.{c}" for layer in ("Noisy Image", "Combined") for c in "RGB"))
+    path = write(tmp_path / "b.exr", RESULT, like=read(write_raw(tmp_path / "a.exr", (before,))))
+    ((_, header, channels),) = read_raw(path)
+    assert all(same_bits(channels[name], before[name]) for name in before) and "ngpt:pass" not in header
+
+
+def test_channels_in_the_units_of_others_stay_as_they_are(tmp_path):
+    before = small(*ROOT, "V.Vector.X", "V.Vector.Y", "V.Vector.Z", "V.Vector.W")
+    stack = read(write_raw(tmp_path / "a.exr", (before,)))
+    assert same_bits(stack["motion"][..., 1], -before["V.Vector.Y"])
+    write(tmp_path / "b.exr", stack)
+    write(tmp_path / "c.exr", RESULT, like=stack)
+    write(tmp_path / "d.exr", RESULT, like=stack.replace(motion=stack["motion"] + 1))
+    for name in "bcd":
+        ((_, _, channels),) = read_raw(tmp_path / f"{name}.exr")
+        assert all(same_bits(channels[key], before[key]) for key in before if "Vector" in key)
+        assert ("motion.X" in channels) == (name == "d")
+    assert same_bits(read(tmp_path / "c.exr")["motion"], stack["motion"])
+    assert same_bits(read(tmp_path / "d.exr")["motion"], stack["motion"] + 1)
+
+
 def test_a_root_that_is_not_the_primal_is_not_lost(tmp_path):
     before = small(*ROOT, "noisy.R", "noisy.G", "noisy.B")
     stack = read(write_raw(tmp_path / "a.exr", (before,)), {"primal": "noisy"})

@@ -4,7 +4,8 @@ Each ``NAME.exr`` is a multi-layer file with the denoising passes, as a user get
 in Blender's Python, where ngpt is not installed.
 
 Options before the folder: ``--blur`` opens the lens, ``--interleaved`` writes one part instead of one for each pass,
-``--denoised`` has Cycles denoise, ``--size WIDTHxHEIGHT``.
+``--denoised`` has Cycles denoise, ``--size WIDTHxHEIGHT``. ``--moving`` writes the pass *Vector*, and the camera goes
+right and up by some pixels a frame, of which ``NAME=SPP:SEED:FRAME`` renders one; ``--stereo`` writes two eyes.
 """
 
 import argparse
@@ -102,8 +103,19 @@ def prepare(size, interleaved=False, blur=False):
     written.file_format, written.color_depth, written.exr_codec = "OPEN_EXR_MULTILAYER", "32", "ZIP"
 
 
-def render(path, spp, seed):
+def move():
+    """The camera goes right and up, evenly from frame 1 to 5."""
+    camera = bpy.context.scene.camera
+    bpy.context.view_layer.use_pass_vector = True
+    bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
+    for frame, place in ((1, (0, -3.9, 1.5)), (5, (0.6, -3.9, 1.9))):
+        camera.location = place
+        camera.keyframe_insert("location", frame=frame)
+
+
+def render(path, spp, seed, frame=1):
     scene = bpy.context.scene
+    scene.frame_set(frame)
     scene.cycles.samples, scene.cycles.seed = spp, seed
     scene.render.filepath = str(path.resolve())
     bpy.ops.render.render(write_still=True)
@@ -114,12 +126,19 @@ def main():
     parser.add_argument("--blur", action="store_true")
     parser.add_argument("--interleaved", action="store_true")
     parser.add_argument("--denoised", action="store_true")
+    parser.add_argument("--moving", action="store_true")
+    parser.add_argument("--stereo", action="store_true")
     parser.add_argument("--size", default="480x270")
     parser.add_argument("folder", type=Path)
     parser.add_argument("renders", nargs="+")
     given = parser.parse_args()
     prepare(given.size, given.interleaved, given.blur)
     bpy.context.scene.cycles.use_denoising = given.denoised
+    if given.moving:
+        move()
+    if given.stereo:
+        bpy.context.scene.render.use_multiview = True
+        bpy.context.scene.render.image_settings.views_format = "MULTIVIEW"
     for wanted in given.renders:
         name, _, how = wanted.partition("=")
         render(given.folder / f"{name}.exr", *map(int, how.split(":")))

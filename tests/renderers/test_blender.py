@@ -7,6 +7,7 @@ from pythons import run
 import ngpt
 from ngpt.denoisers import oidn
 from ngpt.measure.metrics import EPSILON, squared_error, trimmed_mean
+from ngpt.sequence.warp import warped
 
 pytestmark = pytest.mark.slow
 
@@ -105,3 +106,35 @@ def test_auto_leaves_no_more_than_oidn_and_denoises_without(scene, monkeypatch):
     monkeypatch.setattr(oidn, "find_spec", lambda name: None)
     result = ngpt.reconstruct(stack)
     assert result.method == "nfor" and error(result.image) < 0.5 * noisy
+
+
+def test_motion_leads_to_the_frame_before(tmp_path):
+    render(tmp_path, "--moving", ["before=4:1:3", "now=4:1:4"])
+    before, now = (ngpt.read(tmp_path / f"{name}.exr") for name in ("before", "now"))
+
+    def distance(motion):
+        seen, found = warped(before["albedo"], motion)
+        return np.abs(seen - now["albedo"])[found].mean()
+
+    motion = now["motion"]
+    assert np.abs(np.median(motion, axis=(0, 1))).min() > 1
+    others = [motion * sign for sign in ([0, 0], [-1, -1], [1, -1], [-1, 1])]
+    assert distance(motion) < 0.4 * min(map(distance, others))
+    temporal = ngpt.Temporal()
+    for stack in (before, now):
+        temporal.next(stack, ngpt.denoise(stack))
+    assert temporal.share > 0.2 and not temporal.reason
+
+
+@pytest.mark.parametrize("layout", [[], ["--interleaved"]], ids=["many parts", "one part"])
+def test_both_eyes_are_denoised_and_written_back(tmp_path, layout):
+    render(tmp_path, "--stereo", *layout, ["both=4:1"], size=(96, 54))
+    stacks = ngpt.read_views(tmp_path / "both.exr")
+    assert [stack.names for stack in stacks] == [("primal", "albedo", "normal", "depth", "alpha")] * 2
+    assert not np.array_equal(stacks[0]["depth"], stacks[1]["depth"])
+    images = [ngpt.denoise(stack) for stack in stacks]
+    ngpt.write(tmp_path / "clean.exr", images, like=stacks)
+    for view, image, stack in zip(("left", "right"), images, stacks, strict=True):
+        assert np.allclose(ngpt.read_image(tmp_path / "clean.exr", view=view), image, rtol=1e-3)
+        again = ngpt.read(tmp_path / "clean.exr", view=view)
+        assert all(np.array_equal(again[name], stack[name]) for name in stack.names)

@@ -130,6 +130,25 @@ def test_a_film_of_a_shot(tmp_path, frames, image):
     assert sorted(path.name for path in pictures.iterdir()) == ["0000.png", "0001.png", "0002.png"]
 
 
+def test_a_film_in_the_order_of_numbers_without_results_between(tmp_path, frames, image, capfd):
+    pytest.importorskip("PIL")
+    for number in (10, 9):
+        write(frames / f"{number}.exr", image * np.float32(number))
+    assert main(["picture", str(frames), "-o", str(tmp_path / "plain.webp")]) == 0
+    for path in sorted(frames.iterdir()):
+        write(path.with_name(f"{path.stem}_denoised.exr"), image * 0)
+    (frames / "._9.exr").write_bytes(b"of macOS")
+    capfd.readouterr()
+    assert main(["picture", str(frames), "-o", str(tmp_path / "shot.webp")]) == 0
+    assert "5 results beside their inputs are left out" in capfd.readouterr().err
+    assert (tmp_path / "shot.webp").read_bytes() == (tmp_path / "plain.webp").read_bytes()
+    assert main(["picture", f"{frames}/*_denoised.exr", "-o", str(tmp_path / "clean.webp")]) == 0
+    with opened(tmp_path / "shot.webp") as noisy, opened(tmp_path / "clean.webp") as clean:
+        light = [np.asarray(noisy.convert("RGB")).mean() for i in range(5) if not noisy.seek(i)]
+        assert noisy.n_frames == 5 and light == sorted(light)
+        assert np.asarray(clean.convert("RGB")).max() == 0
+
+
 @pytest.mark.skipif(not (shutil.which("ffmpeg") or find_spec("imageio_ffmpeg")), reason="needs FFmpeg")
 def test_an_mp4_of_a_shot(tmp_path):
     from ngpt.report.pictures import _ffmpeg

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 import pytest
 from scipy.ndimage import gaussian_filter
-from shots import SIZE, frame_of, mse, view, without
+from shots import SIGMA, SIZE, frame_of, mse, part_of, view, without
 
 from ngpt.sequence.flicker import flicker
 from ngpt.sequence.history import LONGEST, Temporal
@@ -176,3 +176,54 @@ def test_neither_torch_nor_mitsuba_is_imported():
         "import sys, ngpt, ngpt.cli.denoise; ngpt.Temporal(); print({'torch', 'mitsuba', 'drjit'} & sys.modules.keys())"
     )
     assert subprocess.check_output([sys.executable, "-c", code], text=True).strip() == "set()"
+
+
+@pytest.mark.parametrize("grows", [0, 2])
+def test_windows_that_move_find_their_history(rng, history, grows):
+    """A shot at rest, of which frames are a part that moves and changes its size."""
+    image, features = view()
+    stacks = [frame_of(image, features, rng) for _ in range(6)]
+    windows = [(4 * i, i, 30 + grows * (i % 3), 30 - grows * (i % 2)) for i in range(len(stacks))]
+    parts = [part_of(stack, *window) for stack, window in zip(stacks, windows, strict=True)]
+    temporal, whole = history(), played(history(), stacks)
+    for i, part in enumerate(parts):
+        alone, found = smooth(part), temporal.next(part, smooth(part))
+        known, truth = part.place.data.within(part.place.display), image[part.place.data.within(part.place.display)]
+        assert i == 0 or mse(found, truth) < 0.95 * mse(alone, truth)  # blur is in both
+        assert np.abs(found - whole[i][known])[5:-5, 5:-9].mean() < 0.1 * SIGMA
+
+
+def test_pictures_of_other_sizes_have_no_history(rng, history):
+    image, features = view()
+    stack = frame_of(image, features, rng)
+    small = GradientStack({name: layer[:20] for name, layer in stack.layers.items()})
+    temporal = history()
+    temporal.next(stack, smooth(stack))
+    assert np.array_equal(temporal.next(small, smooth(small)), smooth(small))
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (lambda frame: frame, ""),
+        (lambda frame: without(frame, "motion"), "no layer 'motion'"),
+        (lambda frame: frame.replace(motion=np.full((*SIZE, 2), 99.0)), "motion is not known, or leads out of"),
+        (lambda frame: frame.replace(motion=np.full((*SIZE, 2), np.nan)), "motion is not known, or leads out of"),
+        (lambda frame: frame.replace(albedo=1 - frame["albedo"], depth=9 + 0 * frame["depth"]), "albedo, normal or"),
+        (lambda frame: frame.replace(primal=9 * frame["primal"]), "the light differs"),
+        (
+            lambda frame: GradientStack({k: v[:-4] for k, v in frame.layers.items()}),
+            "is ",
+        ),
+        (lambda frame: GradientStack(frame.layers, {"ngpt:previousFrame": 4}), "is made after frame 4, and the frame"),
+    ],
+)
+def test_history_that_counts_for_nothing_has_a_reason(rng, change, reason):
+    image, features = view()
+    frames = [frame_of(image, features, rng, **{"ngpt:frame": i}) for i in (6, 7)]
+    temporal = Temporal(None)
+    temporal.next(frames[0], smooth(frames[0]))
+    assert temporal.reason == "the first frame" and temporal.share == 0
+    last = change(frames[1])
+    temporal.next(last, smooth(last))
+    assert temporal.reason.startswith(reason) and bool(temporal.reason) == (temporal.share < 0.005) == bool(reason)

@@ -151,6 +151,6 @@ def test_it_follows_the_exposure_and_keeps_values_far_apart(rng):
 def test_taps_are_those_of_the_bilinear_image(rng):
     image, motion = rng.random(SIZE), rng.uniform(-4, 4, (*SIZE[:2], 2))
     motion[2, 3] = np.nan
-    places, weights, found = bilinear_taps(motion)
+    places, weights, found = bilinear_taps(motion, SIZE[:2])
     value = (image.reshape(-1, 3)[places] * weights[..., None]).sum(axis=0).reshape(SIZE)
     assert not found[2, 3] and np.allclose(value[found], warped(image, motion)[0][found])

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from shots import wall, without
+from shots import part_of, wall, without
 
 import ngpt
 from ngpt.methods import METHODS
@@ -81,3 +81,17 @@ def test_frames_do_not_depend_on_those_that_are_not_wanted(stacks):
     for only in (0, HOP, COUNT - 1):
         found = results(stacks, wanted=lambda number, only=only: number == only)
         assert list(found) == [only] and np.array_equal(found[only], whole[only])
+
+
+def test_windows_of_pixels_that_move_meet_where_they_lie(rng):
+    """Frames at rest, of which the files hold a part that moves and changes its size."""
+    steep = np.linspace(1, 5, SIZE[1])[:, None] + np.zeros(SIZE)
+    stacks = [stack.replace(primal=stack["primal"] + steep) for stack in wall(rng, 5, growth=0)]
+    slope = np.diff(steep, axis=1, append=steep[:, -1:])
+    stacks = [stack.replace(dx=stack["dx"] + slope) for stack in stacks]
+    parts = [part_of(stack, 2 * i, i % 2, 10 + i % 2, 14 - i % 3) for i, stack in enumerate(stacks)]
+    whole, found, alone = results(stacks), results(parts), {i: results([part])[0] for i, part in enumerate(parts)}
+    for i, part in enumerate(parts):
+        there = part.place.data.within(part.place.display)
+        errors = [np.square(image - 1 - steep[there]).mean() for image in (found[i], alone[i], whole[i][there])]
+        assert errors[0] < 0.7 * errors[1] and errors[0] < 3 * errors[2]

@@ -20,11 +20,13 @@ import ngpt  # noqa: E402
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import weights  # noqa: E402
 from ngpt.network.model import ModelConfig  # noqa: E402
+from ngpt.stack import GradientStack  # noqa: E402
 from ngpt.training import examples, folders  # noqa: E402
 from ngpt.training.augment import Augmentation  # noqa: E402
 from ngpt.training.schedule import learning_rate  # noqa: E402
 from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
 from ngpt.training.trainer import Trainer, published  # noqa: E402
+from ngpt.windows import Place, Window  # noqa: E402
 
 CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
 SETTINGS = {
@@ -295,6 +297,13 @@ def test_folders_of_stacks_are_crops(tmp_path):
     assert np.allclose(read.stack(0)["dx"], crop.stack(0)["dx"])
     with pytest.raises(NgptError, match="no such folder"):
         folders.open_crops(tmp_path / "nowhere")
+    there = Window(2, 0, *read.stack(0).place.data.size)
+    moved = GradientStack(crop.stack(0).layers, place=Place(there, Window(0, 0, 99, 99)))
+    other = GradientStack({"primal": crop.reference}, place=Place(replace(there, left=3), Window(0, 0, 99, 99)))
+    ngpt.write(tmp_path / "view" / "a.exr", moved, overwrite=True)
+    ngpt.write(tmp_path / "view" / "reference.exr", other, overwrite=True)
+    with pytest.raises(NgptError, match=r"at \(2, 0\) of 99x99 but .*reference.exr is .* at \(3, 0\) of 99x99"):
+        folders.open_crops(tmp_path)
 
 
 def test_the_papers_schedule():

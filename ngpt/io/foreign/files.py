@@ -88,7 +88,7 @@ def _form(path: str | Path, file: BinaryIO, reader: Callable[[BinaryIO], Form]) 
 
 def _header(form: Form) -> PartHeader:
     channels = dict.fromkeys(_names(form), (4, (1, 1)))
-    return PartHeader("", "the image", form.size, channels, False, 0, 0, False, form.ratio)
+    return PartHeader("", "the image", form.size, channels, False, 0, 0, False, form.ratio, {})
 
 
 def _names(form: Form) -> str:

@@ -14,6 +14,10 @@ from ngpt.errors import NgptError, WrongUse
 _FIELD = re.compile(r"%(?:0(\d))?d|(##+)|\$F(\d?)|<frame>|\{frame(?::0(\d)d)?\}")
 
 
+# A number in a name. A minus belongs to it after a dot, an underscore or nothing: "f.-2", but not "f-2".
+NUMBER = re.compile(r"((?:(?<![^._/\\])-)?[0-9]+)")
+
+
 def varies(name: str) -> bool:
     """Whether a name is one for each frame."""
     return bool(_FIELD.search(name)) and not os.path.exists(name)
@@ -46,7 +50,7 @@ def named(name: str, frame: int) -> str:
 
 def number_of(path: Path, wanted: str) -> int:
     """The frame that a file is by the last number in its name. Raises WrongUse where there is none for ``wanted``."""
-    numbers = re.findall(r"\d+", path.stem)
+    numbers = NUMBER.findall(path.stem)
     if not numbers:
         raise WrongUse(f"{path}: has no number, which {wanted} asks for; name the output without")
     return int(numbers[-1])

@@ -1,0 +1,89 @@
+"""How the noise of a pixel's mean falls with its samples, where these are points of scrambled nets.
+
+Let V(m) be the variance of the mean of an aligned block of m = 2^j points of one net, with V(1) = 1. Scrambling is
+nested [Owen 1995, "Randomly permuted (t,m,s)-nets and (t,s)-sequences"], so any two points whose smallest common block
+has 2m points have the same covariance. A block of 2m points is two blocks of m points, which gives that covariance:
+
+    V(2m) = (V(m) + C(m)) / 2,    C(m) = 2 V(2m) - V(m).
+
+Points of different rounds (``data_gen.paths.streams``) are independent. So V gives the variance of a mean of *any*
+number of points, and of the difference between the means of any two parts of them. The one assumption is that V belongs
+to a family of laws, from independent samples to smooth integrands. The render itself shows which law holds.
+"""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+
+# The family: V(m) = share / m + (1 - share) m^-rate, from much noise to little. Rates below 1: worse than independent
+# samples, as a few pixels may seem to be by chance. Share 1: independent samples. Share 0 and rate 3/2: steps of the
+# integrand. In between: steps beside light that is found by luck. Rate 3: a smooth integrand in two dimensions.
+_MIXED = np.linspace(1.0, 0.0, 21)
+SHARES = np.concatenate([np.zeros(10), _MIXED, np.zeros(30)])
+RATES = np.concatenate([np.linspace(0.5, 0.95, 10), np.full(21, 1.5), np.linspace(1.55, 3.0, 30)])
+
+
+class Law(NamedTuple):
+    """What ``n`` samples of a pixel show, and the variance of their mean, for each law of the family; both (laws).
+
+    Both are over the variance that the spread of the samples claims, which takes them for independent.
+    """
+
+    seen: np.ndarray  # of the contrast of data_gen.film.claims; falls from law to law
+    truth: np.ndarray
+
+
+def split(n: int) -> int:
+    """How many of ``n`` samples are held against those after them, n > 1: so that either part has a third or more.
+
+    It is the last power of two before n, or half of that.
+    """
+    last = 1 << ((n - 1).bit_length() - 1)
+    return last if 2 * (n - last) >= last else last // 2
+
+
+@cache
+def law(n: int, net: int) -> Law:
+    """The law of ``n`` > 1 samples, the first round of which is a net of ``net``, a power of two."""
+    first = split(n)
+    second = n - first
+    within, behind, total = _covariances(0, first, net), _covariances(first, n, net), _covariances(0, n, net)
+    across = (total - within - behind) / 2
+    variance = total / n**2
+    # The expected square of a contrast whose square is the variance of the mean where samples are independent
+    contrast = within / first**2 + behind / second**2 - 2 * across / (first * second)
+    claimed = (1 - variance) / (n - 1)
+    return Law(contrast * first * second / n**2 / claimed, variance / claimed)
+
+
+def _covariances(begin: int, end: int, net: int) -> np.ndarray:
+    """The sum of the covariances of all pairs of samples from ``begin`` to before ``end``."""
+    total, start, size = np.zeros(len(RATES)), 0, net
+    while start < end:
+        total += _in_block(begin, end, start, size)
+        # A round is as large as all before it together.
+        start += size
+        size = start
+    return total
+
+
+def _in_block(begin: int, end: int, start: int, size: int) -> np.ndarray:
+    """The same of those among them that are in the aligned block of ``size`` samples from ``start`` on."""
+    begin, end = max(begin, start), min(end, start + size)
+    if begin >= end:
+        return np.zeros(len(RATES))
+    if end - begin == size:
+        return size**2 * _variance(size)
+    half = size // 2
+    middle = start + half
+    apart = max(middle - begin, 0) * max(end - middle, 0)
+    covariance = 2 * _variance(size) - _variance(half)
+    left, right = _in_block(begin, end, start, half), _in_block(begin, end, middle, half)
+    return left + right + 2 * apart * covariance
+
+
+def _variance(m: int) -> np.ndarray:
+    return SHARES / m + (1 - SHARES) * float(m) ** -RATES

@@ -1,0 +1,36 @@
+"""``ngpt denoise --ref``: the error of a result, in the pixels that both it and the reference have."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ngpt.io.exr import read_picture
+from ngpt.io.primaries import converted, to_rec709
+from ngpt.measure.metrics import compare
+from ngpt.stack import GradientStack
+from ngpt.windows import Place, overlap
+
+
+class Errors(NamedTuple):
+    """What ``compare`` says, and of which pixels where that is not the whole of both images."""
+
+    metrics: dict[str, float]
+    part: str
+
+
+class Reference(NamedTuple):
+    """A reference image, (H, W, 3) in linear Rec. 709, its file, and where it lies."""
+
+    path: str
+    pixels: np.ndarray
+    place: Place
+
+    @classmethod
+    def read(cls, path: str, isolated: bool) -> "Reference":
+        return cls(path, *read_picture(path, isolated))
+
+    def errors(self, image: np.ndarray, stack: GradientStack) -> Errors:
+        """Of an image (H, W, 3) that was made of a stack. Raises NgptError where the two have no pixel in common."""
+        both = overlap([stack.path, self.path], [stack.place, self.place])
+        light = converted(image, to_rec709(stack.attributes))
+        return Errors(compare(*both.of([light, self.pixels])), str(both.common) if both.line else "")

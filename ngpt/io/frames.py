@@ -1,0 +1,166 @@
+"""Files of frames: those of a folder or a pattern, in the order of their numbers, for all that read or show shots."""
+
+import glob
+import os
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import NamedTuple
+
+from ngpt.errors import NgptError
+from ngpt.io.framenames import NUMBER, frames_named, varies
+from ngpt.io.header import read_headers
+from ngpt.system.reading import regular_file
+
+# What `ngpt denoise` appends to the name of its input. Files of such names are results, and no frames to denoise.
+RESULT_SUFFIX = "_denoised"
+
+
+class Series(NamedTuple):
+    """Files whose names differ in one number: ``name`` has # in its place; ``files`` are in order."""
+
+    name: str
+    files: list[Path]
+    numbers: list[int]
+
+
+def natural(name: object) -> tuple:
+    """A key that sorts names as people do: numbers as numbers, f.2 before f.10, f.-2 before f.-1."""
+    path = Path(str(name))
+    texts = NUMBER.split(str(path.with_suffix("")))
+    return tuple(int(text) if i % 2 else text for i, text in enumerate(texts)), path.suffix, str(path)
+
+
+def is_shot(name: str) -> bool:
+    """Whether a name means several files: a folder, a name of frames, or a pattern that is not the name of a file."""
+    return Path(name).is_dir() or varies(name) or (glob.has_magic(name) and not Path(name).exists())
+
+
+def shot_files(name: str) -> list[Path]:
+    """The frames of a folder (its .exr files) or a pattern, in order, without hidden files such as macOS's ``._*``.
+
+    Patterns are those of shells, and names of frames (``ngpt.io.framenames``). Folders and files of that very name win,
+    also within a pattern: ``dir[1]/*.exr``. Results that lie beside what they were made of (``*_denoised``) are left
+    out. Raises NgptError where there are none.
+    """
+    return in_order(without_results(_files(name)) or _none(name, "no .exr files there"))
+
+
+def input_files(name: str) -> list[Path]:
+    """As ``shot_files``, without any results of ``ngpt denoise``: what there is to denoise."""
+    found = [path for path in _files(name) if not path.stem.endswith(RESULT_SUFFIX)]
+    return in_order(
+        found or _none(name, "no .exr files to denoise there; other formats by their names, such as '*.pfm'")
+    )
+
+
+def without_results(files: Sequence[Path]) -> list[Path]:
+    """The files without results that lie beside their inputs."""
+    known = set(files)
+    inputs = {path: path.with_name(frame_name(path) + path.suffix) for path in files}
+    return [path for path in files if inputs[path] == path or inputs[path] not in known]
+
+
+def frame_name(path: Path) -> str:
+    """What the files of one frame have in common: the name without its ending and without that of a result."""
+    return path.stem.removesuffix(RESULT_SUFFIX)
+
+
+def in_order(files: Iterable[Path]) -> list[Path]:
+    """Files by their frames: by the attribute ``ngpt:frame`` where all have one of their own, else by their names.
+
+    Frames of several series, whose names differ in more than one number, come one series after the other.
+    """
+    given = list(files)
+    frames = {path: frame for path in given if (frame := _frame(path)) is not None} if len(given) > 1 else {}
+    if len(frames) == len(given) == len(set(frames.values())):
+        return sorted(given, key=lambda path: frames[path])
+    ordered = []
+    for one in series(given):
+        known = all(path in frames for path in one.files)
+        ordered += sorted(one.files, key=lambda path: frames[path]) if known else one.files
+    return ordered
+
+
+def series(files: Iterable[Path]) -> list[Series]:
+    """The series among files, in natural order of their first names.
+
+    Of several numbers in a name the last one that differs among names alike counts the frames: ``take2.0007``.
+    """
+    alike: dict[str, list[Path]] = {}
+    for path in sorted(files, key=natural):
+        alike.setdefault(NUMBER.sub("#", path.stem) + path.suffix + str(path.parent), []).append(path)
+    found: dict[str, Series] = {}
+    for paths in alike.values():
+        texts = [NUMBER.split(path.stem) for path in paths]
+        places = range(1, len(texts[0]), 2)
+        place = next((i for i in reversed(places) if len({int(text[i]) for text in texts}) > 1), None)
+        for path, text in zip(paths, texts, strict=True):
+            name, number = path.name, 0
+            if place is not None:
+                name = "".join([*text[:place], "#", *text[place + 1 :]]) + path.suffix
+                number = int(text[place])
+            one = found.setdefault(str(path.with_name(name)), Series(name, [], []))
+            one.files.append(path)
+            one.numbers.append(number)
+    return list(found.values())
+
+
+def remarks(name: str, files: Sequence[Path], results: bool = True) -> list[str]:
+    """What to say of the frames of a shot before they are shown or blended: a line each, none where all is well.
+
+    ``results``  whether to tell how many results were left out
+    """
+    said = []
+    if left := len(set(_files(name)) - set(files)) if results else 0:
+        pattern = (Path(name) if Path(name).is_dir() else Path(name).parent) / f"*{RESULT_SUFFIX}.exr"
+        said.append(f"{name}: {left} results beside their inputs are left out; '{pattern}' names them")
+    found = series(files)
+    if len(found) > 1 and len(files) > len(found):
+        each = ", ".join(f"{one.name} ({len(one.files)})" for one in found)
+        said.append(f"{name}: {len(found)} series of frames, one after the other: {each}")
+    for one in found:
+        steps = list(pairwise(sorted(set(one.numbers))))
+        step = min((after - before for before, after in steps), default=1)
+        gaps = [(before + step, after - step) for before, after in steps if after - before > step]
+        if gaps:
+            some = ", ".join(str(first) if first >= last else f"{first} to {last}" for first, last in gaps[:5])
+            some += f" and {len(gaps) - 5} more gaps" if len(gaps) > 5 else ""
+            said.append(f"{name}: {one.name} goes from {steps[0][0]} to {steps[-1][1]} without {some}")
+    return said
+
+
+def _files(name: str) -> list[Path]:
+    path = Path(name)
+    if path.is_dir():
+        found = [file for file in path.iterdir() if file.suffix.lower() == ".exr"]
+    elif varies(name):
+        found = list(frames_named(name).values())
+    else:
+        found = [Path(file) for file in glob.glob(_with_literals(path), recursive=True)]
+    return [file for file in found if not file.name.startswith(".")]
+
+
+def _with_literals(path: Path) -> str:
+    """A pattern in which folders that exist by the very names it begins with are no patterns: ``dir[1]/*.exr``."""
+    known, parts = Path(), []
+    for part in path.parts:
+        if not (known / part).exists():
+            break
+        known /= part
+        parts.append(glob.escape(part))
+    return os.path.join(*parts, *path.parts[len(parts) :])
+
+
+def _none(name: str, what: str) -> list[Path]:
+    raise NgptError(f"{name}: {what}")
+
+
+def _frame(path: Path) -> float | None:
+    """The attribute ``ngpt:frame`` of a file; None where it has none, or cannot be read: its reader complains."""
+    try:
+        with regular_file(path) as file:
+            numbers = [part.number("ngpt:frame") for part in read_headers(file, str(path))]
+    except NgptError:
+        return None
+    return next((number for number in numbers if number is not None), None)

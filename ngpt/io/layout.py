@@ -1,0 +1,83 @@
+"""Layers in a file: where a stack's are, how they become arrays, and how arrays become channels."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.io.resolution import Found, Resolution
+from ngpt.io.views import Part, View, views_of
+from ngpt.windows import Place, Window
+
+_HALF_MAX = 65504.0
+_HALF_NORMAL_MIN = 2.0**-14
+_ROWS = 16  # that are gathered at a time
+
+
+@dataclass(frozen=True)
+class StackSource:
+    """The file a stack was read from, where in it the layers are, and by which names those of its view go."""
+
+    image: ExrImage
+    resolution: Resolution
+    view: View
+
+
+def file_views(image: ExrImage) -> list[View]:
+    """The views of a file, by its headers."""
+    return views_of(
+        [
+            Part(part.name, list(part.channels), str(part.header.get("view", "")), part.header.get("multiView", ()))
+            for part in image.parts
+        ]
+    )
+
+
+def place_of(part: ExrPart) -> Place:
+    """Where the pixels of a part lie."""
+    return Place(Window.of_box(part.header["dataWindow"]), Window.of_box(part.header["displayWindow"]))
+
+
+def gather(part: ExrPart, names: tuple[str, ...]) -> np.ndarray:
+    """Returns the channels ``names`` as one array (H, W, C) float32."""
+    channels = [part.channels[name] for name in names]
+    layer = np.empty((*channels[0].shape, len(channels)), np.float32)
+    # Some rows at a time: what one channel wrote is then in the cache when the next comes between it.
+    for top in range(0, len(layer), _ROWS):
+        rows = slice(top, top + _ROWS)
+        for index, channel in enumerate(channels):
+            layer[rows, :, index] = channel[rows]
+    return layer
+
+
+def taken(image: ExrImage, found: Found) -> np.ndarray:
+    """A layer of a file, (H, W, C) float32."""
+    layer = gather(image.parts[found.part], found.channels)
+    return layer * np.asarray(found.factors, np.float32) if found.factors else layer
+
+
+def holds(part: ExrPart, names: tuple[str, ...], values: np.ndarray, factors: tuple[float, ...] = ()) -> bool:
+    """Whether the channels ``names`` are ``values`` (H, W, C), of those that are float32 bit for bit."""
+    if values.dtype != np.float32:
+        return False
+    if factors:
+        return np.array_equal(gather(part, names) * np.asarray(factors, np.float32), values, equal_nan=True)
+    return values.shape[:2] == part.channels[names[0]].shape and all(
+        np.array_equal(part.channels[name].astype(np.float32, copy=False).view(np.uint32), bits)
+        for name, bits in zip(names, np.moveaxis(values.view(np.uint32), -1, 0), strict=True)
+    )
+
+
+def scatter(part: ExrPart, names: tuple[str, ...], values: np.ndarray, half: bool) -> None:
+    """Puts ``values`` (H, W, C) into the channels ``names``: as half if asked to and half can hold them, else float."""
+    if half:
+        peak = np.abs(values[np.isfinite(values)]).max(initial=0.0)
+        half = peak <= _HALF_MAX and not 0.0 < peak < _HALF_NORMAL_MIN
+    # Variances in double precision may be beyond floats: they are infinite in files, which counts as not known.
+    with np.errstate(over="ignore"):
+        for index, name in enumerate(names):
+            part.channels[name] = np.ascontiguousarray(values[..., index], dtype=np.float16 if half else np.float32)
+
+
+def is_half(part: ExrPart, names: tuple[str, ...]) -> bool:
+    return all(part.channels[name].dtype == np.float16 for name in names)

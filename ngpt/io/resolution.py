@@ -1,0 +1,379 @@
+"""Where the layers of the contract (``ngpt.layers``) are in a file, by the names in it (``ngpt.io.aliases``).
+
+Everything here works on channel *names*; no file is opened. OpenEXR calls channel ``C`` of layer ``L`` ``L.C``, layers
+nest with dots, and layer names may hold spaces: ``ViewLayer.Denoising Albedo.R`` is channel ``R`` of the layer
+``ViewLayer.Denoising Albedo``. A name matches a layer when it is the layer's name or its tail after a dot.
+"""
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+from ngpt.errors import NgptError, did_you_mean
+from ngpt.io.aliases import ALIASES, LOOKS, NO_LIGHT, NOISE, NOT_LOOKS, OWN, Alias, plain
+from ngpt.layers import LAYERS, RGB, XY, XYZ, Layer
+
+# The names of the parts of a file, and their channels: by the names that count here, where those in the file are others
+# (``ngpt.io.views``).
+Parts = Sequence[tuple[str, Sequence[str] | Mapping[str, str]]]
+
+_COLOUR = (("R", "r", "red"), ("G", "g", "green"), ("B", "b", "blue"))
+_SPELLINGS = {
+    RGB: (_COLOUR,),
+    # Tools that write an (H, W, 3) array name its channels R G B whatever it holds.
+    XYZ: ((("X", "x"), ("Y", "y"), ("Z", "z")), _COLOUR),
+    XY: ((("X", "x"), ("Y", "y")),),
+    ("Z",): ((("Z", "z", "V", "v", "T", "t", "Y", "y", "D", "d", "R", "r", ""),),),
+    ("N",): ((("N", "n", ""),),),
+    ("A",): ((("A", "a", "alpha", ""),),),
+}
+# A channel with a sign and a factor: "-N.Z", "-1920*velocity.R".
+_TERM = re.compile(r"\s*([+-]?)(?:([0-9.]+(?:e[+-]?[0-9]+)?)\*)?(.+?)\s*")
+
+
+class Found(NamedTuple):
+    """Where a file holds a layer: part index, channel names in canonical order, and the layer's name in the file.
+
+    ``factors``: what the channels are multiplied by, one each; none are all 1.
+    """
+
+    part: int
+    channels: tuple[str, ...]
+    name: str
+    factors: tuple[float, ...] = ()
+
+
+Resolution = dict[str, Found]
+
+
+class _Group(NamedTuple):
+    """The channels of one layer of a file: suffix -> channel name. ``name`` is "" for the root."""
+
+    part: int
+    name: str
+    channels: dict[str, str]
+
+
+class _Home(NamedTuple):
+    """Where the primal is: its part, what its name begins with, and how others that are no rivals' may not begin."""
+
+    part: int | None
+    prefix: str = ""
+    rivals: frozenset[str] = frozenset()
+
+
+def resolve(
+    parts: Parts,
+    overrides: Mapping[str, str] | None = None,
+    path: str = "image",
+    writer: str = "",
+    origin: str = "",
+) -> Resolution:
+    """Finds the layers of the contract among the channel names of a file.
+
+    ``parts`` lists each part's name and its channel names. ``overrides`` maps names of the contract to the name of a
+    layer in the file, whole or its tail, and wins over the aliases; or to its channels with signs and factors,
+    "-velocity.R,velocity.G". ``path`` is for messages. ``writer`` is who wrote the file, as ``writer_of`` tells: in a
+    file of "ngpt" ``direct`` and ``caustic`` are what the contract says; elsewhere only layers that nobody else writes
+    show it. ``origin`` is the layer that the input of a result was read from.
+
+    A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part; there
+    other layers can also be called ``part.layer``. Where a name fits several layers, the one whose name begins like
+    that of the primal wins (``Near.Combined``, ``Near.Depth``), then the one it fits whole, then the one in the part
+    that holds the primal. Layers that begin like another image that could be the primal belong to that one. Where no
+    name is known, the only layer of colour is the primal.
+
+    Raises NgptError if there is no primal, a name fits several layers, a layer lacks channels or has one twice, or an
+    override names something that is not there.
+    """
+    groups = _group(parts)
+    overrides = dict(overrides or {})
+    for name in overrides:
+        if name not in LAYERS:
+            meant = did_you_mean(name, LAYERS)
+            raise NgptError(
+                f"{path}: --layer {name}=...: no layer is called '{name}'; {meant}use one of {', '.join(LAYERS)}"
+            )
+    found: Resolution = {}
+    home = _Home(None)
+    for layer in LAYERS.values():
+        if layer.name in overrides:
+            found[layer.name] = _chosen(layer, overrides[layer.name], groups, home, path)
+        else:
+            aliases = (alias for alias in ALIASES if alias.layer == layer.name and alias.writer in ("", writer))
+            matches = (match for alias in aliases if (match := _match(alias, layer, groups, home, path)))
+            if match := next(matches, None):
+                found[layer.name] = match
+        if layer.name == "primal":
+            if "primal" not in overrides and ("primal" not in found or found["primal"][:2] in _features(groups)):
+                lone = _lone(groups)
+                if lone is None:
+                    raise _no_primal(groups, path)
+                found["primal"] = lone
+            home = _home(groups, found["primal"], origin)
+    primal = found["primal"]
+    for name, other in found.items():
+        # The root of a multi-part file may be a part called `albedo`, say, and then it is no primal.
+        if name != "primal" and "primal" not in overrides and other[:2] == primal[:2]:
+            raise _no_primal(groups, path)
+    for name, beside in OWN.items():
+        if name in found and name not in overrides and writer != "ngpt" and not beside & found.keys():
+            del found[name]
+    if "alpha" not in found:
+        own = next((group for group in groups if group.part == primal.part and group.name == primal.name), None)
+        if own and (channels := _complete(LAYERS["alpha"], own)):
+            found["alpha"] = Found(own.part, channels, own.name)
+    return found
+
+
+def resolve_alone(parts: Parts, name: str, path: str) -> Found:
+    """Finds layer ``name`` in a file of its own, ``parts`` as for ``resolve``.
+
+    That is the layer of one of its names, else the root of the first part, else the one layer with such channels.
+
+    Raises NgptError where there is none, or several and none of a known name.
+    """
+    groups, layer = _group(parts), LAYERS[name]
+    for alias in (alias for alias in ALIASES if alias.layer == name and not alias.writer):
+        if found := _match(alias, layer, groups, _Home(None), path):
+            return found
+    candidates = list(_distinct(layer, sorted(groups, key=lambda group: group.name != "")))
+    if not candidates:
+        raise NgptError(
+            f"{path}: no layer with channels {' '.join(layer.channels)} for '{name}'; the file holds {_listing(groups)}"
+        )
+    if len(candidates) > 1 and candidates[0].name:
+        names = ", ".join(f'"{candidate.name}"' for candidate in candidates)
+        raise NgptError(f"{path}: layer '{name}' could be any of {names}; write a file with one of them")
+    return candidates[0]
+
+
+def propose(parts: Parts, found: Resolution) -> dict[str, str]:
+    """Layers of a file that look like ones of the contract that ``found`` lacks: layer -> its name in the file.
+
+    A guess from names, for the user to judge: ``--layer albedo="NAME"`` takes it. Each layer is proposed once. Motion
+    is proposed by its channels, as if it led to the next frame with y up, which most renderers write.
+    """
+    taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
+    proposed: dict[str, str] = {}
+    groups = _group(parts)
+    rivals = _home(groups, found["primal"], "").rivals if "primal" in found else frozenset()
+    for name, looks in LOOKS.items():
+        for group in groups if name not in found else ():
+            text = plain(group.name)
+            if not any(look in text for look in looks) or any(other in text for other in NOT_LOOKS.get(name, ())):
+                continue
+            if text.endswith(NOISE) or group.name in proposed.values() or group.name.rpartition(".")[0] in rivals:
+                continue
+            if name == "motion":
+                first, second = (next((c for c in pair if c in group.channels), None) for pair in ("XRxr", "YGyg"))
+                if first and second:
+                    proposed[name] = f"-{group.channels[first]},{group.channels[second]}"
+                    break
+                continue
+            channels = _complete(LAYERS[name], group)
+            if channels and not {(group.part, channel) for channel in channels} & taken:
+                proposed[name] = group.name
+                break
+    return proposed
+
+
+def layers_of_light(parts: Parts, found: Resolution) -> dict[str, Found]:
+    """The layers of colour that are none of the contract: name -> where they are."""
+    taken = {(layer.part, channel) for layer in found.values() for channel in layer.channels}
+    light = {}
+    for group in _group(parts):
+        channels = _complete(LAYERS["primal"], group)
+        if group.name and channels and not {(group.part, channel) for channel in channels} & taken:
+            light[group.name] = Found(group.part, channels, group.name)
+    return light
+
+
+def holds_colour(parts: Parts) -> bool:
+    """Whether there is a layer with channels R G B."""
+    return any(_complete(LAYERS["primal"], group) for group in _group(parts))
+
+
+def _group(parts: Parts) -> list[_Group]:
+    """Sorts channels into layers; one without a dot also makes a layer of its own, called like the channel."""
+    filled = [index for index, (_, channels) in enumerate(parts) if channels]
+    several = len(filled) > 1
+    groups: dict[tuple[int, str], dict[str, str]] = {}
+    for index in filled:
+        part, channels = parts[index]
+        for channel, own in channels.items() if isinstance(channels, Mapping) else zip(channels, channels, strict=True):
+            layer, dot, suffix = channel.rpartition(".")
+            if several and part and layer != part and not layer.startswith(f"{part}."):
+                layer = f"{part}.{layer}" if dot else part
+            held = groups.setdefault((index, layer), {})
+            # Of two channels of one layer, R and beauty.R in the part beauty, the one that names it wins.
+            held[suffix] = own if dot else held.get(suffix, own)
+            if not dot:
+                groups.setdefault((index, f"{layer}.{suffix}" if layer else suffix), {})[""] = own
+                if several and index == filled[0]:
+                    groups.setdefault((index, ""), {})[suffix] = own
+    return [_Group(index, name, channels) for (index, name), channels in groups.items()]
+
+
+def _match(alias: Alias, layer: Layer, groups: list[_Group], home: _Home, path: str) -> Found | None:
+    """Returns the one place where the file holds ``layer`` under ``alias``, None if there is none."""
+    complete: dict[tuple[int, tuple[str, ...]], Found] = {}
+    partial: NgptError | None = None
+    for group in groups:
+        if not _named(group, alias) or group.name.rpartition(".")[0] in home.rivals:
+            continue
+        try:
+            channels = _channels(layer, group, alias.only, path)
+        except NgptError as error:
+            partial = error
+        else:
+            if channels:
+                complete.setdefault((group.part, channels), Found(group.part, channels, group.name, alias.factors))
+    candidates = list(complete.values())
+    for better in (
+        [found for found in candidates if home.prefix and found.name.rpartition(".")[0] == home.prefix],
+        [found for found in candidates if found.name == alias.name],
+        [found for found in candidates if found.part == home.part],
+    ):
+        if len(candidates) > 1 and better:
+            candidates = better
+    if len(candidates) > 1:
+        names = ", ".join(f'"{found.name}"' for found in candidates)
+        remedy = f'--layer {layer.name}="{candidates[0].name}"'
+        raise NgptError(f"{path}: layer '{layer.name}' could be any of {names}; choose one, as in {remedy}")
+    if not candidates and partial:
+        raise partial
+    return candidates[0] if candidates else None
+
+
+def _named(group: _Group, alias: Alias) -> bool:
+    return group.name == alias.name or bool(alias.name and group.name.endswith(f".{alias.name}"))
+
+
+def _chosen(layer: Layer, text: str, groups: list[_Group], home: _Home, path: str) -> Found:
+    """The layer that the user named, or whose channels."""
+    wide = home._replace(rivals=frozenset())
+    if match := _match(Alias(layer.name, "the user", text), layer, groups, wide, path):
+        return match
+    terms = [_TERM.fullmatch(term) for term in text.split(",")]
+    if len(terms) == len(layer.channels):
+        places = [_places(term[3], groups) if term else set() for term in terms]
+        shared = set.intersection(*({part for part, _ in place} for place in places))
+        for part in sorted(shared, key=lambda part: part != home.part):
+            channels = tuple(sorted(name for index, name in place if index == part)[0] for place in places)
+            factors = tuple(float((term[1] or "") + (term[2] or "1")) for term in terms if term)
+            return Found(part, channels, text, factors)
+    wanted, meant = f'--layer {layer.name}="{text}"', did_you_mean(text, {group.name for group in groups})
+    raise NgptError(
+        f"{path}: {wanted} fits no layer with channels {' '.join(layer.channels)}; "
+        f"{meant}the file holds {_listing(groups)}"
+    )
+
+
+def _places(channel: str, groups: list[_Group]) -> set[tuple[int, str]]:
+    """The parts and names of channels that are called so, whole or by their tail after a dot; whole ones win."""
+    names = {(g.part, own): f"{g.name}.{suffix}".strip(".") for g in groups for suffix, own in g.channels.items()}
+    whole = {place for place, name in names.items() if channel in (name, place[1])}
+    return whole or {place for place, name in names.items() if name.endswith(f".{channel}")}
+
+
+def _distinct(layer: Layer, groups: Sequence[_Group]) -> Iterator[Found]:
+    """Each place that has the channels of ``layer``, once."""
+    seen = set()
+    for group in groups:
+        channels = _complete(layer, group)
+        if channels and (group.part, channels) not in seen:
+            seen.add((group.part, channels))
+            yield Found(group.part, channels, group.name)
+
+
+def _features(groups: list[_Group]) -> set[tuple[int, tuple[str, ...]]]:
+    """The places of colours that are known by name as another layer than the primal."""
+    others = [alias for alias in ALIASES if alias.layer not in ("primal", "alpha")]
+    named = [group for group in groups if any(_named(group, alias) for alias in others)]
+    return {found[:2] for found in _distinct(LAYERS["primal"], named)}
+
+
+def _lone(groups: list[_Group]) -> Found | None:
+    """The only layer of colour that could be the primal, whatever its name."""
+    features = _features(groups)
+    words = (*NO_LIGHT, *(look for looks in LOOKS.values() for look in looks))
+    tails = [(group, plain(group.name.rpartition(".")[2])) for group in groups if group.name]
+    light = [g for g, tail in tails if not tail.endswith(NOISE) and not any(word in tail for word in words)]
+    found = [found for found in _distinct(LAYERS["primal"], light) if found[:2] not in features]
+    return found[0] if len(found) == 1 else None
+
+
+def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
+    """Where the primal is; rivals are told by the names of primals, and by that of this one."""
+    name = origin or primal.name
+    prefix, _, tail = name.rpartition(".")
+    tails = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"primal"} | {tail}
+    light = [group for group in groups if group.name.rpartition(".")[2] in tails and "." in group.name]
+    others = {found.name.rpartition(".")[0] for found in _distinct(LAYERS["primal"], light)} - {prefix}
+    return _Home(primal.part, prefix, frozenset(others) if prefix else frozenset())
+
+
+def _channels(layer: Layer, group: _Group, only: tuple[str, ...], path: str) -> tuple[str, ...]:
+    """Returns the channels of ``group`` in canonical order, or () if it has none of those that ``layer`` needs.
+
+    With ``only``, it has all of these or is another layer.
+    """
+    if only:
+        there = all(suffix in group.channels for suffix in only)
+        return tuple(group.channels[suffix] for suffix in only[: len(layer.channels)]) if there else ()
+    for spelling in _SPELLINGS[layer.channels]:
+        held = [[group.channels[suffix] for suffix in names if suffix in group.channels] for names in spelling]
+        if not any(held):
+            continue
+        name = group.name or "root"
+        missing = [names[0] for names, channels in zip(spelling, held, strict=True) if not channels]
+        if missing:
+            holds = ", ".join(group.channels.values())
+            raise NgptError(
+                f"{path}: layer '{layer.name}' is incomplete: '{name}' lacks channel {', '.join(missing)} "
+                f"(it holds {holds}); write all of {' '.join(layer.channels)}"
+            )
+        twice = next((channels for channels in held if len(channels) > 1), None)
+        if twice:
+            raise NgptError(
+                f"{path}: layer '{layer.name}' has one channel twice, {' and '.join(twice)}; remove or rename one"
+            )
+        return tuple(channels[0] for channels in held)
+    return ()
+
+
+def _complete(layer: Layer, group: _Group) -> tuple[str, ...]:
+    """``_channels``, or () where they are incomplete or one is there twice."""
+    try:
+        return _channels(layer, group, (), "")
+    except NgptError:
+        return ()
+
+
+def _no_primal(groups: list[_Group], path: str) -> NgptError:
+    root: set[str] = set().union(*(group.channels for group in groups if group.name == ""))
+    if "Y" in root and not root & set(RGB):
+        held = "luminance and chroma (channels Y RY BY)" if {"RY", "BY"} <= root else "luminance (channel Y)"
+        return NgptError(f"{path}: holds {held} but no colours R G B; save the image with channels R G B")
+    return NgptError(
+        f"{path}: no primal image (root R G B, or a layer such as primal, Noisy Image or Combined); "
+        f'the file holds {_listing(groups)}; name it with --layer primal="NAME"'
+    )
+
+
+def layers_held(parts: Parts) -> dict[str, str]:
+    """All layers of a file: the name of each, "root" for the root, and its channels' suffixes, "R G B"."""
+    return _held(_group(parts))
+
+
+def _held(groups: list[_Group]) -> dict[str, str]:
+    layers = [group for group in groups if "" not in group.channels]
+    return {group.name or "root": " ".join(sorted(group.channels, key="RGBA".find)) for group in layers}
+
+
+def _listing(groups: list[_Group], limit: int = 24) -> str:
+    """Names the layers of a file and their channel suffixes, at most ``limit`` of them."""
+    layers = _held(groups)
+    names = [f'"{name}" ({channels})' for name, channels in list(layers.items())[:limit]]
+    return ", ".join(names) + (f" and {len(layers) - limit} more" if len(layers) > limit else "")

@@ -1,0 +1,142 @@
+"""Stacks and results as files: what a stack was read from, with its layers brought up to date, and a result in it."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from ngpt.errors import NgptError
+from ngpt.io.layout import holds, is_half, scatter, taken
+from ngpt.io.openexr import ExrImage, ExrPart
+from ngpt.io.resolution import Found, Resolution, layers_of_light
+from ngpt.io.views import View
+from ngpt.layers import LAYERS
+from ngpt.stack import GradientStack
+from ngpt.system.threads import map_parts
+
+# Attributes that describe how a part is stored, rather than what it shows; a stack's attributes are all others.
+STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
+    "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
+}  # fmt: skip
+# Attributes that say what made a result; those of the stack are others, and stay.
+MADE_BY = (
+    "ngpt:method",
+    "ngpt:weights",
+    "ngpt:options",
+    "ngpt:estimated",
+    "ngpt:reconstructSeconds",
+    "ngpt:temporal",
+    "ngpt:history",
+    "ngpt:historyWeights",
+    "ngpt:pass",
+)
+# A primal with this in its name says itself that it is noisy: nobody takes it for the image.
+_NOISY = "noisy"
+
+
+def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> tuple[ExrImage, Resolution, int]:
+    """Returns the stack as a file, where the layers are in it, and the index of the part that has the attributes.
+
+    ``base``: the file as it is by now, where other views of it have results already.
+    """
+    if stack.source is None:
+        stack.require("primal", why=f"writing {path}")
+        image, resolution, main = ExrImage([ExrPart("", new_header(stack), {})]), {}, 0
+    else:
+        parts = (base or stack.source.image).parts
+        image = ExrImage([replace(part, channels=dict(part.channels)) for part in parts])
+        resolution = dict(stack.source.resolution)
+        main = resolution["primal"].part
+        size = next(iter(image.parts[main].channels.values())).shape
+        if (stack.height, stack.width) != size:
+            raise NgptError(
+                f"{path}: the stack is {stack.width}x{stack.height} but {stack.path}, which it was read from, is "
+                f"{size[1]}x{size[0]}; make a new stack of its layers with GradientStack.from_arrays"
+            )
+    header = {name: value for name, value in image.parts[main].header.items() if name in STRUCTURE}
+    image.parts[main] = replace(image.parts[main], header={**header, **stack.attributes})
+    known = [name for name in stack.names if name in resolution]
+
+    def is_there(name: str) -> bool:
+        found = resolution[name]
+        return holds(image.parts[found.part], found.channels, stack[name], found.factors)
+
+    unchanged = dict(zip(known, map_parts(is_there, known), strict=True))
+    for name in stack.names:
+        values, half = stack[name], False
+        if unchanged.get(name):
+            continue
+        # Channels in another renderer's units stay as they are, and ours go beside them.
+        if name in resolution and not resolution[name].factors:
+            part, names = image.parts[resolution[name].part], resolution[name].channels
+            half = is_half(part, names) and not LAYERS[name].float_on_disk
+        else:
+            prefix = "" if name in ("primal", "alpha") else f"{name}."
+            part, names = image.parts[main], tuple(prefix + suffix for suffix in LAYERS[name].channels)
+            if stack.source is not None:
+                names = tuple(stack.source.view.channel(main, channel) for channel in names)
+            resolution[name] = Found(main, names, name)
+        scatter(part, names, values, half)
+    return image, resolution, main
+
+
+def new_header(stack: GradientStack) -> dict[str, Any]:
+    """Of the part that a stack is written to which comes from no file."""
+    windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
+    return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
+
+
+def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
+    """Removes the layer ``error`` that came with the file of a stack: it is that of an earlier result."""
+    place = stack.source.resolution.get("error") if stack.source else None
+    if place and "error" in stack and holds(stack.source.image.parts[place.part], place.channels, stack["error"]):
+        for channel in place.channels:
+            image.parts[place.part].channels.pop(channel, None)
+
+
+def with_result(
+    image: ExrImage, resolution: Resolution, view: View, pixels: np.ndarray, origin: str = ""
+) -> tuple[ExrImage, int]:
+    """Returns the file with ``pixels`` (H, W, 3) float32 as the root of a view's first part, the input as primal.R/G/B.
+
+    They also replace the layer that the input came from, whose name goes into the header as ``ngpt:pass``: who loads
+    that layer wants the image too. ``origin`` is its name where the input was moved before. The second value is the
+    index of the part with the result.
+    """
+    primal, alpha = resolution["primal"], resolution.get("alpha")
+    source, parts, place = image.parts[primal.part], list(image.parts), view.first
+    root, kept = (tuple(view.channel(place, start + c) for c in "RGB") for start in ("", "primal."))
+    half = is_half(source, primal.channels)
+    moved = primal.part == place and primal.channels == kept
+    if moved:
+        shown = layers_of_light(view.parts, resolution).get(origin) if origin else None
+    else:
+        shown = primal if _NOISY not in primal.name.lower() and primal.channels != root else None
+    values = [source.channels[name] for name in primal.channels]
+    if primal.factors:
+        values, half = list(np.moveaxis(taken(image, primal), -1, 0)), False
+    shows_another = primal.channels not in (root, kept) and any(name in source.channels for name in root)
+    if primal.part != place or shows_another:
+        parts = [part if part.name else replace(part, name="source") for part in parts]
+        name = f"ngpt {view.name}".strip()
+        while any(part.name == name for part in parts):
+            name += " result"
+        header = {key: value for key, value in source.header.items() if key not in ("channels", "lineOrder", "tiles")}
+        header |= {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, "name": name}
+        if view.name:
+            header = {key: value for key, value in header.items() if key != "multiView"} | {"view": view.name}
+        root, kept = ("R", "G", "B"), ("primal.R", "primal.G", "primal.B")
+        # At the end the numbers of the other views' parts stay what they are.
+        place = 0 if place == 0 else len(parts)
+        parts.insert(place, ExrPart(name, header, {}))
+    channels = parts[place].channels
+    channels.update(zip(kept, values, strict=True))
+    if alpha:
+        channels.setdefault(root[0][:-1] + "A", image.parts[alpha.part].channels[alpha.channels[0]])
+    scatter(parts[place], root, pixels, half)
+    if shown and shown.channels != root:
+        part = image.parts[shown.part]
+        scatter(part, shown.channels, pixels, is_half(part, shown.channels))
+        parts[place].header["ngpt:pass"] = shown.name
+    return ExrImage(parts), place

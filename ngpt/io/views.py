@@ -1,0 +1,114 @@
+"""The views of a file: the eyes of a stereo camera, each with layers of its own.
+
+| layout | the right eye's colour | what says so |
+|---|---|---|
+| OpenEXR's, one part | ``right.R``, ``albedo.right.R``; the first may lack its name | the attribute ``multiView`` |
+| OpenEXR's, many parts | ``R`` in a part of its own | that part's attribute ``view`` |
+| others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names alike |
+
+A view's layers go by names without that of the view, ``albedo.R``, so that all are found in one way.
+https://openexr.com/en/latest/MultiViewOpenEXR.html
+"""
+
+import re
+from collections.abc import Sequence
+from typing import NamedTuple
+
+from ngpt.errors import NgptError
+from ngpt.io.resolution import holds_colour
+
+# Views that need no attribute, where names alike hold both.
+_EYES = ("left", "right")
+
+
+class Part(NamedTuple):
+    """The names in a part of a file: its own, its channels', its view's, and the views among its channels."""
+
+    name: str
+    channels: Sequence[str]
+    view: str = ""
+    views: Sequence[str] = ()
+
+
+class View(NamedTuple):
+    """One view: its name, "" in a file without views, and for each part of the file its name and channels.
+
+    Channels are told by their names without that of the view: that name -> the one in the file; none in parts of
+    other views. ``infix`` is what new channels have in their names, "" in the first view and in parts of its own.
+    """
+
+    name: str
+    parts: list[tuple[str, dict[str, str]]]
+    infix: str = ""
+
+    @property
+    def first(self) -> int:
+        """The first part with channels of this view."""
+        return next(index for index, (_, channels) in enumerate(self.parts) if channels)
+
+    def without(self, name: str) -> str:
+        """A layer's name, or names of channels, without the name of this view: "right.albedo" is its "albedo"."""
+        word = re.escape(self.name)
+        return re.sub(rf"\b{word}\.|\.{word}\b", "", name) if self.name else name
+
+    def channel(self, part: int, name: str) -> str:
+        """What a channel of this view is called in a part of the file, whether it is there or not."""
+        known = self.parts[part][1] if part < len(self.parts) else {}
+        layer, dot, suffix = name.rpartition(".")
+        inserted = ".".join([*([layer] if dot else []), self.infix, suffix]) if self.infix else name
+        return known.get(name, inserted)
+
+
+def views_of(parts: Sequence[Part]) -> list[View]:
+    """The views of a file in order, those that hold colour; one of no name where there are none."""
+    names = list(dict.fromkeys([*(view for part in parts for view in part.views), *(p.view for p in parts if p.view)]))
+    names = names or _eyes(parts)
+    plain = View("", [(part.name, {channel: channel for channel in part.channels}) for part in parts])
+    if len(names) < 2:
+        return [plain]
+    views = [View(name, [_of_view(part, name, names) for part in parts], _infix(parts, name, names)) for name in names]
+    return [view for view in views if holds_colour(view.parts)] or [plain]
+
+
+def choose_views(views: Sequence[View], wanted: str | None, path: str) -> list[View]:
+    """The view of that name, or all; raises NgptError where there is none."""
+    if wanted is None:
+        return list(views)
+    if found := [view for view in views if view.name == wanted]:
+        return found
+    names = ", ".join(view.name for view in views)
+    raise NgptError(
+        f"{path}: has no view '{wanted}'; " + (f"it has {names}" if names else "it has one view of no name")
+    )
+
+
+def _eyes(parts: Sequence[Part]) -> list[str]:
+    """Left and right, where each has a part or a channel that the other has too."""
+    left, right = _EYES
+    if {left, right} <= {part.name for part in parts}:
+        return list(_EYES)
+    words = [tuple(channel.split(".")) for part in parts for channel in part.channels]
+    twins = {tuple(right if word == left else word for word in name) for name in words if left in name[:-1]}
+    return list(_EYES) if twins & set(words) else []
+
+
+def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
+    """The name of a part without that of the view, and the channels that belong to it."""
+    own = part.view or (part.name if part.name in names else "")
+    bare = re.sub(rf"(^|[-._ ]){re.escape(view)}$|^{re.escape(view)}[-._ ]", "", part.name)
+    if own:
+        return bare, {channel: channel for channel in part.channels} if own == view else {}
+    found: dict[str, str] = {}
+    for channel in part.channels:
+        words = channel.split(".")
+        place = next((i for i in reversed(range(len(words) - 1)) if words[i] in names), None)
+        if (words[place] if place is not None else names[0]) == view:
+            name = ".".join(word for i, word in enumerate(words) if i != place)
+            # Of two with one name the one that names its view is the view's.
+            found[name] = channel if place is not None else found.get(name, channel)
+    return bare, found
+
+
+def _infix(parts: Sequence[Part], view: str, names: Sequence[str]) -> str:
+    own = any(view in (part.view, part.name) for part in parts)
+    return "" if own or view == names[0] else view

@@ -1,0 +1,167 @@
+"""Where images lie: the rectangle of their pixels, in the rectangle of the whole picture.
+
+OpenEXR calls them data window and display window. Pixels of two images belong together where their windows say so, not
+where their arrays have the same index.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+
+MOST = 2**28  # pixels of a picture that is filled up: 16384 x 16384
+
+
+@dataclass(frozen=True)
+class Window:
+    """A rectangle of pixels, x to the right and y down: the first is (left, top), which may be negative."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+
+    @classmethod
+    def of_box(cls, box: Any) -> Window:
+        """Of the first and the last pixel, as OpenEXR has it: ((left, top), (right, bottom))."""
+        (left, top), (right, bottom) = ((int(n) for n in corner) for corner in box)
+        return cls(left, top, right - left + 1, bottom - top + 1)
+
+    @property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """The inverse of ``of_box``."""
+        last = [self.left + self.width - 1, self.top + self.height - 1]
+        return np.array([self.left, self.top], np.int32), np.array(last, np.int32)
+
+    @property
+    def corner(self) -> tuple[int, int]:
+        return self.left, self.top
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """(width, height)."""
+        return self.width, self.height
+
+    def __str__(self) -> str:
+        return f"{self.width}x{self.height} at ({self.left}, {self.top})"
+
+    def common(self, other: Window) -> Window | None:
+        """The pixels of both; None where they have none in common."""
+        left, top = max(self.left, other.left), max(self.top, other.top)
+        width = min(self.left + self.width, other.left + other.width) - left
+        height = min(self.top + self.height, other.top + other.height) - top
+        return Window(left, top, width, height) if width > 0 and height > 0 else None
+
+    def around(self, other: Window) -> Window:
+        """The smallest rectangle that holds both."""
+        left, top = min(self.left, other.left), min(self.top, other.top)
+        right = max(self.left + self.width, other.left + other.width)
+        bottom = max(self.top + self.height, other.top + other.height)
+        return Window(left, top, right - left, bottom - top)
+
+    def within(self, other: Window) -> tuple[slice, slice]:
+        """Rows and columns of these pixels in an image of those of ``other``, which holds them all."""
+        x, y = self.left - other.left, self.top - other.top
+        return slice(y, y + self.height), slice(x, x + self.width)
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where an image lies: ``data`` is the rectangle of its pixels, ``display`` the one of the whole picture.
+
+    ``data`` may be a part of the picture, reach beyond it (overscan), or both.
+    """
+
+    data: Window
+    display: Window
+
+    @classmethod
+    def whole(cls, width: int, height: int) -> Place:
+        """Of an image of which nothing but its size is known."""
+        return cls(window := Window(0, 0, width, height), window)
+
+    @property
+    def known(self) -> bool:
+        """Whether it says more than a size."""
+        return self != Place.whole(*self.data.size)
+
+    def __str__(self) -> str:
+        if not self.known:
+            return "x".join(map(str, self.data.size))
+        return f"{self.data} of {self.display if any(self.display.corner) else Place.whole(*self.display.size)}"
+
+    def seen_from(self, other: Place) -> Window | None:
+        """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.
+
+        An image of which nothing but its size is known lies where one of that size does: many programs lose the place
+        of what they cut. Other pictures lie side by side, but for two of different sizes with one corner: those are
+        pictures of different resolution.
+        """
+        if self.display != other.display:
+            if self.data.size == other.data.size and not (self.known and other.known):
+                return other.data
+            if self.display.corner == other.display.corner:
+                return None
+        return self.data
+
+    def shift_in(self, other: Place) -> tuple[int, int] | None:
+        """The column and row of an image at ``other`` where the first pixel of this one is; as ``seen_from``."""
+        window = self.seen_from(other)
+        return None if window is None else (window.left - other.data.left, window.top - other.data.top)
+
+
+@dataclass(frozen=True)
+class Overlap:
+    """Images upon each other: the ``windows`` of all, in the coordinates of the first, and the ``common`` pixels."""
+
+    windows: list[Window]
+    common: Window
+
+    @property
+    def line(self) -> str:
+        """Says what is compared, where that is not the whole of each image; else ""."""
+        if all(window == self.common for window in self.windows):
+            return ""
+        return f"compared are the pixels that all images have: {self.common}"
+
+    def of(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Of each image (H, W, C) the common pixels."""
+        return [image[self.common.within(window)] for image, window in zip(images, self.windows, strict=True)]
+
+
+def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
+    """Raises NgptError for images that have no pixel in common, and for pictures of different sizes."""
+    windows, common = [], places[0].data
+    for name, place in zip(names, places, strict=True):
+        window = place.seen_from(places[0])
+        if window is None:
+            raise NgptError(f"{name} is {place} but {names[0]} is {places[0]}; render or crop them to one size")
+        windows.append(window)
+        if (both := common.common(window)) is None:
+            each = ", ".join(f"{name} is {place}" for name, place in zip(names, places, strict=True))
+            raise NgptError(f"{each}; these have no pixel in common: give images of one place")
+        common = both
+    return Overlap(windows, common)
+
+
+def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
+    """An image (H, W, C) of the pixels of ``window``, cut to those of ``canvas``, and filled up to them.
+
+    Raises NgptError for a canvas that is out of all proportion, as a header may ask for with a few bytes.
+    """
+    if window == canvas:
+        return image
+    if canvas.width * canvas.height > MOST:
+        raise NgptError(
+            f"a picture of {canvas.width}x{canvas.height} pixels is to be filled, of which a file has {window}; "
+            f"{MOST >> 20} million are shown at most: set its display window"
+        )
+    filled = np.full((canvas.height, canvas.width, *image.shape[2:]), outside, image.dtype)
+    if common := window.common(canvas):
+        filled[common.within(canvas)] = image[common.within(window)]
+    return filled

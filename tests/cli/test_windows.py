@@ -1,0 +1,167 @@
+"""Files whose pixels are a part of a picture, or reach beyond it: they are compared and shown where they lie."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from shots import SIZE, frame_of, part_of, view
+
+import ngpt
+from ngpt.cli import main
+from ngpt.io.exr import read_picture
+from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
+
+HEIGHT, WIDTH = SIZE
+WHOLE = Window(0, 0, WIDTH, HEIGHT)
+
+
+@pytest.fixture
+def stack(rng):
+    return frame_of(*view(), rng, **{"ngpt:spp": 4, "ngpt:seed": "1", "ngpt:sampler": "gpt"})
+
+
+def written(path, stack, *window, **at):
+    """The file of a part of a stack; ``at`` replaces windows of its place."""
+    part = part_of(stack, *window) if window else stack
+    if at:
+        place = {"data": part.place.data, "display": part.place.display} | at
+        part = GradientStack(part.layers, part.attributes, place=Place(**place))
+    return str(ngpt.write(path, part, overwrite=True))
+
+
+def pixels(path):
+    from PIL import Image
+
+    return np.asarray(Image.open(path))
+
+
+def test_a_place_survives_files_and_results(stack, tmp_path):
+    path = written(tmp_path / "part.exr", stack, 16, 8, 24, 20)
+    part = ngpt.read(path)
+    assert part.place == Place(Window(16, 8, 24, 20), WHOLE) == read_picture(path).place
+    for other in (part.replace(alpha=np.ones((20, 24))), part):
+        assert ngpt.read(ngpt.write(tmp_path / "again.exr", other, overwrite=True)).place == part.place
+    assert main(["denoise", path, "-o", str(tmp_path / "result.exr"), "-m", "primal"]) == 0
+    assert ngpt.read(tmp_path / "result.exr").place == part.place
+    # Cut without being told where: nothing is known of its place.
+    assert GradientStack({"primal": part["primal"][:5]}, place=part.place).place == Place.whole(24, 5)
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "common"),
+    [
+        ((0, 0, 40, 30), (16, 8, 40, 30), "24x22 at (16, 8)"),
+        ((0, 0, WIDTH, HEIGHT), (16, 8, 24, 20), "24x20 at (16, 8)"),
+        ((3, 5, 30, 30), (3, 5, 30, 30), ""),
+    ],
+)
+def test_diff_compares_where_both_have_pixels(one, other, common, stack, tmp_path, capfd):
+    files = [written(tmp_path / name, stack, *window) for name, window in (("a.exr", one), ("b.exr", other))]
+    assert main(["diff", *files, "--json"]) == 0
+    out, err = capfd.readouterr()
+    assert json.loads(out)["metrics"]["max |x - r|"] == 0
+    assert err.strip() == (f"compared are the pixels that all images have: {common}" if common else "")
+
+
+def test_what_has_no_place_in_common_is_refused(stack, tmp_path, capfd):
+    left, right = (written(tmp_path / f"{x}.exr", stack, x, 0, 20, 30) for x in (0, 30))
+    small = written(tmp_path / "small.exr", GradientStack({"primal": stack["primal"][::2, ::2]}))
+    for command in (["diff"], ["report", "-o", str(tmp_path / "page.html")]):
+        assert main([*command, left, right]) == 1
+        assert (
+            f"20x30 at (0, 0) of {WIDTH}x{HEIGHT}, {right} is 20x30 at (30, 0) of {WIDTH}x{HEIGHT}"
+            in capfd.readouterr().err
+        )
+        assert main([*command, left, small]) == 1
+        assert f"{small} is 28x20 but {left} is 20x30 at (0, 0) of {WIDTH}x{HEIGHT}" in capfd.readouterr().err
+    assert main(["denoise", left, "-m", "primal", "--ref", right]) == 1
+    assert "these have no pixel in common" in capfd.readouterr().err
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_file_that_lost_its_place_lies_where_one_of_its_size_does(stack, tmp_path, capfd):
+    """As programs write it that know no windows: Mitsuba's crops, PNG."""
+    part = written(tmp_path / "part.exr", stack, 16, 8, 24, 20)
+    lost = written(tmp_path / "lost.exr", GradientStack({"primal": ngpt.read_image(part)}))
+    for pair in ([part, lost], [lost, part]):
+        assert main(["diff", *pair]) == 0 and not capfd.readouterr().err
+
+
+def test_errors_of_results_are_those_of_the_place(stack, tmp_path, capfd):
+    clean = frame_of(*view(), np.random.default_rng(0), sigma=0)
+    reference = written(tmp_path / "ref.exr", clean, 10, 4, 40, 30)
+    parts = [written(tmp_path / f"{x}.exr", stack, x, 8, 24, 20) for x in (12, 0)]
+    (tmp_path / "out").mkdir()
+    command = ["denoise", *parts, "-o", str(tmp_path / "out"), "-m", "primal", "--ref", reference, "--json"]
+    assert main(command) == 0
+    out, err = capfd.readouterr()
+    inside, partly = json.loads(out)["files"]
+    truth = clean["primal"]
+    for report, window in ((inside, Window(12, 8, 24, 20)), (partly, Window(10, 8, 14, 20))):
+        there = window.within(WHOLE)
+        expected = np.mean(np.square(stack["primal"][there] - truth[there]))
+        assert report["metrics"]["MSE"] == pytest.approx(expected, rel=1e-5)
+        assert report["compared"] == str(window) and f"of the pixels that both have: {window}" in err
+
+
+def test_a_report_shows_what_all_have(stack, tmp_path, capfd):
+    paths = [written(tmp_path / f"{x}.exr", stack, x, 0, 30, 30) for x in (0, 10, 14)]
+    assert main(["report", *paths, "-o", str(tmp_path / "page.html"), "--ref", written(tmp_path / "r.exr", stack)]) == 0
+    assert "compared are the pixels that all images have: 16x30 at (14, 0)" in capfd.readouterr().err
+    assert "16x30" in (tmp_path / "page.html").read_text()
+
+
+def test_a_report_of_a_shot_shows_display_windows(stack, tmp_path, capfd):
+    """The subject rests and is cut in another way in each frame: nothing changes, and nothing is wrong."""
+    shot, refs = tmp_path / "shot", tmp_path / "refs"
+    for folder in (shot, refs):
+        folder.mkdir()
+    for i in range(3):
+        written(shot / f"f.{i}.exr", stack, 3 * i, i, 30 + i, 30)
+        written(refs / f"f.{i}.exr", stack)
+    page = tmp_path / "page.html"
+    assert main(["report", str(shot), "--ref", str(refs), "-o", str(page)]) == 0
+    out, err = capfd.readouterr()
+    assert "3 of 3 frames: compared are the pixels that all images have" in err
+    assert re.search(r"shot +0 +0 ", out) and out.split()[-1] == "0" and f"{WIDTH}x{HEIGHT}" in page.read_text()
+
+
+def test_pictures_leave_overscan_out(stack, tmp_path):
+    inner = Window(8, 6, 30, 20)
+    over = written(tmp_path / "over.exr", stack, display=inner)
+    crop = written(tmp_path / "crop.exr", stack, 8, 6, 30, 20)
+    for name in ("over", "crop"):
+        assert main(["picture", str(tmp_path / f"{name}.exr"), "-o", str(tmp_path / f"{name}.png")]) == 0
+    assert main(["denoise", over, "-m", "primal", "-o", str(tmp_path / "denoised.png")]) == 0
+    seen = [pixels(tmp_path / f"{name}.png") for name in ("over", "crop", "denoised")]
+    assert all(np.array_equal(image, seen[0]) for image in seen) and seen[0].shape == (20, 30, 3)
+    assert main(["denoise", crop, "-m", "primal", "-o", str(tmp_path / "crop2.png")]) == 0
+
+
+def test_a_display_window_out_of_all_proportion_fills_no_memory(stack, tmp_path, capfd):
+    (tmp_path / "shot").mkdir()
+    written(tmp_path / "shot" / "a.exr", stack, display=Window(0, 0, 2**29, 2**29))
+    for command in (["picture", "-o", str(tmp_path / "f.webp")], ["report", "-o", str(tmp_path / "page.html")]):
+        assert main([*command, str(tmp_path / "shot")]) == 1
+        assert "536870912x536870912 pixels is to be filled" in capfd.readouterr().err
+    assert main(["picture", str(tmp_path / "shot" / "a.exr"), "-o", str(tmp_path / "a.png")]) == 0
+
+
+@pytest.mark.parametrize("target", ["film.webp", "frames"])
+def test_films_show_display_windows(target, stack, tmp_path):
+    shot = tmp_path / "shot"
+    shot.mkdir()
+    for i, window in enumerate([(0, 0, WIDTH, HEIGHT), (4, 2, 30, 20), (20, 10, 36, 30)]):
+        written(shot / f"f.{i}.exr", stack, *window)
+    assert main(["picture", str(shot), "-o", str(tmp_path / target)]) == 0
+    if target == "film.webp":
+        from PIL import Image, ImageSequence
+
+        frames = [np.asarray(frame.convert("RGB")) for frame in ImageSequence.Iterator(Image.open(tmp_path / target))]
+    else:
+        frames = [pixels(path) for path in sorted((tmp_path / target).iterdir())]
+    assert all(frame.shape == (HEIGHT, WIDTH, 3) for frame in frames) and len(frames) == 3
+    there = Window(4, 2, 30, 20).within(WHOLE)
+    assert np.array_equal(frames[1][there], frames[0][there]) and not frames[1][:2].any()
