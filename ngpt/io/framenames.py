@@ -28,7 +28,9 @@ def frames_named(name: str) -> dict[int, Path]:
     pieces, form, end = [], "", 0
     for field in _FIELD.finditer(name):
         pieces.append(name[end : field.start()])
-        form += re.escape(pieces[-1]) + rf"(-?\d{{{max(_digits(field), 1)},}})"
+        least = max(_digits(field), 1)
+        # printf and Python count a minus as a digit.
+        form += re.escape(pieces[-1]) + rf"(-\d{{{max(least - 1, 1)},}}|\d{{{least},}})"
         end = field.end()
     pieces.append(name[end:])
     form += re.escape(pieces[-1])

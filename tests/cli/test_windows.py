@@ -2,14 +2,18 @@
 
 import json
 import re
+from pathlib import Path
 
 import numpy as np
 import pytest
+from exr_files import write_raw
 from shots import SIZE, frame_of, part_of, view
 
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import read_picture
+from ngpt.io.foreign.pfm import write_pfm
+from ngpt.io.frames import shot_files
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
@@ -165,3 +169,38 @@ def test_films_show_display_windows(target, stack, tmp_path):
     assert all(frame.shape == (HEIGHT, WIDTH, 3) for frame in frames) and len(frames) == 3
     there = Window(4, 2, 30, 20).within(WHOLE)
     assert np.array_equal(frames[1][there], frames[0][there]) and not frames[1][:2].any()
+
+
+def test_views_windows_other_formats_and_names_of_frames_go_together(stack, tmp_path, monkeypatch, capfd):
+    monkeypatch.chdir(tmp_path)
+    noisy, image = stack["primal"], np.ones((4, 6), np.float32)
+    write_raw("eyes.exr", ({f"{eye}.{c}": image * (eye == "right") for eye in ("left", "right") for c in "RGB"},))
+    for frame in (-2, -1, 0, 1, 2, 10):
+        written(f"a.{frame:03d}.exr", stack, *((4, 2, 30, 20) if frame == 1 else ()))
+        write_pfm(Path(f"b.{frame}.pfm"), noisy * 2, True)
+    cropped, left_taken = "30x20 at (4, 2)", "eyes.exr: of the views left, right, left is taken"
+    for words, status, said in (
+        (
+            "denoise eyes.exr -m primal -o eye.pfm",
+            1,
+            "has several views, and eye.pfm is of one; choose one, as in --view left",
+        ),
+        ("denoise eyes.exr -m primal -o eye.pfm --view right", 0, "eye.pfm: primal"),
+        ("denoise a.%03d.exr -m primal -o new/c.$F3.exr", 0, "new/c.-02.exr"),
+        ("report new/c.%03d.exr b.%d.pfm", 0, "1 of 6 frames: compared are the pixels that all images have"),
+        (
+            "denoise a.001.exr --ref b.1.pfm -m primal",
+            0,
+            f"relMSE trimmed 0.24975 of the pixels that both have: {cropped}",
+        ),
+        ("diff a.001.exr b.1.pfm", 1, f"compared are the pixels that all images have: {cropped}"),
+        ("picture new/c.%03d.exr -o film/", 0, "without 3 to 9"),
+        ("report eyes.exr -o eyes.html", 0, left_taken),
+        ("picture eyes.exr -o eye.png --view right", 0, "6x4"),
+    ):
+        assert main(words.split()) == status, words
+        told = capfd.readouterr().err
+        assert told.count(said) == 1 and told.count(left_taken) == (said == left_taken)
+    assert read_picture("eye.pfm").pixels.all() and pixels("eye.png").all()
+    assert [path.name for path in shot_files("new/c.%03d.exr")][:3] == ["c.-02.exr", "c.-01.exr", "c.000.exr"]
+    assert len(list(Path("film").iterdir())) == 6
