@@ -141,7 +141,7 @@ def test_wrong_files_end_in_one_line(files, tmp_path):
         "no .tza file, or a damaged one": good[:5],
         "beyond the end": good[:-8] + struct.pack("<Q", 2**40),
         "does not say which image": foreign,
-        "OIDN cannot run them": tza.packed({"enc_conv0.weight": np.zeros((32, 9, 3, 3))}, "wcv"),
+        "OIDN cannot run on device": tza.packed({"enc_conv0.weight": np.zeros((32, 9, 3, 3))}, "wcv"),
     }
     for message, data in wrong.items():
         (tmp_path / "wrong.tza").write_bytes(data)

@@ -1,0 +1,60 @@
+"""Threads and forks: what a process keeps for all its threads, and what a forked child must not inherit.
+
+A forked child has the memory of its parent and none of its threads. A pool of threads that it inherits never answers,
+and even to destroy it may take for ever. So what owns threads is dropped before a fork, and whoever needs it next, in
+parent or child, makes its own.
+"""
+
+import os
+import sys
+from collections.abc import Callable
+from functools import cache, lru_cache, wraps
+from threading import Lock
+from typing import ParamSpec, TypeVar
+
+Given = ParamSpec("Given")
+Made = TypeVar("Made")
+
+
+def hold_while_forking(lock: Lock, drop: Callable[[], object] = lambda: None) -> None:
+    """No fork happens while another thread holds ``lock``; ``drop`` is called under it before each fork.
+
+    The thread that forks must not hold the lock itself.
+    """
+
+    def before() -> None:
+        lock.acquire()
+        drop()
+
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(before=before, after_in_parent=lock.release, after_in_child=lock.release)
+
+
+def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, Made]]:
+    """A decorator: keeps the ``most`` last results, as ``lru_cache`` does, for results that own threads.
+
+    Threads that ask for the same result at the same time get the same object. Before a fork all results are dropped.
+    """
+
+    def decorate(make: Callable[Given, Made]) -> Callable[Given, Made]:
+        lock, cached = Lock(), lru_cache(most)(make)
+
+        @wraps(make)
+        def kept(*args: Given.args, **kwargs: Given.kwargs) -> Made:
+            with lock:
+                return cached(*args, **kwargs)
+
+        hold_while_forking(lock, cached.cache_clear)
+        return kept
+
+    return decorate
+
+
+@cache
+def one_torch_thread_in_children() -> None:
+    """Forked children run PyTorch on one thread, as those of its ``DataLoader`` do.
+
+    Its pool of threads cannot be dropped: a child would wait for the threads of its parent for ever.
+    """
+    if hasattr(os, "register_at_fork"):
+        os.register_at_fork(after_in_child=lambda: sys.modules["torch"].set_num_threads(1))
