@@ -81,7 +81,7 @@ class Network:
 
     @property
     def session(self) -> Any:
-        """ONNX Runtime's, which all networks of the file share; no network holds it, since it does not outlive a fork."""
+        """ONNX Runtime's, shared by all networks of the file. No network holds it: it does not outlive a fork."""
         return session(self.path, self.device, self.threads)
 
     def _check(self) -> None:

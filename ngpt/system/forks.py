@@ -6,7 +6,6 @@ parent or child, makes its own.
 """
 
 import os
-import sys
 from collections.abc import Callable
 from functools import cache, lru_cache, wraps
 from threading import Lock
@@ -51,10 +50,10 @@ def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, M
 
 
 @cache
-def one_torch_thread_in_children() -> None:
-    """Forked children run PyTorch on one thread, as those of its ``DataLoader`` do.
+def in_children(call: Callable[[], object]) -> None:
+    """``call`` is called in every forked child from now on, in the thread that forked; once, however often it is given.
 
-    Its pool of threads cannot be dropped: a child would wait for the threads of its parent for ever.
+    For pools that cannot be dropped, as those of OpenMP: with one thread a child needs none of them.
     """
     if hasattr(os, "register_at_fork"):
-        os.register_at_fork(after_in_child=lambda: sys.modules["torch"].set_num_threads(1))
+        os.register_at_fork(after_in_child=call)
