@@ -47,7 +47,7 @@ class Method:
     run: Callable[..., np.ndarray]
     options: dict[str, Option]
     standing: str = "niche"
-    missing: Callable[[], str] = lambda: ""
+    missing: Callable[[], str] = str
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
@@ -111,7 +111,7 @@ def _network(
     summary: str,
     needs: tuple[str, ...],
     standing: str = "use",
-    also_missing: Callable[[], str] = lambda: "",
+    also_missing: Callable[[], str] = str,
     estimates: tuple[str, ...] = (),
 ) -> Method:
     network = Shipped(name, also_missing)

@@ -28,6 +28,7 @@ import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
+from ngpt.io import openexr_copies
 from ngpt.io.header import PartHeader, read_headers
 from ngpt.system.files import atomic_output
 from ngpt.system.forks import hold_while_forking
@@ -64,6 +65,7 @@ hold_while_forking(_one_at_a_time)
 # MiB of address space that a thread may reserve, for its stack and its share of the heap.
 _THREAD = 256
 _FLOAT_MAX = float(np.finfo(np.float32).max)
+openexr_copies.register()
 
 
 @dataclass(frozen=True)
