@@ -274,7 +274,8 @@ def _stack(
     where: str, image: np.ndarray, layers: Mapping[str, np.ndarray], method: str, options: Mapping[str, Any]
 ) -> GradientStack:
     """What the method needs; ``where`` begins the messages."""
-    stack = GradientStack({"primal": image[..., :3], **layers}, path=where)
+    alpha = {"alpha": image[..., 3:]} if image.shape[2] > 3 else {}
+    stack = GradientStack({"primal": image[..., :3], **alpha, **layers}, path=where)
     needs = METHODS[method].needs if method in METHODS and not options.get("weights") else ()
     if lacking := [name for name in needs if name not in stack]:
         arguments = ", ".join(f"{name}=..." for name in lacking)
