@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -72,6 +73,18 @@ def test_readers_in_threads_leave_stdout_and_stderr_to_the_program(tmp_path):
     with ThreadPoolExecutor(4) as pool:
         list(pool.map(lambda i: ngpt.read(tmp_path / f"{i % 4}.exr"), range(100)))
     assert (sys.stdout, os.fstat(2).st_ino) == before
+
+
+def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monkeypatch):
+    real, before = os.umask, os.umask(0o027)
+    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.005))[0])
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(12)))
+    finally:
+        after = real(before)
+    assert after == 0o027
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}
 
 
 def in_a_child(work, i=0, seconds=60):
