@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable
 from functools import cache, lru_cache, wraps
 from threading import Lock
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 Given = ParamSpec("Given")
 Made = TypeVar("Made")
@@ -36,7 +36,8 @@ def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, M
     """
 
     def decorate(make: Callable[Given, Made]) -> Callable[Given, Made]:
-        lock, cached = Lock(), lru_cache(most)(make)
+        lock = Lock()
+        cached: Any = lru_cache(most)(make)
 
         @wraps(make)
         def kept(*args: Given.args, **kwargs: Given.kwargs) -> Made:
