@@ -1,6 +1,5 @@
 """Threads and forked children get what one thread gets, from every method and whatever else is kept in a process."""
 
-import multiprocessing
 import os
 import sys
 import time
@@ -9,6 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pytest
 from full_stack import full_stack
+from processes import complete, in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
 from ngpt.denoisers import oidn_filters
@@ -87,25 +87,8 @@ def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monke
     assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}
 
 
-def in_a_child(work, i=0, seconds=60):
-    """What ``work(i)`` returns in a forked child, as bytes; fails where the child takes longer."""
-    ours, theirs = multiprocessing.Pipe(duplex=False)
-    child = multiprocessing.get_context("fork").Process(target=lambda: theirs.send_bytes(work(i).tobytes()))
-    child.start()
-    try:
-        assert ours.poll(seconds), "the child hangs"
-        return ours.recv_bytes()
-    finally:
-        child.kill()
-        child.join()
-
-
-forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
-quiet = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-
-
-@forks
-@quiet
+@needs_forks
+@no_warning_of_forks
 @pytest.mark.parametrize("name", WORK)
 def test_a_child_that_is_forked_after_use_works_as_its_parent_does(name):
     expected = WORK[name](0)
@@ -113,8 +96,8 @@ def test_a_child_that_is_forked_after_use_works_as_its_parent_does(name):
     assert np.array_equal(WORK[name](0), expected)  # and the parent after that
 
 
-@forks
-@quiet
+@needs_forks
+@no_warning_of_forks
 @pytest.mark.parametrize("name", [name for name in ("oidn", "ngpt-fast") if name in USABLE])
 def test_a_child_ends_by_itself(name):
     """By ``sys.exit`` too, where all that is left is destroyed."""
@@ -130,14 +113,12 @@ if os.fork() == 0:
     sys.exit(7)
 print(os.waitstatus_to_exitcode(os.wait()[1]))
 """
-    from processes import complete
-
     result = complete([sys.executable, "-c", code], timeout=60)
     assert result.stdout == "7\n" and result.stderr == ""
 
 
-@forks
-@quiet
+@needs_forks
+@no_warning_of_forks
 def test_a_fork_while_other_threads_work_leaves_a_child_that_works(tmp_path):
     ngpt.write(tmp_path / "s.exr", stack(0))
 
@@ -151,8 +132,8 @@ def test_a_fork_while_other_threads_work_leaves_a_child_that_works(tmp_path):
         assert all(np.array_equal(each.result(), expected) for each in busy)
 
 
-@forks
-@quiet
+@needs_forks
+@no_warning_of_forks
 def test_what_owns_threads_is_made_anew_in_parent_and_child():
     made = until_fork(2)(lambda key: np.array([os.getpid(), key]))
     first = made(1)
