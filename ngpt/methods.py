@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
+from ngpt.coverage import kept_within
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.primaries import converted, inside_rec709
@@ -47,7 +48,7 @@ class Method:
     run: Callable[..., np.ndarray]
     options: dict[str, Option]
     standing: str = "niche"
-    missing: Callable[[], str] = lambda: ""
+    missing: Callable[[], str] = str
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
@@ -111,7 +112,7 @@ def _network(
     summary: str,
     needs: tuple[str, ...],
     standing: str = "use",
-    also_missing: Callable[[], str] = lambda: "",
+    also_missing: Callable[[], str] = str,
     estimates: tuple[str, ...] = (),
 ) -> Method:
     network = Shipped(name, also_missing)
@@ -250,7 +251,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
-    matrix = inside_rec709(stack) if entry.rec709 else None
+    given, matrix = stack, inside_rec709(stack) if entry.rec709 else None
     if matrix is not None:
         light = {name: converted(stack[name], matrix) for name in ("primal", "direct", "caustic") if name in stack}
         stack = stack.replace(**light)
@@ -279,7 +280,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
             f"{enlarged(np.abs(data.image).max(), power):.3g}: scale the stack down, or use another method"
         )
     return Result(
-        np.ascontiguousarray(image, np.float32),
+        np.ascontiguousarray(kept_within(image, given), np.float32),
         weights.method if weights else name,
         seconds,
         data.pixels,

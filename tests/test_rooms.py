@@ -20,7 +20,7 @@ ngpt.report.display ngpt.report.png
 ngpt.report.transforms ngpt.report.pictures
 ngpt.api.tensors ngpt.layers ngpt.windows ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack
-ngpt.renderer ngpt.repair ngpt.magnitude ngpt.io
+ngpt.renderer ngpt.repair ngpt.magnitude ngpt.coverage ngpt.io
 ngpt.merging
 ngpt.classical
 ngpt.denoisers ngpt.sequence.wcv_frames

@@ -9,8 +9,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
+from threading import Lock
 
 from ngpt.errors import NgptError
+from ngpt.system.forks import hold_while_forking
 
 try:
     import fcntl
@@ -20,6 +22,8 @@ except ImportError:  # Windows, where a locked file could not be written by the 
 # Temporary files have names of their own, so that what killed processes leave behind is known for what it is.
 _PREFIX = ".ngpt-"
 _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
+_one_at_a_time = Lock()
+hold_while_forking(_one_at_a_time)
 _FORGOTTEN = 24 * 3600.0  # seconds without a change, after which they are swept where nothing can be locked
 
 
@@ -60,9 +64,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         with open(temporary, "r+b") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
         # mkstemp makes private files; give the result the permissions that open() would have given it.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+        os.chmod(temporary, 0o666 & ~_umask())
         _publish(temporary, path, overwrite)
         _sync_folder(path.parent)
     except OSError as error:
@@ -73,6 +75,14 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
                 temporary.unlink(missing_ok=True)
         if handle is not None:
             os.close(handle)
+
+
+def _umask() -> int:
+    """Of the process. It is known only by setting it: two threads that did so at once would leave it at 0."""
+    with _one_at_a_time:
+        umask = os.umask(0)
+        os.umask(umask)
+    return umask
 
 
 def _temporary(path: Path) -> tuple[Path, int | None]:
