@@ -28,6 +28,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument("--seconds", type=duration, help="time for rendering and reconstruction")
     goal.add_argument("--error", type=duration, metavar="ERROR", help="trimmed relMSE to reach")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
+    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -57,7 +58,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
-    scene = load_scene(args.scene, args.size, dict(args.define))
+    scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
     # Its own time is not part of the time that it advises on.
     seen = explore(scene, max(args.seconds or LONG, LONG), said=console.say)
     if not seen:
@@ -111,5 +112,6 @@ def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
 def of_the_scene(args: argparse.Namespace) -> list[str]:
     """The options of this call that are those of a render too."""
     words = ["--size", "{}x{}".format(*args.size)] if args.size else []
+    words += ["--sensor", args.sensor] if args.sensor is not None else []
     words += ["--variant", args.variant] if args.variant else []
     return words + [word for name, value in args.define for word in ("-D", f"{name}={value}")]
