@@ -51,7 +51,8 @@ def test_options_samples_that_differ_and_what_ends_a_render(renderer):
 SENSORS = """<scene version="3.0.0"><integrator type="path"/>
 <sensor type="perspective" id="wide"><film type="hdrfilm"><integer name="width" value="8"/>
 <integer name="height" value="6"/></film></sensor>
-<sensor type="perspective" id="close"><float name="fov" value="20"/><film type="hdrfilm"><integer name="width" value="6"/>
+<sensor type="perspective" id="close"><float name="fov" value="20"/>
+<film type="hdrfilm"><integer name="width" value="6"/>
 <integer name="height" value="4"/><string name="pixel_format" value="luminance"/></film></sensor>
 <sensor type="batch"><sensor type="perspective"/><sensor type="perspective"/></sensor>
 <shape type="sphere"><point name="center" x="0" y="0" z="3"/><emitter type="area"/></shape></scene>"""
