@@ -7,6 +7,7 @@ Integrators for derivatives (``prb`` and its like) are written in Python. Their 
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -43,7 +44,7 @@ _SAME = {
 # Those that trace no paths from the camera
 _FROM_LAMPS = ("ptracer",)
 # Those that add channels, which a stack has no use for, to the colour of another
-AROUND = ("aov", "moment")
+AROUND = ("aov", "moment", "stokes")
 
 
 def plugin_name(integrator: mi.Integrator) -> str:
@@ -64,7 +65,7 @@ def same_image(plugin: str, hides: bool) -> str:
 
 def followed(integrator: mi.Integrator) -> mi.Integrator:
     """The integrator whose image is rendered in place of this one: one of the same image with the same depths, the one
-    within an ``aov`` or ``moment``, or itself."""
+    within an ``aov``, ``moment`` or ``stokes``, or itself."""
     name = plugin_name(integrator)
     if name in AROUND and len(nested := _nested(integrator)) == 1:
         return followed(nested[0])
@@ -114,17 +115,20 @@ def check_integrator(integrator: mi.Integrator) -> None:
 def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
     """(sampler, ray, medium, active) -> what the integrator itself estimates along camera rays.
 
-    That raises NgptError where an integrator that is written in Python fails.
+    That raises NgptError where the integrator fails.
     """
-    if not isinstance(integrator, mi.CppADIntegrator):
-        return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
-    # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them
-    constant = {"mode": dr.ADMode.Primal, "scene": scene, "δL": None, "δaovs": None, "state_in": None}
+    call = partial(integrator.sample, scene)
+    if isinstance(integrator, mi.CppADIntegrator):
+        # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them
+        constant = {"mode": dr.ADMode.Primal, "scene": scene, "δL": None, "δaovs": None, "state_in": None}
+
+        def call(sampler, ray, medium, active):
+            with dr.suspend_grad():
+                return integrator.sample(sampler=sampler, ray=ray, depth=mi.UInt32(0), active=active, **constant)
 
     def estimate(sampler, ray, medium, active) -> mi.Spectrum:
         try:
-            with dr.suspend_grad():
-                return integrator.sample(sampler=sampler, ray=ray, depth=mi.UInt32(0), active=active, **constant)[0]
+            return call(sampler, ray, medium, active)[0]
         except Exception as error:
             stop_if_interrupted(error)
             why = " ".join(str(error).split())
