@@ -55,7 +55,10 @@ SENSORS = """<scene version="3.0.0"><integrator type="path"/>
 <film type="hdrfilm"><integer name="width" value="6"/>
 <integer name="height" value="4"/><string name="pixel_format" value="luminance"/></film></sensor>
 <sensor type="batch"><sensor type="perspective"/><sensor type="perspective"/></sensor>
-<shape type="sphere"><point name="center" x="0" y="0" z="3"/><emitter type="area"/></shape></scene>"""
+<emitter type="constant"/><shape type="sphere"><point name="center" x="0" y="0" z="3"/><emitter type="area"/></shape>
+<shape type="shapegroup" id="group"><shape type="cube"/></shape><emitter type="point"/>
+<shape type="instance"><ref id="group"/><transform name="to_world"><translate x="1" z="6"/></transform></shape>
+</scene>"""
 
 
 def test_one_of_several_sensors_by_number_or_id(renderer, tmp_path, capsys):
