@@ -69,8 +69,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     # Its own time is not part of the time that it advises on, but no more than that.
     whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_WHOLE), LONG)
     seen = explore(scene, whole, said=console.say)
+    if not seen and whole < LONG:
+        console.say(f"pilot: no trial ended within {SHARE * whole:.0f} s; once more with {SHARE * LONG:.0f} s")
+        seen = explore(scene, LONG, said=console.say)  # with the kernels that are there by now
     if not seen:
-        raise NgptError(f"{args.scene}: no sampler ended its trial within {SHARE * whole:g} s; give a smaller --size")
+        raise NgptError(f"{args.scene}: no sampler ended its trial within {SHARE * LONG:g} s; give a smaller --size")
     found = rows_of(seen, args.seconds, args.error)
     console.say(f"{args.scene}: pilot of {time.perf_counter() - start:.1f} s with compilation")
     if args.json:

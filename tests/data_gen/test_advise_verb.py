@@ -44,7 +44,8 @@ def test_the_least_error_in_a_time(seen, capsys):
     assert (best["sampler"], best["method"], best["adaptive"]) == ("gpt", "wcv", True)
 
 
-def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys, monkeypatch):
+@pytest.mark.parametrize("slow", [False, True])
+def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys, monkeypatch, slow):
     from data_gen.choosing import plans
     from data_gen.choosing.pipelines import Pipeline
 
@@ -52,13 +53,15 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys,
 
     def explore(scene, seconds, **options):
         asked.append(seconds * plans.SHARE_WITH_METHODS)
+        if slow and len(asked) == 1:
+            return []
         return [Pipeline("primal", "primal", 16, 0.02, -1.0, 0.001, 0.0)]
 
     monkeypatch.setattr(plans, "explore", explore)
     for goal in (("--seconds", "1"), ("--seconds", "40"), ("--seconds", "900"), ("--error", "0.01")):
         advice(capsys, *goal)
-    # Kernels take some seconds whatever is to be advised on.
-    assert asked == pytest.approx([18, 40, 60, 60])
+    # Kernels take some seconds whatever is to be advised on; on a machine too busy for them it is tried once more.
+    assert asked == pytest.approx([18, *([60] if slow else []), 40, 60, 60])
 
 
 def test_what_is_expected_comes_with_where_it_may_lie(seen, capsys):
