@@ -4,6 +4,9 @@ from ngpt.cli import CONTINUES, Verb
 
 ROOM = "data_gen.cli"
 
+# What the first pass of a render is at for seconds, where no earlier render of the scene has left them
+KERNELS = "compiling kernels ..."
+
 VERBS = {
     "demo": Verb(
         "render built-in scenes, reconstruct with every method, and write a report to open in a browser", ROOM

@@ -3,6 +3,7 @@
 import argparse
 from pathlib import Path
 
+from data_gen.cli import KERNELS
 from ngpt.cli.arguments import add_config, part
 from ngpt.system import configs
 from ngpt.system.console import Console
@@ -37,7 +38,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     config = read_config(path)
     executor = cluster(args.cluster) if args.cluster else processes(args.workers)
-    with executor as workers, console.progress(str(args.out), "crops") as progress:
+    with executor as workers, console.progress(str(args.out), "crops", begins=KERNELS) as progress:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
     write_card(args.out)
     if args.layout:

@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from data_gen.cli import KERNELS
 from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
@@ -53,12 +54,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
         "too. --time is then that of pilot, render and method",
     )
-    parser.add_argument(
-        "--size",
-        type=size,
-        metavar="WxH",
-        help="pixels of the film, of which a crop window stays the same part (default: the scene's own)",
-    )
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the film (default: the scene's own)")
+    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
     first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
     others = ", ".join(by_standing("niche"))
     parser.add_argument(
@@ -74,7 +71,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=VALUE",
-        help="an option of the sampler; may be repeated. See `ngpt info SAMPLER`",
+        help="of the sampler; may be repeated. See `ngpt info NAME`",
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
@@ -88,9 +85,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="serve a page on 127.0.0.1 that shows the render, noisy and denoised, while it goes on",
     )
-    parser.add_argument(
-        "--view", metavar="HOST:PORT", help="send the same to the viewer tev (its own: 127.0.0.1:14158)"
-    )
+    parser.add_argument("--view", metavar="HOST:PORT", help="send the same to tev (its own: 127.0.0.1:14158)")
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -141,7 +136,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    names = ("spp", "seed", "sampler", "size", "memory", "diagnostics", "variant")
+    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "variant")
     options = dict(args.option)
     check_options(args.sampler, options)  # so that none of them goes by another's name
     given = {name: getattr(args, name) for name in names}
@@ -174,7 +169,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
     looking = onlookers(args.live, args.view, args.scene, args.command, console, unit)
     with (
         closing(looking),
-        console.progress(f"render {args.scene}", unit) as progress,
+        console.progress(f"render {args.scene}", unit, begins=KERNELS) as progress,
         stop_on_ctrl_c(ending) as stop,
     ):
 
@@ -233,7 +228,7 @@ def shot(args: argparse.Namespace, console: Console) -> int:
     files = targets(args.output, args.scene, args.frames)
     more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
     more |= {"overwrite": args.force, "skip_existing": args.skip_existing, **asked(args)}
-    with console.progress(f"render {args.scene}", "frames") as progress:
+    with console.progress(f"render {args.scene}", "frames", begins=KERNELS) as progress:
         said = 0
 
         def made(written: Written, total: int) -> None:

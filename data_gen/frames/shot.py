@@ -28,6 +28,7 @@ class Shot:
     ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
                   they change; kernels are compiled once, as long as frames consist of the same kinds of things.
     ``camera``    moves the first sensor
+    ``sensor``    number or id of the one that is rendered; None: the first
     ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
     """
 
@@ -37,8 +38,9 @@ class Shot:
         size: tuple[int, int] | None = None,
         camera: CameraPath | None = None,
         update: Callable[[mi.SceneParameters, int], None] | None = None,
+        sensor: int | str | None = None,
     ):
-        self.describe, self.size, self.camera, self.update = describe, size, camera, update
+        self.describe, self.size, self.camera, self.update, self.sensor = describe, size, camera, update, sensor
         self._loaded: Any = None
         self._scene: mi.Scene | None = None
         self._shapes: tuple[Geometry, ...] | None = None
@@ -50,7 +52,8 @@ class Shot:
         if self._scene is None or wanted != self._loaded:
             self._scene = self._shapes = None
             gc.collect()  # two scenes in memory would make kernels larger
-            self._scene, self._loaded = load_scene(name, self.size, wanted[1], merged=False), wanted
+            self._scene = load_scene(name, self.size, wanted[1], merged=False, sensor=self.sensor)
+            self._loaded = wanted
         scene = self._scene
         if self.update is not None:
             params = mi.traverse(scene)
@@ -69,7 +72,7 @@ class Shot:
 
     def twin(self) -> Shot:
         """The same shot, with a scene of its own."""
-        return Shot(self.describe, self.size, self.camera, self.update)
+        return Shot(self.describe, self.size, self.camera, self.update, self.sensor)
 
     def changes(self, frames: Sequence[int]) -> bool:
         """Whether anything but the camera may change in these frames."""

@@ -18,6 +18,7 @@ from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.cameras import check_camera
+from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
 from data_gen.scenes.places import Places
@@ -36,10 +37,8 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
     depths = path_depths(integrator) if integrator.class_name() == "PathIntegrator" else {}
     if holes and depths and not scene.environment() and not integrator.hide_emitters:
         prb = mi.load_dict({"type": "prb", **depths})
-        return lambda sampler, ray, medium, active: prb.sample(
-            dr.ADMode.Primal, scene, sampler, ray, None, None, active
-        )[0]
-    return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
+        return own_estimate(scene, prb)
+    return own_estimate(scene, integrator)
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

@@ -217,13 +217,17 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler of that name, which may be "auto", does not take."""
+    """Raises WrongUse for options that the sampler of that name does not take, or not all that "auto" may stand for."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
-    elif given:
-        option = next(iter(given))
-        having = [name for name, entry in by_standing("use").items() if option in entry.options] or ["gpt"]
-        raise WrongUse(f"option '{option}' is a sampler's own; name the sampler: --sampler {', or '.join(having)}")
+        return
+    able = [sampler for sampler in SAMPLERS.values() if sampler.rank or sampler.tried]
+    shared = {o: option for o, option in COMMON.items() if all(o in sampler.options for sampler in able)}
+    for option in given:
+        having = [entry.name for entry in (*SAMPLERS.values(), *FRAME_SAMPLERS.values()) if option in entry.options]
+        if having and option not in shared:
+            raise WrongUse(f"option '{option}' needs a sampler that has it, not 'auto': {', '.join(having)}")
+    settings("sampler 'auto'", shared, given)
 
 
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:

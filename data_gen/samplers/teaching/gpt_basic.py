@@ -26,6 +26,7 @@ from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, radiance
+from data_gen.scenes.integrators import check_integrator, followed
 from data_gen.scenes.load import reference_integrator
 
 
@@ -43,8 +44,10 @@ class GPTBasic(GradientIntegrator):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
-        self.integrator = nested[0] if nested else mi.load_dict({"type": "path"})
+        nested = [value for _, value in props.items() if isinstance(value, mi.Integrator)]
+        integrator = nested[0] if nested else mi.load_dict({"type": "path"})
+        check_integrator(integrator)
+        self.integrator = followed(integrator)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone: see the nested integrator."""
