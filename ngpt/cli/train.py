@@ -36,12 +36,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from ngpt.system.parts import find_renderer
     from ngpt.training.cost import cost
     from ngpt.training.distributed import Processes
-    from ngpt.training.examples import Mixture, split
+    from ngpt.training.examples import Mixture
     from ngpt.training.folders import open_crops
     from ngpt.training.loss import make_loss
     from ngpt.training.run_record import write_record
     from ngpt.training.run_summary import PAGE
     from ngpt.training.settings import read_settings
+    from ngpt.training.split import split
     from ngpt.training.trainer import Trainer, show
 
     settings = read_settings(config, args.set)
@@ -72,7 +73,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if processes.rank == 0:
             stack.enter_context(exclusive(out))
         on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
-        crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
+        found = [crop for folder in on_disk for crop in open_crops(folder)]
+        crops, held_out, told = split(found, settings.data.validation, settings.data.validation_share)
+        if told and processes.rank == 0:
+            say(told)
         made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
         streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
         trainer = Trainer(settings, Mixture(crops, *streams), held_out, loss, out, processes, say=say)
