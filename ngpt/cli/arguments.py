@@ -4,11 +4,13 @@ import argparse
 import glob
 import json
 import re
+from collections.abc import Container, Iterator
 from pathlib import Path
 
 from ngpt.errors import NgptError
 from ngpt.layers import LAYERS
 from ngpt.system import configs
+from ngpt.system.parts import Registry
 
 # What `ngpt denoise` appends to the name of its input, and skips when it is given a folder again.
 RESULT_SUFFIX = "_denoised"
@@ -25,6 +27,19 @@ def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
     """``--config``, for one of the kinds of ``ngpt.system.configs``."""
     known = ", ".join(configs.names(kind))
     parser.add_argument("--config", required=True, metavar="CONFIG", help=f"{what}: a TOML file, or one of: {known}")
+
+
+class Names(Container[str]):
+    """The names of a registry and "auto", as choices of an option. Entries of other packages are listed once imported."""
+
+    def __init__(self, registry: Registry):
+        self.registry = registry
+
+    def __contains__(self, name: object) -> bool:
+        return name == "auto" or name in self.registry
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("auto", *self.registry))
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

@@ -24,11 +24,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     image, reference = read_image(args.image), read_image(args.reference)
-    metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
+    metrics = compare(image, reference)
     for lack in lacks:
         console.say(lack)
-    metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]
+    metrics |= judge([name for name in usable if name not in metrics], image, reference)[0]
     agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
     if args.json:
         print_json({"agree": agree, "tolerance": args.tolerance, "metrics": metrics})

@@ -16,7 +16,7 @@ from ngpt.system import configs
 from ngpt.system.records import described
 from ngpt.training.augment import Augmentation
 from ngpt.training.cost import per_pixel
-from ngpt.training.loss import LossSettings
+from ngpt.training.loss import TERMS, LossSettings
 from ngpt.training.settings import DataSettings, OptimizerSettings, RunSettings, Settings, read_settings
 
 # The tables of a configuration and what reads them; "" is its top.
@@ -79,12 +79,20 @@ def template(text: str) -> str:
 def _commented(table: str, given: dict[str, Any]) -> str:
     """Lines for the parameters of a table that are not ``given``."""
     known: dict[str, Field] = {field.name: field for field in fields(TABLES[table])}
+    told = [(names, meaning) for names, meaning in entries(TABLES[table])]
+    explained = {name for names, _ in told for name in names}
+    told += [((name,), "") for name in known if name not in explained and name not in TABLES]
+    defaults = {name: field.default for name, field in known.items()}
+    if table == "loss":
+        for name in TERMS.load():
+            told.append(((name,), f"weight of another package's term: {cleandoc(TERMS[name].__doc__ or name)}"))
+            defaults[name] = 0.0
     lines = []
-    for names, meaning in entries(TABLES[table]):
-        others = [name for name in names if name not in given]
-        if others:
-            told = textwrap.wrap(meaning.replace("``", ""), 116, initial_indent="# ", subsequent_indent="#   ")
-            lines += [*told, *(f"# {name} = {_toml(known[name].default)}" for name in others)]
+    for names, meaning in told:
+        if others := [name for name in names if name not in given]:
+            words = meaning.replace("``", "").partition("\n")[0]
+            lines += textwrap.wrap(words, 116, initial_indent="# ", subsequent_indent="#   ")
+            lines += [f"# {name} = {_toml(defaults[name])}" for name in others]
     return "\n".join(lines)
 
 

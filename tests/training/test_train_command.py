@@ -143,7 +143,7 @@ def test_an_error_of_a_process_that_prepares_examples_is_one_line(train, tmp_pat
     status, _, errors = train("--config", "tiny", "--out", str(tmp_path / "run"), *arguments)
     assert status == 1
     assert errors.splitlines()[-1] == (
-        "ngpt: error: a crop is 32x32, smaller than the 64 pixels of an example; --set data.crop=32"
+        "train.py: error: a crop is 32x32, smaller than the 64 pixels of an example; --set data.crop=32"
     )
 
 
@@ -224,7 +224,7 @@ def on_its_set(path: Path):
     return pytest.param(path, "split_set" if split else "smallest_set", id=path.stem, marks=marks)
 
 
-@pytest.mark.parametrize(("path", "kind"), map(on_its_set, CONFIGS))
+@pytest.mark.parametrize(("path", "kind"), [on_its_set(path) for path in CONFIGS])
 def test_every_configuration_trains_on_a_set_of_our_own_generator(path, kind, train, request, tmp_path, one_thread):
     """With no more changed of it than its size; one of the two scenes is set aside, and it is said."""
     folder = request.getfixturevalue(kind)
