@@ -93,7 +93,8 @@ class RunSettings:
 class Settings:
     """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``.
 
-    ``initial``  a file of weights to start from, with the same [model]; "" starts from chance
+    ``initial``  weights to start from, with the same [model]: a file, or a network that comes with ngpt, by its name;
+                 "" starts from chance
     """
 
     model: ModelConfig

@@ -12,8 +12,9 @@ from full_stack import full_stack
 
 import ngpt
 from ngpt.network.model import Reconstructor, parameters
+from ngpt.system.templates import entries
 from ngpt.training.loss import make_loss
-from ngpt.training.parameters import TABLES, configuration_row, entries, parameter_tables, purpose
+from ngpt.training.parameters import TABLES, configuration_row, parameter_tables, purpose
 from ngpt.training.settings import from_dict, read_settings
 
 CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
@@ -81,6 +82,7 @@ def test_a_dry_run_says_what_it_would_cost(train):
     [
         (["--config", "nowhere.toml", "--dry-run"], 1, "nowhere.toml: cannot be read"),
         (["--config", "configs/fast.toml"], 2, "--out is missing"),
+        ([], 2, "--config is missing: a TOML file, or one of: ablations, "),
         (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], 1, "no such folder"),
         (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], 1, "choose one of"),
         (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base"], 2, "give it as table.key=value"),
@@ -147,8 +149,13 @@ def test_an_error_of_a_process_that_prepares_examples_is_one_line(train, tmp_pat
     )
 
 
-def test_the_shipped_network_is_fine_tuned_in_one_command(train, tmp_path):
+def test_the_shipped_network_is_fine_tuned_in_one_command(tmp_path, monkeypatch, capsys):
+    """Wherever it is called: the weights that it starts from are found by their name."""
     from crops import SyntheticCrop
+
+    from ngpt.cli import main
+
+    monkeypatch.chdir(tmp_path)
 
     crop = SyntheticCrop("", 0)
     (tmp_path / "views" / "mine").mkdir(parents=True)
@@ -157,8 +164,7 @@ def test_the_shipped_network_is_fine_tuned_in_one_command(train, tmp_path):
     changes = {"data.folders": [str(tmp_path / "views")], "data.crop": 32, "run.steps": 1, "run.batch": 1}
     arguments = [word for name, value in changes.items() for word in ("--set", f"{name}={value!r}")]
     out = tmp_path / "run"
-    status, _, errors = train("--config", "configs/fine-tune.toml", "--out", str(out), *arguments)
-    assert status == 0, errors
+    assert main(["train", "--config", "fine-tune", "--out", str(out), *arguments]) == 0, capsys.readouterr().err
     ours = ngpt.denoise(crop.stack(0), "ngpt-fast", weights=str(out / "weights.safetensors"))
     # One step at a low rate: close to what it started from, and not the same.
     change = np.abs(ours - ngpt.denoise(crop.stack(0), "ngpt-fast"))
@@ -250,18 +256,3 @@ def test_the_smallest_set_trains_the_smallest_network_as_the_page_says(smallest_
     assert "finished at step 2" in output and "relMSE" in output
     ngpt.write("stack.exr", full_stack(18, 26))
     assert main(commands[2].split()) == 0, capsys.readouterr().err
-
-
-@pytest.mark.parametrize("name", ("tiny", "fast", "paper", "kpcn"))
-def test_a_configuration_to_start_from(train, tmp_path, name):
-    """It is the one that was named; and every line that it offers, taken in, is one that could be set."""
-    path = tmp_path / "mine.toml"
-    assert train("--config", name, "--init", str(path))[0] == 0
-    assert read_settings(path) == read_settings(Path("configs") / f"{name}.toml")
-    offered = tmp_path / "offered.toml"
-    offered.write_text(re.sub(r"^# (\w+ = .*)$", r"\1", path.read_text(), flags=re.M))
-    all_set, plain = read_settings(offered), read_settings(path)
-    assert len(offered.read_text().splitlines()) > 30 and replace(all_set, loss={}) == replace(plain, loss={})
-    assert make_loss(all_set.loss).settings == make_loss(plain.loss).settings
-    status, _, error = train("--config", name, "--init", str(path))
-    assert status != 0 and "exists already" in error
