@@ -66,7 +66,11 @@ def test_a_door_takes_what_its_verb_takes(verb, capfd):
     ours, theirs = (output[output.index("\n\n") :] for _, output, _ in helps)
     assert ours == theirs and "--help" in ours
     status, _, errors = stopped(door, ["--nonsense"], capfd)
-    assert status == 2 and errors.startswith("usage: python ") and "error: unrecognized arguments: --nonsense" in errors
+    assert (
+        status == 2
+        and errors.startswith("usage: python ")
+        and re.search("error: (unrecognized|the following) arguments", errors)
+    )
 
 
 @pytest.mark.parametrize(
