@@ -1,6 +1,7 @@
 """The reconstruction methods: one registry, one way to call them.
 
-A new method is one more entry in ``METHODS``; the command line, the reports and the tables find it there.
+A new method is one more entry in ``_OURS``; the command line, the reports and the tables find it in ``METHODS``. Other
+packages bring theirs by entry points of the group "ngpt.methods" (docs/methods/add-a-method.md).
 """
 
 import logging
@@ -23,6 +24,7 @@ from ngpt.network.run import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
+from ngpt.system.parts import Registry
 
 _LOG = logging.getLogger(__name__)
 
@@ -128,7 +130,7 @@ def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
 
-METHODS = {
+_OURS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
     "l2": _classical("l2", "screened Poisson, least squares: unbiased, fast"),
     "l1": _classical("l1", "screened Poisson, least norms: robust to outliers", "use"),
@@ -181,17 +183,18 @@ METHODS = {
         rec709=True,
     ),
 }
-METHODS |= {
-    "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
-    "oidn-noisy": _variant("oidn", METHODS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+_OURS |= {
+    "oidn-clean": _variant("oidn", _OURS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", _OURS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
     "oidn-fast": _variant(
         "oidn",
-        METHODS["oidn"],
+        _OURS["oidn"],
         "OIDN's quickest network, with the features as they are",
         auxiliary="clean",
         quality="fast",
     ),
 }
+METHODS = Registry("ngpt.methods", "method", Method, _OURS)
 
 
 def by_standing(*standings: str) -> dict[str, Method]:

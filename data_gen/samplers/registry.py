@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from ngpt.errors import NgptError, WrongUse
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
+from ngpt.system.parts import Registry
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -171,8 +172,9 @@ class FrameSampler(Entry):
     alone: str = field(kw_only=True)
 
 
-SAMPLERS: dict[str, Sampler] = {}
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
+# Other packages bring theirs by entry points.
+SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
 def register(entry: Sampler | FrameSampler) -> None:

@@ -16,6 +16,7 @@ import numpy as np
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
+    Names,
     add_files,
     add_force,
     add_json,
@@ -67,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         default="auto",
         metavar="NAME",
-        choices=["auto", *METHODS],
+        choices=Names(METHODS),
         help=f"auto: the best that layers and machine allow (default); {first}; for some stacks: "
         f"{', '.join(by_standing('niche'))}. See `ngpt info`",
     )

@@ -31,11 +31,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     image, reference = both.of(images)
     if both.line:
         console.say(both.line)
-    metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
+    metrics = compare(image, reference)
     for lack in lacks:
         console.say(lack)
-    metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]
+    metrics |= judge([name for name in usable if name not in metrics], image, reference)[0]
     agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
     if args.json:
         print_json({"agree": agree, "tolerance": args.tolerance, "metrics": metrics})

@@ -11,11 +11,12 @@ _WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 
 
 def available(height: int, width: int) -> tuple[list[str], list[str]]:
-    """The metrics of SHOWN for images of this size, and a line for each of those that cannot be computed here."""
-    lacks = {name: missing() for name in SHOWN if (missing := METRICS[name].missing)}
+    """The metrics of SHOWN and of other packages for images of this size, and a line for each that cannot be used."""
+    names = (*SHOWN, *METRICS.load())
+    lacks = {name: missing() for name in names if (missing := METRICS[name].missing)}
     if min(height, width) < 11:
         lacks["SSIM"] = f"SSIM needs images of 11x11 pixels, and these are {width}x{height}"
-    return [name for name in SHOWN if not lacks.get(name)], [lack for lack in lacks.values() if lack]
+    return [name for name in names if not lacks.get(name)], [lack for lack in lacks.values() if lack]
 
 
 def judge(names: list[str], image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, float], dict[str, np.ndarray]]:

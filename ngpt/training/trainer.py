@@ -23,6 +23,7 @@ from ngpt.errors import NgptError
 from ngpt.network import padding, weights
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.transfer import signed_exp
+from ngpt.system import limits
 from ngpt.system.console import print_line
 from ngpt.system.files import atomic_output
 from ngpt.system.records import check
@@ -255,15 +256,19 @@ class Trainer:
             [first + i * run.batch + processes.rank * size + j for j in range(size)]
             for i in range(run.steps - self.step)
         )
-        workers = self.settings.data.workers
-        yield from DataLoader(
-            self.examples,
-            batch_sampler=indices,  # type: ignore[arg-type]
-            collate_fn=collated,
-            num_workers=workers,
-            persistent_workers=bool(workers),
-            pin_memory=self.device.type == "cuda",
-        )
+        workers = min(self.settings.data.workers, limits.processors())
+        try:
+            yield from DataLoader(
+                self.examples,
+                batch_sampler=indices,  # type: ignore[arg-type]
+                collate_fn=collated,
+                num_workers=workers,
+                persistent_workers=bool(workers),
+                pin_memory=self.device.type == "cuda",
+            )
+        except NgptError as error:
+            # A worker's error comes with the worker's traceback before it.
+            raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
 
     def _give_up(self, batch: dict[str, Tensor], total: float, norm: float) -> None:
         path = self.out / f"bad-batch-{self.step:07d}.safetensors"

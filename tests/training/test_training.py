@@ -273,15 +273,6 @@ def test_a_mixture_is_its_parts_one_after_the_other():
     assert len(mixture) == 4 and mixture[1].scene == "scene1" and mixture[3].scene == "scene4"
 
 
-def test_scenes_are_held_out_whole():
-    training, held_out = examples.split(CROPS, ("scene1", "scene5"))
-    assert [crop.scene for crop in held_out] == ["scene1", "scene5"] and len(training) == 4
-    assert examples.split(CROPS, ()) == (CROPS, [])
-    with pytest.raises(NgptError, match="no scene has a name that begins with 'nosuch'; there are scene0, scene1"):
-        examples.split(CROPS, ("scene1", "nosuch"))
-    assert examples.split([], ("scene1",)) == ([], [])  # all crops are rendered while it trains
-
-
 def test_folders_of_stacks_are_crops(tmp_path):
     crop = CROPS[0]
     (tmp_path / "view").mkdir()
