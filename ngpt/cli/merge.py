@@ -6,7 +6,7 @@ from ngpt.cli.arguments import add_force, add_json, print_json
 from ngpt.io.exr import read, write
 from ngpt.merging import merge
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
+from ngpt.system.files import check_output, save
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,7 +19,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output, args.force)
     merged = merge([read(path) for path in args.stacks])
-    write(target, merged, overwrite=args.force)
+    save(target, lambda path, overwrite: write(path, merged, overwrite=overwrite), args.force)
     spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]
     console.say(f"{len(args.stacks)} stacks -> {target}: {merged.width}x{merged.height}, {spp} spp, seeds {seed}")
     if args.json:
