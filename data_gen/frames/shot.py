@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from data_gen.begun import UNFINISHED, Unfinished, frame_seed
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.frame_sampler import Remembering
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot
@@ -86,13 +87,6 @@ class Shot:
         params.update()
 
 
-def frame_seed(seed: int, frame: int, use: int = 0) -> int:
-    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
-    # Entropy must not be negative, frames may be.
-    entropy = [seed, frame % 2**64]
-    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
-
-
 def render_shot(
     shot: Shot,
     frames: Sequence[int],
@@ -151,13 +145,24 @@ def render_shot(
                 far = None if what is None else depth(scene, now, what)
                 stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
-                stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
+                try:
+                    own = frame_seed(seed, frame)
+                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
+                except Unfinished as error:
+                    raise Unfinished(f"frame {frame}: {error}", _placed(error.stack, frame, previous, motion)) from error
             before, last = now, frame
         done = i + 1
-        stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-        stack = stack.replace(motion=motion)
+        stack = _placed(stack, frame, previous, motion)
         del scene  # two scenes in memory would make kernels larger
+        if dt and UNFINISHED in stack.attributes:
+            return
         yield frame, _with_dt(stack, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1)) if dt else stack
+
+
+def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:
+    """A stack as one of the shot's frames."""
+    stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
+    return stack.replace(motion=motion)
 
 
 def _with_dt(
