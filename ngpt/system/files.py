@@ -43,20 +43,24 @@ def check_output(path: str | os.PathLike, overwrite: bool = False) -> Path:
 
 
 def save(
-    path: str | os.PathLike, write: Callable[[Path, bool], object], overwrite: bool = False, *, beside: bool = True
+    path: str | os.PathLike, write: Callable[[Path, bool], object], overwrite: bool = False, *, alike: bool = False
 ) -> None:
     """``write(path, overwrite)``; where that fails, what was made is written elsewhere, and NgptError says where.
 
-    For what took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for "a.exr" (unless
-    ``beside`` is False, as for folders all of whose files count), the working directory, and the folder for temporary
-    files. Nothing is overwritten there. ``write`` is called again for each, and makes files complete or not at all, as
-    ``atomic_output`` does.
+    For what took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for "a.exr", the working
+    directory, and the folder for temporary files. Nothing is overwritten there. ``write`` is called again for each, and
+    makes files complete or not at all, as ``atomic_output`` does.
+
+    ``alike`` is for folders that are made by several processes, all of whose files count: whoever makes this file makes
+    the same, so that one which is there by now will do; and nothing is put beside it.
     """
     path = Path(path)
     try:
         write(path, overwrite)
     except (NgptError, OSError) as error:
-        for other in _other_places(path, beside):
+        if alike and path.is_file():
+            return
+        for other in _other_places(path, not alike):
             try:
                 write(other, False)
             except (NgptError, OSError):

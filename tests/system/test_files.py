@@ -113,10 +113,14 @@ def test_what_cannot_be_written_is_kept_elsewhere_and_the_message_says_where(pla
             save(asked / "a.txt", hours_of_work)
         assert (asked / name).read_text() == "hours"
     save(asked / "a.txt", hours_of_work, True)
-    with pytest.raises(NgptError, match=rf"kept in {working / 'a.kept.txt'}$"):
-        save(asked / "a.txt", hours_of_work, beside=False)
-    with pytest.raises(NgptError, match=rf"gone does not exist.* kept in {working / 'a.kept-2.txt'}$"):
+    with pytest.raises(NgptError, match=rf"gone does not exist.* kept in {working / 'a.kept.txt'}$"):
         save(asked / "gone" / "a.txt", hours_of_work, True)
+    # One that others make too, in a folder all of whose files count.
+    save(asked / "a.txt", hours_of_work, alike=True)
+    (asked / "b.txt").mkdir()
+    with pytest.raises(NgptError, match=rf"kept in {working / 'b.kept.txt'}$"):
+        save(asked / "b.txt", hours_of_work, alike=True)
+    assert sorted(os.listdir(asked)) == ["a.kept-2.txt", "a.kept.txt", "a.txt", "b.txt"]
 
 
 def test_a_working_directory_that_is_full_or_gone_leaves_the_folder_for_temporary_files(places):
