@@ -63,7 +63,8 @@ def render_stack(
     before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. A render that was ended by
     ``stop`` before it had all says so in ``ngpt:unfinished``.
 
-    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails. Raises NgptError for options that do not exist or make no sense, and for a scene that the sampler cannot render.
+    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
+    options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
     check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(check_scene(scene))

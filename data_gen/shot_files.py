@@ -104,7 +104,9 @@ def write_frames(
     write_all(skip, {})
     if stop():
         done = {report["frame"] for report in written.frames if "unfinished" not in report}
-        written.interrupted = next((frame for frame in ours if frame not in done and not asked[frame].done(files[frame])), None)
+        written.interrupted = next(
+            (frame for frame in ours if frame not in done and not asked[frame].done(files[frame])), None
+        )
     return written
 
 
@@ -130,7 +132,10 @@ def asked_of(
     remembers = FRAME_SAMPLERS.get(sampler)
     if spp is None and (seconds is None or remembers):
         spp = remembers.spp if remembers else DEFAULT_SPP
-    given = {name: filled(text, frame) for name, text in (parameters or {}).items()} | {"--fps": str(fps), "--dt": str(dt)}
+    given = {name: filled(text, frame) for name, text in (parameters or {}).items()} | {
+        "--fps": str(fps),
+        "--dt": str(dt),
+    }
     name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
     return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame)
 

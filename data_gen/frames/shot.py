@@ -149,7 +149,9 @@ def render_shot(
                     own = frame_seed(seed, frame)
                     stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
                 except Unfinished as error:
-                    raise Unfinished(f"frame {frame}: {error}", _placed(error.stack, frame, previous, motion)) from error
+                    raise Unfinished(
+                        f"frame {frame}: {error}", _placed(error.stack, frame, previous, motion)
+                    ) from error
             before, last = now, frame
         done = i + 1
         stack = _placed(stack, frame, previous, motion)

@@ -249,7 +249,7 @@ def read_frame(
 def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
     """Raises NgptError where a result is not that of this stack by what is asked for."""
     (result, _), (stack, _) = read_header(target), read_header(source)
-    asked = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
+    asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
     asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
     if args.method in METHODS and not args.weights:
         options = METHODS[args.method].options

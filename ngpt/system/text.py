@@ -1,4 +1,4 @@
-"""Text of elsewhere, made fit to be shown: names in files may hold what controls a terminal, or hides and turns text."""
+"""Text of elsewhere, fit to be shown: names in files may hold what controls a terminal, or hides and turns text."""
 
 import re
 from html import escape

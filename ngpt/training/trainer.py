@@ -203,7 +203,9 @@ class Trainer:
             tensors |= {f"adam1/{name}": state["exp_avg"], f"adam2/{name}": state["exp_avg_sq"]}
         header = {"kind": "checkpoint", "step": self.step, "seconds": self.seconds, "version": __version__}
         header["settings"] = self.settings.to_dict()
-        files.save(self.checkpoint, lambda path, over: weights.write_tensors(path, tensors, header, over), overwrite=True)
+        files.save(
+            self.checkpoint, lambda path, over: weights.write_tensors(path, tensors, header, over), overwrite=True
+        )
         self._save_weights("weights.safetensors")
         write_run(self.out)
 

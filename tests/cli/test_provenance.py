@@ -211,7 +211,10 @@ def test_results_that_are_there_count_where_they_are_what_is_asked_for(stack, tm
     for same in (["-m", "l1"], [], ["-m", "auto"]):
         assert main([*words, *same]) == 0
     assert "1 of 1 stacks were skipped" in capsys.readouterr().err
-    for other, told in ((["-m", "l2"], "method l1, not l2"), (["-m", "l1", "--temporal"], "temporal none, not asked for")):
+    for other, told in (
+        (["-m", "l2"], "method l1, not l2"),
+        (["-m", "l1", "--temporal"], "temporal none, not asked for"),
+    ):
         assert main([*words, *other]) == 1
         assert f"{target}: is another result: {told}; " in capsys.readouterr().err
     # And the stack may have more samples by now.

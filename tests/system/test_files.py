@@ -105,7 +105,7 @@ def hours_of_work(path, overwrite):
 
 
 def test_what_cannot_be_written_is_kept_elsewhere_and_the_message_says_where(places):
-    asked, working, temporary = places
+    asked, working, _ = places
     save(asked / "a.txt", hours_of_work)
     assert os.listdir(asked) == ["a.txt"]
     for name in ("a.kept.txt", "a.kept-2.txt"):  # the name is taken, and nothing is overwritten
