@@ -22,13 +22,12 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, read, write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
-from ngpt.merging import DIAGNOSTICS, merge
+from ngpt.merging import DIAGNOSTICS, UNFINISHED, merge
 from ngpt.stack import GradientStack
 from ngpt.system.files import save
 
-# Attributes: which scene a stack is of; for how many seconds it was to be rendered; and what broke it off before all
-# that was asked for was done, if anything did.
-SCENE, TIME, UNFINISHED = "ngpt:scene", "ngpt:time", "ngpt:unfinished"
+# Attributes: which scene a stack is of, and for how many seconds it was to be rendered
+SCENE, TIME = "ngpt:scene", "ngpt:time"
 # Points that the number of samples decides between are no other way to render.
 _EITHER = {"points=rounds", "points=sobol"}
 # Of a time, what is too little to go on for
@@ -105,7 +104,7 @@ class Asked:
     spp: int | None = None
     seconds: float | None = None
     error: float | None = None
-    diagnostics: bool = False
+    adaptive: str = ""  # the method that samples are shared out for
     frame: int | None = None
 
     def left(self, path: Path) -> Rest | None:
@@ -139,7 +138,7 @@ class Asked:
             None if self.seconds is None else self.seconds - given,
             None if self.error is None or even else 1 / math.sqrt(self.error**-2 - reached**-2),
             sampler,
-            "" if even else str(attributes.get("ngpt:adaptive", "")),
+            "" if even else str(attributes.get("ngpt:adaptive", self.adaptive)),
         )
 
     def done(self, path: Path) -> bool:
@@ -188,7 +187,6 @@ def begun_stack(path: Path, diagnostics: bool) -> GradientStack:
 def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
     """The stack of both parts; its header says of how it was ended what that of the ``rest`` says."""
     whole = merge([begun, rest])
-    whole.attributes.pop(UNFINISHED, None)
     whole.attributes |= {name: rest.attributes[name] for name in (UNFINISHED, TIME) if name in rest.attributes}
     # Errors fall with the root of the samples.
     errors = [n for stack in (begun, rest) if (n := _number(stack.attributes, "ngpt:error"))]

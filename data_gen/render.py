@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
-from data_gen.begun import UNFINISHED, Unfinished
+from data_gen.begun import Unfinished
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
@@ -20,6 +20,7 @@ from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
+from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
 

@@ -25,6 +25,8 @@ from ngpt.stack import GradientStack
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
 # Channels beside the layers that are means over samples too.
 DIAGNOSTICS = "diagnostics."
+# Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
+UNFINISHED = "ngpt:unfinished"
 # Samples of a pixel, of which headers count as many in 32 bits
 _MOST = 2.0**31
 
@@ -44,11 +46,11 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     A stack with one sample per pixel has no variances and needs none, since its sum of squared deviations is zero: two
     of them merged have variances. ``diagnostics.*`` channels are averaged as layers are.
 
-    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp``, ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all
-    other attributes are those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in
-    size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are
-    negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no numbers, results of a reconstruction, and
-    channels of unknown meaning.
+    The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp``, ``ngpt:seconds`` and ``ngpt:discarded`` are sums,
+    ``ngpt:unfinished`` is left out, and all other attributes are those of the first stack. Raises NgptError for fewer
+    than two stacks, stacks that differ in size, layers or sampler, a seed that occurs twice, missing ``ngpt:spp`` or
+    ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no
+    numbers, results of a reconstruction, and channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -71,6 +73,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         "ngpt:spp": max(1, round(float(total.mean()))),
         "ngpt:seed": " ".join(seed for stack in stacks for seed in _seeds(stack)),
     }
+    attributes.pop(UNFINISHED, None)
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)

@@ -6,7 +6,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
-from data_gen.begun import UNFINISHED, Asked, Unfinished, begun_stack, scene_name, write_part
+from data_gen.begun import Asked, Unfinished, begun_stack, scene_name, write_part
 from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
@@ -15,6 +15,7 @@ from data_gen.shot_files import Written, report_of, write_frames, write_frames_o
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
+from ngpt.merging import UNFINISHED
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.interrupts import Interrupt
@@ -169,6 +170,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
         wanted,
         args.time,
         args.error,
+        (args.method or "auto") if args.adaptive else "",
     )
     if args.skip_existing and finished(target):
         rest = whole.left(target)

@@ -10,7 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
-from data_gen.begun import UNFINISHED, Unfinished, frame_seed
+from data_gen.begun import Unfinished, frame_seed
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.frame_sampler import Remembering
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot
@@ -20,6 +20,7 @@ from data_gen.samplers import FRAME_SAMPLERS
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
+from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 
 

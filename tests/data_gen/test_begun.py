@@ -42,6 +42,9 @@ def test_a_file_is_finished_where_it_has_what_is_asked_for(tmp_path):
     rest = Asked("box 1", 3, error=0.06).left(path)
     assert rest.adaptive == "wcv" and 1 / math.hypot(1 / rest.error, 10) == pytest.approx(0.06)
     assert Asked("box 1", 3, spp=340, error=0.06).left(path) == Rest(1, 4, None, None, "gpt")
+    # An adaptive render that was broken off before a sample was shared out
+    there(path, unfinished="interrupted")
+    assert Asked("box 1", 3, spp=400, adaptive="auto").left(path).adaptive == "auto"
     there(path, seed=f"3 {part_seed(3, 1)}", samplerOptions="points=rounds")
     assert Asked("box 1", 3, spp=400).left(path).options(3)["seed"] == part_seed(3, 2)
 
