@@ -164,7 +164,8 @@ def render_frames(
     ``seconds``  for each frame
     ``sampler``  may be one of ``data_gen.samplers.FRAME_SAMPLERS`` too, which reuse the frames before
     ``skip``     asked when a frame's turn has come whether to leave it out
-    ``stop``     asked after each pass: a frame that is broken off is not given, nor any after it
+    ``stop``     asked after each pass: a frame that is broken off has ``ngpt:unfinished`` (with ``dt`` it is not
+                 given), and none is given after it
 
     All else as of ``render_scene``; ``data_gen.frames.shot`` says more of seeds and motion. A shot that changes by
     other means than a file's parameters: ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene``, and for
@@ -206,9 +207,9 @@ def render_frames(
 
     def whole() -> Iterator[tuple[int, GradientStack]]:
         for frame, stack in found:
+            yield frame, stack
             if stop():
                 return
-            yield frame, stack
 
     return whole()
 

@@ -6,6 +6,7 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from data_gen.begun import Asked, Unfinished, begun_stack, scene_name, write_part
 from data_gen.cli import KERNELS
 from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled, varies
@@ -13,9 +14,9 @@ from data_gen.samplers import by_standing, check_options
 from data_gen.session import DEFAULT_SPP, render_scene, stop_on_ctrl_c
 from data_gen.shot_files import Written, report_of, write_frames, write_frames_on_cluster
 from ngpt.cli.arguments import add_force, add_json, assignment, duration, natural, part, positive, print_json, size
-from ngpt.errors import WrongUse
-from ngpt.io.exr import write
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
+from ngpt.merging import UNFINISHED
 from ngpt.system.console import Console
 from ngpt.system.files import check_output
 from ngpt.system.interrupts import Interrupt
@@ -125,7 +126,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing.add_argument(
         "--skip-existing",
         action="store_true",
-        help="leave out what is there already",
+        help="leave out what is there already with all that is asked for, and go on with what is there in part",
     )
     add_json(parser)
 
@@ -157,9 +158,29 @@ def image(args: argparse.Namespace, console: Console) -> int:
     target = check_output(args.output or f"{Path(args.scene).stem}.exr", args.force or args.skip_existing)
     if target.suffix.lower() != ".exr":
         raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
+    given, begun, there = asked(args), None, target.exists()
+    how = {"adaptive": args.adaptive, "error": args.error, "method": args.method}
+    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
+    whole = Asked(
+        scene_name(args.scene, dict(args.define) | ({"--sensor": args.sensor} if args.sensor else {})),
+        args.seed,
+        args.sampler,
+        dict(args.option),
+        args.size,
+        wanted,
+        args.time,
+        args.error,
+        (args.method or "auto") if args.adaptive else "",
+    )
     if args.skip_existing and finished(target):
-        console.say(f"{target}: skipped: the stack is there")
-        return 0
+        rest = whole.left(target)
+        if rest is None:
+            console.say(f"{target}: skipped: the stack is there")
+            return 0
+        begun = begun_stack(target, args.diagnostics)
+        given |= rest.options(args.seed)
+        how = {"adaptive": bool(rest.adaptive), "error": rest.error, "method": rest.method(args.method)}
+        console.say(f"{target}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
 
     def chosen(plan) -> None:
         how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
@@ -180,20 +201,26 @@ def image(args: argparse.Namespace, console: Console) -> int:
             progress(done, total)
             looking.progress(done, total)
 
-        stack, plan = render_scene(
-            args.scene,
-            adaptive=args.adaptive,
-            error=args.error,
-            method=args.method,
-            progress=told,
-            stop=ended,
-            newest=looking.newest,
-            chosen=chosen,
-            said=console.say,
-            **asked(args),
-        )
+        failed = None
+        try:
+            stack, _ = render_scene(
+                args.scene,
+                progress=told,
+                stop=ended,
+                newest=looking.newest,
+                chosen=chosen,
+                said=console.say,
+                **how,
+                **given,
+            )
+        except Unfinished as error:
+            stack, failed = error.stack, error
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
-        write(target, stack, overwrite=args.force or args.skip_existing)
+        whole.name(stack)
+        if args.skip_existing and not there and whole.done(target):
+            console.say(f"{target}: skipped: the stack is there by now, of another process")
+            return 0
+        stack = write_part(target, stack, args.force or there, begun)
         looking.last(stack, f"ended: {target} is written")
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
@@ -202,8 +229,9 @@ def image(args: argparse.Namespace, console: Console) -> int:
         expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
         short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
-    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
-    if interrupted := ended() and done != wanted:
+    if failed is not None:
+        raise NgptError(f"{failed}; {target} has the {done} samples per pixel done before")
+    if interrupted := UNFINISHED in stack.attributes:
         tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{how}: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s")
@@ -212,8 +240,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
             f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
             "on this machine now; a smaller --size is"
         )
-    if "ngpt:for" in stack.attributes:
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {plan.method}")
+    if method := stack.attributes.get("ngpt:for"):
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {method}")
     if args.json:
         print_json(report_of(stack, target) | {"layers": stack.names})
     return stop.status if interrupted else 0
@@ -250,7 +278,9 @@ def shot(args: argparse.Namespace, console: Console) -> int:
                 shard = args.shard or (0, 1)
                 written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
     if written.interrupted is not None:
-        console.error(f"interrupted: frame {written.interrupted} is left out; --skip-existing goes on with it")
+        part = next((each["spp"] for each in written.frames if each["frame"] == written.interrupted), None)
+        has = "is left out" if part is None else f"has {part} samples per pixel"
+        console.error(f"interrupted: frame {written.interrupted} {has}; --skip-existing goes on with it")
         return stop.status
     if written.skipped:
         console.say(f"{written.skipped} of {written.done} frames were skipped: their stacks are there")

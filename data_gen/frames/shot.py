@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from data_gen.begun import Unfinished, frame_seed
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.frame_sampler import Remembering
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot, window_moved
@@ -19,6 +20,7 @@ from data_gen.samplers import FRAME_SAMPLERS
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
+from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 
 
@@ -89,13 +91,6 @@ class Shot:
         params.update()
 
 
-def frame_seed(seed: int, frame: int, use: int = 0) -> int:
-    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
-    # Entropy must not be negative, frames may be.
-    entropy = [seed, frame % 2**64]
-    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
-
-
 def render_shot(
     shot: Shot,
     frames: Sequence[int],
@@ -160,15 +155,27 @@ def render_shot(
                 far = None if what is None else depth(scene, now, what)
                 stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
-                stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
+                try:
+                    own = frame_seed(seed, frame)
+                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
+                except Unfinished as error:
+                    placed = _placed(error.stack, frame, previous, motion + np.float32(shift))
+                    raise Unfinished(f"frame {frame}: {error}", placed) from error
             before, last = now, frame
         done = i + 1
-        stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-        stack = stack.replace(motion=motion + np.float32(shift))
+        stack = _placed(stack, frame, previous, motion + np.float32(shift))
         del scene  # two scenes in memory would make kernels larger
+        if dt and UNFINISHED in stack.attributes:
+            return
         if dt:
             stack = _with_dt(stack, motion, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1))
         yield frame, stack
+
+
+def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:
+    """A stack as one of the shot's frames; ``motion`` is that of the picture."""
+    stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
+    return stack.replace(motion=motion)
 
 
 def _with_dt(

@@ -35,18 +35,20 @@ from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_views, write
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
+from ngpt.io.openexr import read_header
 from ngpt.io.primaries import converted, to_rec709
 from ngpt.io.whole import finished
 from ngpt.methods import METHODS, Result, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
+from ngpt.options import as_text, settings, unusual
 from ngpt.report.pictures import write_picture
 from ngpt.report.transforms import shown
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
-from ngpt.system.files import check_output
+from ngpt.system.files import check_output, save
 from ngpt.system.pipeline import overlapped
 from ngpt.version import __version__
 
@@ -157,7 +159,14 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     options |= dict(args.option)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    overwrite = partial(write_frame, overwrite=args.force, transform=args.transform, exposure=args.exposure)
+    overwrite = partial(
+        write_frame,
+        overwrite=args.force,
+        transform=args.transform,
+        exposure=args.exposure,
+        # Of a folder, whose disk may be full, the next call makes again what is missing.
+        keep=len(pairs) == 1,
+    )
     frames: Any
     windows = False
     if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
@@ -246,6 +255,8 @@ def read_frame(
     source, target = pair
     # Only now, for several machines may be at work on one folder.
     there = args.skip_existing and finished(target)
+    if there and target.suffix.lower() == ".exr":
+        _check_result(source, target, args)
     if there and target not in again:
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
@@ -254,6 +265,24 @@ def read_frame(
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
     return first._replace(others=tuple(others))
+
+
+def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
+    """Raises NgptError where a result is not that of this stack by what is asked for."""
+    (result, _), (stack, _) = read_header(target), read_header(source)
+    asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
+    asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
+    if args.method in METHODS and not args.weights:
+        options = METHODS[args.method].options
+        given = as_text(unusual(options, settings(f"method '{args.method}'", options, dict(args.option))))
+        asked |= {"ngpt:method": args.method, "ngpt:options": given or None}
+    for name, value in asked.items():
+        if result.get(name) != value:
+            what = name.removeprefix("ngpt:")
+            raise NgptError(
+                f"{target}: is another result: {what} {result.get(name, 'none')}, not {value or 'none'}; give another "
+                "name, or --force in place of --skip-existing to replace it"
+            )
 
 
 def compute_frame(
@@ -288,19 +317,28 @@ def compute_frame(
     return frame._replace(over_time=over_time, reason=reason)
 
 
-def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
-    """Writes the result, and returns what there is to report."""
+def write_frame(
+    frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0, keep: bool = False
+) -> dict:
+    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report."""
     source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
     made = {**result.attributes, **over_time}
-    if target.suffix.lower() == ".exr":
-        views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
-        write(target, [image for image, _ in views], [of for _, of in views], overwrite or cut, made)
+
+    def save_to(path: Path, overwrite: bool) -> None:
+        if path.suffix.lower() == ".exr":
+            views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
+            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made)
+        else:
+            light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
+            write_picture(path, shown(light, transform, exposed(exposure, light)), overwrite)
+
+    if keep:
+        save(target, save_to, overwrite or cut)
     else:
-        light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
-        write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
+        save_to(target, overwrite or cut)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,

@@ -119,6 +119,20 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
     )
 
 
+def read_header(path: str | os.PathLike) -> tuple[dict[str, Any], tuple[int, int]]:
+    """The attributes of a file's first part and its (width, height), without its pixels; raises NgptError."""
+    path = Path(path)
+    with regular_file(path) as file:
+        size = read_headers(file, str(path))[0].size
+        name = _numbered(file)
+        try:
+            with _without_native_stderr():
+                return dict(OpenEXR.File(name, header_only=True).parts[0].header), size
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
+            raise NgptError(f"{path}: cannot be read ({reason}); render or copy it again") from error
+
+
 def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False) -> Path:
     """Writes ``image`` to ``path``, complete or not at all, and returns the path.
 

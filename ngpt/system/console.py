@@ -16,6 +16,7 @@ from typing import TextIO
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system.interrupts import raised
 from ngpt.system.limits import address_space
+from ngpt.system.text import printable
 
 # Elsewhere than on a terminal, a line at most this often, and the next when work has gone on for one part more of so
 # many that it took: a log should show life, not fill up.
@@ -80,16 +81,6 @@ def _check_address_space() -> None:
         raise NgptError(
             f"the address space is limited to {limit >> 20} MiB (ulimit -v); {FEWEST_MIB} are the least that works"
         )
-
-
-def printable(text: str) -> str:
-    """One line of text as it may go to a terminal: what files call their things may hold sequences that control one.
-
-    Control characters, line breaks and marks of direction become what Python writes for them, ``\\x1b``.
-    """
-    if text.isprintable():
-        return text
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def tell(line: str) -> None:
