@@ -27,7 +27,12 @@ class CameraSamples:
     ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
+
+    Of an argument of functions that are recorded once (``data_gen.paths.frozen``), the fields of ``DRJIT_STRUCT`` are
+    all that they may use.
     """
+
+    DRJIT_STRUCT = dict.fromkeys(("sensor", "pixel", "random", "position", "lens", "time", "wavelength"), object)
 
     def __init__(
         self,
@@ -77,7 +82,7 @@ class CameraSamples:
         self.random = sample_streams(seed, pixel, sample, int(self.size.x), net)
         self.position = self.random.next_2d()
         self.lens = self.random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        self.time = self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d()
+        self.time = mi.Float(self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d())
         self.wavelength = self.random.next_1d()
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
@@ -89,7 +94,7 @@ class CameraSamples:
         some = copy(self)
         some.random = self.random.at(lanes)
         some.position, some.lens, some.time, some.wavelength = map(
-            gather, (self.position, self.lens, mi.Float(self.time), self.wavelength)
+            gather, (self.position, self.lens, self.time, self.wavelength)
         )
         return some
 
