@@ -13,6 +13,7 @@ from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
 from data_gen.paths.camera import CameraSamples
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
@@ -40,6 +41,12 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
             dr.ADMode.Primal, scene, sampler, ray, None, None, active
         )[0]
     return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
+
+
+def recorded(scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object) -> SamplePass:
+    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``."""
+    frozen = Frozen(scene, *owners)
+    return lambda camera, film: film.put_all(frozen(samples, camera))
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

@@ -126,9 +126,7 @@ class VCM(BDPT):
         ``sight`` with random numbers to go on by, and the splatter's state."""
         n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
-        kept, numbers, state, sums = passes.frozen(
-            self.light_paths, passes.world, sight, η, empty, sums=splats.zeros
-        )
+        kept, numbers, state, sums = passes.frozen(self.light_paths, passes.world, sight, η, empty, sums=splats.zeros)
         dr.eval(kept, numbers, state, sums)
         splats.take(sums)
         photons = Photons(kept, radius, n, number_of(camera.seed, camera.first))
