@@ -11,6 +11,7 @@ import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.film import GradientFilm
+from data_gen.made import Made
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
@@ -42,6 +43,7 @@ def render_stack(
     diagnostics: bool = False,
     with_features: bool = True,
     adaptive: Adaptive | None = None,
+    made: Made | None = None,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -57,6 +59,8 @@ def render_stack(
 
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
+
+    Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
     The same seed, options and number of samples give the same bits, however they came about. Where it is not known
     before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says.
@@ -87,14 +91,16 @@ def render_stack(
         settings["points"] = "rounds"
     limits["points"] = settings.get("points", "independent")
     with weighed(scene, settings["lamps"], entry.by_place) as places:
-        more |= {"places": places} if places else {}
-        sample = entry.make(scene, **own(settings), **more)
+        more |= own(settings) | ({"places": places} if places else {})
+        made = made or Made()
+        sample = made.sampler(entry, scene, more)
         # However long it took to weigh the lamps, the render is begun.
         limits["seconds"] = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
         if adaptive is None:
             film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
         else:
             film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
+        made.keep(entry, scene, more, sample)
     if adaptive is not None:
         chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
     return stack_of(film, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))

@@ -40,26 +40,38 @@ class Frozen:
 
         A call that fails may have added already: the next try has others.
         """
+
+        def tried(f: Callable) -> Any:
+            return f(*args, *([sums()] if sums else []))
+
         if f not in self.functions:
             self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)
-            with_sums = [*args, *([sums()] if sums else [])]
             try:
                 # Dr.Jit makes an array of each number that it meets, and one that belongs to several objects becomes
                 # several arrays, which are one again from the next call on. What does nothing is recorded for that.
-                self.settle(*with_sums)
-                return self.functions[f](*with_sums)
+                tried(self.settle)
+                return tried(self.functions[f])
             except RuntimeError as error:
                 # As with lamps, below: what an object made while it was recorded is there the next time.
                 stop_if_interrupted(error)
         try:
-            return self.functions[f](*args, *([sums()] if sums else []))
+            return tried(self.functions[f])
         except RuntimeError as error:
             stop_if_interrupted(error)
-            reason = " ".join(str(error.__cause__ or error).split())
-            name = getattr(f, "__qualname__", repr(f))
-            _LOG.warning("%s is recorded anew in each pass, which may take a second of each: %s", name, reason)
-            self.functions[f] = f
-            return f(*args, *([sums()] if sums else []))
+            result, self.functions[f] = tried(f), f
+            _say(f, " ".join(str(error.__cause__ or error).split()))
+            return result
+
+
+# Functions of which the warning has been given
+_SAID: set[str] = set()
+
+
+def _say(f: Callable, reason: str) -> None:
+    name = getattr(getattr(f, "func", f), "__qualname__", repr(f))
+    if name not in _SAID:
+        _SAID.add(name)
+        _LOG.warning("%s is recorded anew in each pass, which may take a second of each: %s", name, reason)
 
 
 def _wake_lamps(scene: mi.Scene) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 
 import drjit as dr
@@ -12,7 +12,7 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
@@ -43,10 +43,15 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
     return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
 
 
-def recorded(scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object) -> SamplePass:
-    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``."""
+def recorded(
+    scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
+) -> SamplePass:
+    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``.
+
+    Beside the rays of the camera samples it asks for those by the ``shifts``.
+    """
     frozen = Frozen(scene, *owners)
-    return lambda camera, film: film.put_all(frozen(samples, camera))
+    return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

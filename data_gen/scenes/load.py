@@ -29,11 +29,11 @@ def load_scene(
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            scene = load_merged(name, parameters) if merged else mi.load_file(name, optimize=False, **parameters)
+            scene = load_merged(name, parameters) if merged else mi.load_file(name, parallel=False, optimize=False, **parameters)
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
-            scene = mi.load_dict(SCENES[name](), optimize=False)
+            scene = mi.load_dict(SCENES[name](), parallel=False, optimize=False)
         else:
             raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")
     except (RuntimeError, TypeError, ValueError) as error:

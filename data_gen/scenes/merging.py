@@ -24,6 +24,9 @@ def load_merged(path: str, parameters: dict[str, str]) -> object:
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
+    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
+    # would be compiled again.
+    config.parallel = False
     with _found_beside(path):
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)

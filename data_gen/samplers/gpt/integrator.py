@@ -47,7 +47,7 @@ import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.frozen import Frozen
 from data_gen.paths.spectrum import to_rgb
@@ -118,7 +118,7 @@ class GPT(GradientIntegrator):
 
     def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
-        values, Δ, inside, rest = frozen(self.samples, plan, camera)
+        values, Δ, inside, rest = frozen(self.samples, plan, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:
             values["primal"] = reused(camera, rest, Δ, inside) + values["direct"]
         if plan.manifold:

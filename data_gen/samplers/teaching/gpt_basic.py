@@ -54,7 +54,7 @@ class GPTBasic(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         estimate = radiance(scene, self.integrator)
-        return recorded(scene, partial(self.samples, scene, estimate))
+        return recorded(scene, partial(self.samples, scene, estimate), shifts=SHIFTS.values())
 
     def samples(self, scene, estimate, camera: CameraSamples) -> dict:
         """One base path for each camera sample, shifted to the four neighbours of its pixel."""

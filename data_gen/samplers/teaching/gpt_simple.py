@@ -66,7 +66,7 @@ class GPTSimple(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         refuse(scene, self.limits)
-        return recorded(scene, partial(self.samples, scene))
+        return recorded(scene, partial(self.samples, scene), shifts=SHIFTS.values())
 
     def samples(self, scene, camera: CameraSamples) -> dict:
         """One base path and its four offset paths for each camera sample."""
