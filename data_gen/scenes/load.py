@@ -29,7 +29,11 @@ def load_scene(
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            scene = load_merged(name, parameters) if merged else mi.load_file(name, parallel=False, optimize=False, **parameters)
+            scene = (
+                load_merged(name, parameters)
+                if merged
+                else mi.load_file(name, parallel=False, optimize=False, **parameters)
+            )
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")

@@ -7,8 +7,6 @@ import pytest
 from bdpt_scenes import SCENES
 from unbiased import load
 
-from ngpt.errors import NgptError
-
 FROM_THE_CAMERA = ("gpt", "primal", "gpt-basic", "gpt-simple", "split")
 
 
@@ -65,9 +63,7 @@ def test_paths_from_both_ends_are_recorded_once(renderer, recordings, sampler):
     assert len(others) == 1 and recordings.total() - first <= first + 1
 
 
-@pytest.mark.parametrize(
-    "options", [{"reuse": True}, {"shift": "manifold"}]
-)
+@pytest.mark.parametrize("options", [{"reuse": True}, {"shift": "manifold"}])
 def test_options_of_gpt_are_recorded_once(renderer, recordings, options):
     render(renderer, load(renderer, "glossy", (9, 7)), "gpt", [16, 32, 16], **options)
     assert recordings.of == {"samples": 1}
@@ -98,7 +94,13 @@ def test_pixels_in_any_number_are_recorded_once(renderer, recordings):
     passes = []
     scene = load(renderer, "diffuse", (12, 8))
     render_stack(
-        scene, 160, 1, "gpt", adaptive=Adaptive(None, "wcv"), progress=lambda *done: passes.append(done), lamps="uniform"
+        scene,
+        160,
+        1,
+        "gpt",
+        adaptive=Adaptive(None, "wcv"),
+        progress=lambda *done: passes.append(done),
+        lamps="uniform",
     )
     assert len(passes) > 3 and recordings.of == {"samples": 1}
 
@@ -187,3 +189,36 @@ def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
         calls.clear()
 
 
+def test_renders_of_one_scene_share_what_is_recorded(renderer, recordings):
+    """With another camera as well; whatever else changes is seen."""
+    from data_gen.dataset.cameras import View
+    from data_gen.made import Made
+    from data_gen.render import render_stack
+    from data_gen.scenes import builtin
+
+    mi, made = renderer, Made()
+    lens = {"type": "thinlens", "aperture_radius": 0.02, "focus_distance": 4.0}
+    scene = load(mi, lambda: builtin.diffuse() | {"sensor": builtin.diffuse()["sensor"] | lens}, (16, 16))
+
+    def rendered(i, made=None, **options):
+        origin, up, window = (0.2 * i, 1.2, 3.5 - 0.3 * i), (0.1 * i, 1, 0), (10 + i, 12)
+        View(origin, (0, 1, 0), up, 50 - 5 * i, 0.02 * (i + 1), 4 - i, (64 + 8 * i, 48), window, 16).apply(scene)
+        return render_stack(scene, 4, i, "gpt", made=made, **options)
+
+    anew = [rendered(i) for i in range(3)]
+    recordings.of.clear()
+    shared = [rendered(i, made) for i in range(3)]
+    # The second render may find numbers of the camera that are one.
+    assert recordings.total() <= 2
+    for one, other in zip(anew, shared, strict=True):
+        assert all(np.array_equal(one[name], other[name], equal_nan=True) for name in one.names)
+    recordings.of.clear()
+    rendered(2, made)
+    assert not recordings.of
+    rendered(2, made, caustic=False)
+    assert recordings.of
+    params = mi.traverse(scene)
+    params["lamp.emitter.radiance.value"] = mi.Color3f(1, 2, 3)
+    params.update()
+    bright, again = rendered(2), rendered(2, made)
+    assert np.array_equal(bright["primal"], again["primal"]) and not np.array_equal(bright["primal"], anew[2]["primal"])
