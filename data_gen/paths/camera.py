@@ -122,11 +122,13 @@ class CameraSamples:
         return ray, importance, inside
 
     def _shift(self, shift) -> mi.Vector2f:
+        if isinstance(shift, mi.Vector2f):
+            return shift
         if shift in QUARTERS:
             within = self.position - mi.Point2f(self.pixel % self.size.x, self.pixel // self.size.x)
             half = dr.select(within < 0.5, mi.Vector2f(0.5), -0.5)
             return mi.Vector2f(half.x if "x" in shift else 0, half.y if "y" in shift else 0)
-        return shift if isinstance(shift, mi.Vector2f) else mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
+        return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
 
     def look(self, *shifts: tuple[int, int] | str) -> Self:
         """These samples, of which a function that is recorded once may ask the rays by such ``shifts``.

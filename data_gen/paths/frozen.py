@@ -28,7 +28,7 @@ class Frozen:
 
     def __init__(self, scene: mi.Scene, *owners: Any):
         # Not bound to ``self``: what is in no circle goes when the render does.
-        state = [scene, *map(arrays, owners)]
+        self.scene, state = scene, [scene, *map(arrays, owners)]
         # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
         self.options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
         self.functions: dict[Callable, Callable] = {}
@@ -44,17 +44,19 @@ class Frozen:
         def tried(f: Callable) -> Any:
             return f(*args, *([sums()] if sums else []))
 
-        if f not in self.functions:
-            self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)
-            try:
+        try:
+            if f not in self.functions:
+                self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)
                 # Dr.Jit makes an array of each number that it meets, and one that belongs to several objects becomes
                 # several arrays, which are one again from the next call on. What does nothing is recorded for that.
                 tried(self.settle)
-                return tried(self.functions[f])
-            except RuntimeError as error:
-                # As with lamps, below: what an object made while it was recorded is there the next time.
-                stop_if_interrupted(error)
+            return tried(self.functions[f])
+        except RuntimeError as error:
+            stop_if_interrupted(error)
         try:
+            # There may be a new scene in the process.
+            _wake_lamps(self.scene)
+            tried(self.settle)
             return tried(self.functions[f])
         except RuntimeError as error:
             stop_if_interrupted(error)

@@ -2,6 +2,7 @@
 
 import gc
 from collections import Counter
+from functools import wraps
 
 import pytest
 
@@ -25,6 +26,7 @@ def recordings(renderer, monkeypatch):
     seen, wrapped, real = Recordings(), {}, Frozen.__call__
 
     def call(self, f, *args, **options):
+        @wraps(getattr(f, "func", f))
         def counted(*args):
             seen.of[getattr(getattr(f, "func", f), "__name__", "")] += 1
             return f(*args)
