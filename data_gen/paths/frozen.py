@@ -1,7 +1,8 @@
 """Functions whose kernels are recorded once in a render, and launched again from then on.
 
-A pass of photons has few camera samples and many kernels. To record them, and to find that they are known, would take
-longer than to run them.
+Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are, and a pass of photons has
+few camera samples and many kernels. A function is recorded again where it meets arrays of other types, where two of its
+arrays happen to be of one width, or of width 1, and where scenes come into the process or leave it.
 """
 
 from __future__ import annotations

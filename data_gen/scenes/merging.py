@@ -1,7 +1,7 @@
 """Scene files whose meshes are merged by material.
 
-Each shape of a scene is a case of its own in the kernels, which Dr.Jit records anew for each pass. A room of 800 meshes
-takes seconds for that, and a tenth of it once meshes of one material are one.
+Each shape of a scene is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800
+meshes takes seconds for that, and a tenth of it once meshes of one material are one.
 """
 
 from __future__ import annotations
