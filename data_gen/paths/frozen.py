@@ -153,11 +153,15 @@ def call(f: Callable, *args: Any) -> Any:
 
 
 def arrays(owner: Any) -> list:
-    """The arrays in the attributes of an object, and of objects there."""
+    """The arrays in the attributes of an object, and of objects there, which become copies.
+
+    Kernels tell arrays by how their memory is aligned, and NumPy's is so or so: they would have to be compiled again.
+    """
     found: list = []
-    for value in vars(owner).values() if hasattr(owner, "__dict__") else ():
+    for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():
         if value is not None and dr.is_jit_v(value):
-            found.append(value)
+            setattr(owner, name, dr.opaque(value))
+            found.append(getattr(owner, name))
         elif type(value).__module__.startswith("data_gen."):
             found += arrays(value)
     return found
