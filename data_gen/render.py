@@ -12,6 +12,7 @@ import mitsuba as mi
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
 from data_gen.film import GradientFilm
+from data_gen.made import Made
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
@@ -45,6 +46,7 @@ def render_stack(
     diagnostics: bool = False,
     with_features: bool = True,
     adaptive: Adaptive | None = None,
+    made: Made | None = None,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -60,6 +62,8 @@ def render_stack(
 
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
+
+    Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
     The same seed, options and number of samples give the same bits, however they came about. Where it is not known
     before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. A render that was ended by
@@ -98,8 +102,9 @@ def render_stack(
         settings["points"] = "rounds"
     limits["points"] = settings.get("points", "independent")
     with weighed(scene, settings["lamps"], entry.by_place) as places:
-        more |= {"places": places} if places else {}
-        sample = entry.make(scene, **own(settings), **more)
+        more |= own(settings) | ({"places": places} if places else {})
+        made = made or Made()
+        sample = made.sampler(entry, scene, more)
         # However long it took to weigh the lamps, the render is begun.
         limits["seconds"] = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
         failed = None
@@ -114,6 +119,8 @@ def render_stack(
                 raise
             film, failed = whole[0], error
             film.forget_pass()
+        else:
+            made.keep(entry, scene, more, sample)
     done = round(float(film.samples_each.mean()))
     chosen = chosen | {"ngpt:spp": done} | options_as_attribute(entry, settings)
     if failed or (stop() and (spp is None or done < spp)):

@@ -46,6 +46,7 @@ data_gen.film data_gen.paths data_gen.samplers.registry
 data_gen.passes
 data_gen.uneven
 data_gen.samplers
+data_gen.made
 data_gen.adaptive data_gen.begun
 data_gen.plugins
 data_gen.backend

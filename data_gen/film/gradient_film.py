@@ -83,9 +83,9 @@ class GradientFilm:
         self._pass[name] = (_components(value), active)
 
     def put_all(self, values: dict) -> None:
-        """``put`` for several values: name -> samples."""
+        """``put`` for several values: name -> samples, or (samples, which of them exist)."""
         for name, value in values.items():
-            self.put(name, value)
+            self.put(name, *(value if isinstance(value, tuple) else (value,)))
 
     def splat(self, name: str, pixel: mi.UInt32, value, active: bool | mi.Bool = True) -> None:
         """Adds values to any pixel: the ``pixel`` of each lane, numbered row by row. Only films with ``batches`` can.

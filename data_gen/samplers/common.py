@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 
 import drjit as dr
@@ -12,7 +12,8 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
@@ -39,6 +40,17 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
         prb = mi.load_dict({"type": "prb", **depths})
         return own_estimate(scene, prb)
     return own_estimate(scene, integrator)
+
+
+def recorded(
+    scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
+) -> SamplePass:
+    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``.
+
+    Beside the rays of the camera samples it asks for those by the ``shifts``.
+    """
+    frozen = Frozen(scene, *owners)
+    return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

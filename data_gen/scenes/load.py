@@ -37,7 +37,7 @@ def load_scene(
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
-            scene = mi.load_dict(SCENES[name](), optimize=False)
+            scene = mi.load_dict(SCENES[name](), parallel=False, optimize=False)
             sensor_number(sensor, [camera.id() for camera in scene.sensors()], name)
         else:
             raise NgptError(f"{name}: no such file, nor a built-in scene; those are: {', '.join(SCENES)}")

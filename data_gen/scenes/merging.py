@@ -1,7 +1,7 @@
 """Scene files, whose meshes are merged by material and of whose sensors one may be chosen.
 
-Each shape of a scene is a case of its own in the kernels, which Dr.Jit records anew for each pass. A room of 800 meshes
-takes seconds for that, and a tenth of it once meshes of one material are one.
+Each shape of a scene is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800
+meshes takes seconds for that, and a tenth of it once meshes of one material are one.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int |
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
+    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
+    # would be compiled again.
+    config.parallel = False
     with _found_beside(path):
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)
