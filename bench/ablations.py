@@ -25,10 +25,11 @@ from ngpt.network.weights import load_weights
 from ngpt.repair import repair
 from ngpt.system import configs
 from ngpt.training.cost import per_pixel
-from ngpt.training.examples import judges_of, split
+from ngpt.training.examples import judges_of
 from ngpt.training.folders import open_crops
 from ngpt.training.loss import make_loss
 from ngpt.training.settings import Settings, read_settings
+from ngpt.training.split import split
 from ngpt.training.trainer import Trainer
 
 # What is changed of the configuration; the plain network has as many parameters.
@@ -105,7 +106,7 @@ def main() -> None:
     args = parser.parse_args()
 
     shared = [f"data.folders={_toml(args.data)}", f"data.validation={_toml(args.apart)}", *args.set]
-    crops, held_out = split([crop for folder in args.data for crop in open_crops(folder)], tuple(args.apart))
+    crops, held_out, _ = split([crop for folder in args.data for crop in open_crops(folder)], tuple(args.apart))
     if not crops or not held_out:
         raise NgptError(f"{len(crops)} crops to train on, {len(held_out)} kept apart: change --apart")
     config, variants = configs.find_config("ablations", configs.TRAINING), {}

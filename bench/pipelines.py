@@ -67,7 +67,7 @@ def main() -> None:
         result["scenes"][scene_name(path)] = bench_scene(path, args) | {"apart": path in args.apart}
         save(args.output, result)
         print(f"{scene_name(path)}: {time.perf_counter() - start:.0f} s", flush=True)
-    print(*table(result), sep="\n")
+    print(*table(result), *promises(result), sep="\n")
 
 
 class Kept:
@@ -245,6 +245,31 @@ def cells(entry: dict) -> list[dict]:
         auto = by_sampler[best_of(plain, seconds)[0]] / min(by_sampler.values())
         found.append({"spp": n, "errors": errors, "choice": name_of(ranked[0]), "auto": auto})
     return found
+
+
+def promises(result: dict) -> list[str]:
+    """Lines: the true error over the expected one at times the pilot's samples, 10, 50 and 90 % and geometric mean, of
+    methods by gradients with a network and of others, on all scenes; samples of ``gpt`` and ``primal``."""
+    from data_gen.choosing.pipelines import SPREADS, Pipeline
+    from ngpt.methods import METHODS
+
+    found: dict[tuple[bool, int], list[float]] = {(network, n): [] for network in SPREADS for n in LADDER}
+    for entry in result["scenes"].values():
+        unit = next(row["seconds"] for row in entry["rows"] if row["pilot"]["sampler"] == entry["first"])
+        longest = max(row["after"] for row in entry["rows"])
+        for row in entry["rows"]:
+            p = replace(Pipeline(**row["pilot"]), seconds=row["seconds"], after=row["after"])
+            for n in LADDER if p.sampler in ("gpt", "primal") else ():
+                spp = p.samples(n * unit + longest)
+                if spp >= max(p.least, 2):
+                    network = {"dx", "albedo"} <= set(METHODS[p.method].needs)
+                    found[network, n].append(true_error(row["errors"], spp) / p.expected(spp))
+    lines = []
+    for (network, n), ratios in found.items():
+        deciles = statistics.quantiles(ratios, n=10)
+        ends = ", ".join(f"{deciles[i]:.2f}" for i in (0, 4, 8))
+        lines.append(f"{'networks' if network else 'others'} at {n}: {ends}; {mean_log(ratios):.2f} in the mean")
+    return ["true error over what was expected", *lines]
 
 
 def name_of(p) -> str:

@@ -10,6 +10,7 @@ import ast
 import hashlib
 from collections.abc import Iterable
 from functools import lru_cache
+from importlib.util import find_spec
 from pathlib import Path
 
 from data_gen.samplers import SAMPLERS
@@ -89,7 +90,10 @@ def _exists(module: str) -> bool:
 
 
 def _file(module: str) -> Path:
-    """The file of a module of data_gen, or of a package's ``__init__``."""
+    """The file of a module of data_gen, or of a package's ``__init__``; or of another package's module."""
+    if module.partition(".")[0] != "data_gen":
+        spec = find_spec(module)
+        return Path(spec.origin if spec and spec.origin else module)
     path = ROOT.joinpath(*module.split(".")[1:])
     return path / "__init__.py" if path.is_dir() else path.with_suffix(".py")
 

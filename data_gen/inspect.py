@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import mitsuba as mi
@@ -10,6 +12,7 @@ import mitsuba as mi
 from data_gen.samplers import SAMPLERS, by_standing, choose
 from data_gen.scenes.builtin import SCENES, no_scene
 from data_gen.scenes.facts import Facts, polarised
+from data_gen.scenes.integrators import AROUND, lack, same_image
 from data_gen.scenes.load import complaint
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS
@@ -24,9 +27,9 @@ _LENSES = ("dielectric", "roughdielectric")
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     """Counts a scene's plugins by kind and says how it would be sampled.
 
-    ``name`` and ``parameters`` are those of ``load_scene``. Returns {"plugins": {kind: {plugin: count}}, "size":
-    (width, height) or None where the scene leaves it to Mitsuba, "media": names, "lens": whether there is depth of
-    field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
+    ``name`` and ``parameters`` are those of ``load_scene``. Returns {"plugins": {kind: {plugin: count}},
+    "sensors": a line for each, "size": (width, height) or None where the scene leaves it to Mitsuba, "media": names,
+    "lens": whether there is depth of field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
     """
     config = mi.parser.ParserConfig(mi.variant())
     try:
@@ -39,34 +42,34 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     except RuntimeError as error:
         raise NgptError(f"{name}: not a scene Mitsuba can read: {complaint(error)}") from error
     plugins = {kind: Counter() for kind in _KINDS}
-    size, shutter, media, cameras = None, 0.0, [], []
+    shutter, media = 0.0, []
+    sensors = [_Camera.of(nodes, node) for node in _children(nodes, nodes[0], mi.ObjectType.Sensor)]
+    taken = sensors[0] if sensors else _Camera()
     for node in nodes:
         kind, props = node.type.name, node.props
         if kind in plugins:
             plugins[kind][props.plugin_name()] += 1
-        if kind == "Film" and "width" in props and "height" in props:
-            size = (int(props["width"]), int(props["height"]))
         if kind == "Sensor":
-            cameras.append(props.plugin_name())
             shutter = float(props.get("shutter_close", 0.0)) - float(props.get("shutter_open", 0.0))
         if kind == "Medium":
             media.append(props.id() or props.plugin_name())
-    integrator = next(iter(plugins["Integrator"]), "path")
+    integrator, followed, unable = _transport(nodes)
     lens = "thinlens" in plugins["Sensor"]
     mirrors = any(name in plugins["BSDF"] for name in _MIRRORS)
     facts = Facts(
-        integrator,
+        followed,
         tuple(sorted(media)),
         polarised(),
         mirrors,
         grids="heterogeneous" in plugins["Medium"],
-        camera=cameras[0] if cameras else "perspective",
+        camera=taken.plugin,
         hair="hair" in plugins["BSDF"],
     )
     sampler, reason = choose(facts)
     return {
         "plugins": {kind.lower(): dict(counts.most_common()) for kind, counts in plugins.items() if counts},
-        "size": size,
+        "sensors": [camera.text(number, camera is taken) for number, camera in enumerate(sensors)],
+        "size": taken.size,
         "media": media,
         "lens": lens,
         "shutter": shutter,
@@ -74,11 +77,52 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         "plan": [
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
-            *SAMPLERS[sampler].notes(facts),
+            *([unable] if unable else SAMPLERS[sampler].notes(facts)),
+            *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
             *_camera(lens, shutter),
         ],
     }
+
+
+@dataclass(frozen=True)
+class _Camera:
+    """A sensor of a scene file: its id, its plugin, and (width, height) where the file says them."""
+
+    id: str = ""
+    plugin: str = "perspective"
+    size: tuple[int, int] | None = None
+
+    @classmethod
+    def of(cls, nodes: Sequence, sensor) -> _Camera:
+        films = [film.props for film in _children(nodes, sensor, mi.ObjectType.Film)]
+        sizes = [(int(film["width"]), int(film["height"])) for film in films if "width" in film and "height" in film]
+        return cls(sensor.props.id(), sensor.props.plugin_name(), next(iter(sizes), None))
+
+    def text(self, number: int, taken: bool) -> str:
+        name, size = f" '{self.id}'" if self.id else "", "{}x{}".format(*self.size) if self.size else "size not given"
+        return f"{number}{name}: {self.plugin}, {size}" + ", the one that is rendered" * taken
+
+
+def _children(nodes: Sequence, node, kind: mi.ObjectType) -> list:
+    """The nodes of a ``kind`` that a node of a parsed scene has."""
+    parts = [part.index() for _, part in node.props.items() if isinstance(part, mi.Properties.ResolvedReference)]
+    return [nodes[part] for part in parts if nodes[part].type == kind]
+
+
+def _transport(nodes: Sequence) -> tuple[str, str, str]:
+    """A scene's integrator, the one whose image is rendered, and why there is none, or ""."""
+    found = _children(nodes, nodes[0], mi.ObjectType.Integrator)
+    if not found:
+        return "path", "path", ""
+    outer = inner = found[0]
+    while True:
+        nested, plugin = _children(nodes, inner, mi.ObjectType.Integrator), inner.props.plugin_name()
+        if plugin not in AROUND or len(nested) != 1:
+            break
+        inner = nested[0]
+    hides = bool(inner.props.get("hide_emitters", False))
+    return outer.props.plugin_name(), same_image(plugin, hides), lack(plugin, len(nested))
 
 
 def _contents(plugins: dict[str, Counter], facts: Facts) -> list[str]:

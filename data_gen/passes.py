@@ -14,7 +14,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import ROUND, first_round
 from data_gen.samplers.registry import LANE_BYTES
 from ngpt.errors import NgptError
@@ -199,7 +199,7 @@ def film_within(
     width, height = (int(n) for n in sensor.film().crop_size())
     film = GradientFilm(width, height, batches=bool(batch), net=net)
     block = batch or block_of_samples(film.pixels)
-    most = blocks_within(memory, film, min(block, spp), lane_bytes, instead)
+    most = blocks_within(memory, film, min(block, spp), lane_bytes + bytes_of_rays(sensor), instead)
     return film, block, 1 if batch else most
 
 

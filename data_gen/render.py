@@ -10,7 +10,9 @@ from typing import Any
 import mitsuba as mi
 
 from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
+from data_gen.begun import Unfinished
 from data_gen.film import GradientFilm
+from data_gen.made import Made
 from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
@@ -18,8 +20,9 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
+from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
 
@@ -43,6 +46,7 @@ def render_stack(
     diagnostics: bool = False,
     with_features: bool = True,
     adaptive: Adaptive | None = None,
+    made: Made | None = None,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -59,10 +63,14 @@ def render_stack(
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
 
-    The same seed, options and number of samples give the same bits, however they came about. Where it is not known
-    before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says.
+    Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
-    Raises NgptError for options that do not exist or make no sense, and for a scene that the sampler cannot render.
+    The same seed, options and number of samples give the same bits, however they came about. Where it is not known
+    before, the option points=rounds is taken, which ``ngpt:samplerOptions`` then says. A render that was ended by
+    ``stop`` before it had all says so in ``ngpt:unfinished``.
+
+    Raises Unfinished, which has the stack of the samples done by then, where a later pass fails; and NgptError for
+    options that do not exist or make no sense, and for a scene that the sampler cannot render.
     """
     check_limits(spp, seed, sampler, seconds, memory, adaptive is not None and adaptive.error is not None)
     facts = scene_facts(check_scene(scene))
@@ -82,23 +90,45 @@ def render_stack(
     more = {"diagnostics": True} if diagnostics and entry.diagnoses else {}
     sensor, chosen = scene.sensors()[0], {}
     limits = {"progress": progress, "memory": memory, "stop": stop, "lane_bytes": entry.lane_bytes}
-    limits["look"] = lambda film: newest(lambda: stack_of(film, sensor, seed, sampler, start, False, {}))
+    whole: list[GradientFilm] = []  # the film after the last pass, if there was one
+
+    def look(film: GradientFilm) -> None:
+        whole[:] = [film]
+        newest(lambda: stack_of(film, sensor, seed, sampler, start, False, {}))
+
+    limits["look"] = look
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
     if settings.get("points") == "sobol" and (spp is None or seconds is not None or adaptive is not None):
         settings["points"] = "rounds"
     limits["points"] = settings.get("points", "independent")
     with weighed(scene, settings["lamps"], entry.by_place) as places:
-        more |= {"places": places} if places else {}
-        sample = entry.make(scene, **own(settings), **more)
+        more |= own(settings) | ({"places": places} if places else {})
+        made = made or Made()
+        sample = made.sampler(entry, scene, more)
         # However long it took to weigh the lamps, the render is begun.
         limits["seconds"] = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
-        if adaptive is None:
-            film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
+        failed = None
+        try:
+            if adaptive is None:
+                film = render_passes(sample, sensor, seed, spp, batch=entry.batch, **limits)
+            else:
+                film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
+        except Exception as error:
+            stop_if_interrupted(error)
+            if not whole:
+                raise
+            film, failed = whole[0], error
+            film.forget_pass()
         else:
-            film, chosen = render_adaptive(sample, sensor, seed, adaptive, spp, **limits)
-    if adaptive is not None:
-        chosen["ngpt:spp"] = round(float(film.samples_each.mean()))
-    return stack_of(film, sensor, seed, sampler, start, diagnostics, chosen | options_as_attribute(entry, settings))
+            made.keep(entry, scene, more, sample)
+    done = round(float(film.samples_each.mean()))
+    chosen = chosen | {"ngpt:spp": done} | options_as_attribute(entry, settings)
+    if failed or (stop() and (spp is None or done < spp)):
+        chosen[UNFINISHED] = "failed" if failed else "interrupted"
+    stack = stack_of(film, sensor, seed, sampler, start, diagnostics, chosen)
+    if failed:
+        raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
+    return stack
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:

@@ -66,6 +66,7 @@ def overview() -> dict[str, Any]:
     use_variant()
     from data_gen.scenes.builtin import SCENES
 
+    SAMPLERS.load()
     titles = {"samplers": "use", "samplers for some scenes": "niche", "samplers to compare with": "study"}
     found = {
         title: {name: entry.summary for name, entry in by_standing(standing).items()}

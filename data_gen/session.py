@@ -48,6 +48,7 @@ def render_scene(
     *,
     size: tuple[int, int] | None = None,
     parameters: Mapping[str, str] | None = None,
+    sensor: int | str | None = None,
     seconds: float | None = None,
     adaptive: bool = False,
     error: float | None = None,
@@ -65,6 +66,7 @@ def render_scene(
     """Renders the stack of a scene: a Mitsuba scene, a scene file, or a built-in scene by name.
 
     ``size``        (width, height) in pixels, and ``parameters``, the ``<default>`` values: of a file or built-in scene
+    ``sensor``      number or id of the one that is rendered, of a file; None: the first
     ``spp``         base paths per pixel (32 where nothing else ends the render); with ``adaptive`` their mean
     ``seconds``     of wall-clock time, compilation included; with ``method`` those of pilot, render and method
     ``adaptive``    more samples where the error of the result is large
@@ -88,6 +90,7 @@ def render_scene(
     _start(variant)
     from data_gen.passes import DEFAULT_MEMORY
     from data_gen.render import check_limits, render_stack
+    from data_gen.scenes.cameras import sensor_names
 
     memory = DEFAULT_MEMORY if memory is None else memory
     if spp is None and seconds is None and error is None:
@@ -97,7 +100,10 @@ def render_scene(
     # Before the scene is loaded, which may take long.
     check_limits(spp, seed, sampler, seconds, memory, error is not None)
     check_options(sampler, options)
-    scene = _loaded(scene, size, parameters)
+    scene = _loaded(scene, size, parameters, sensor)
+    if sensor is None and len(scene.sensors()) > 1:
+        names = sensor_names([camera.id() for camera in scene.sensors()])
+        said(f"there are {len(scene.sensors())} sensors ({names}), and none is named: 0 is rendered")
     pilot = sharing is None and sampler == "auto"
     plan = None
     if pilot:
@@ -138,6 +144,7 @@ def render_frames(
     *,
     size: tuple[int, int] | None = None,
     parameters: Mapping[str, str] | None = None,
+    sensor: int | str | None = None,
     camera: CameraPath | str | Path | None = None,
     fps: float = 24.0,
     dt: int = 0,
@@ -157,7 +164,8 @@ def render_frames(
     ``seconds``  for each frame
     ``sampler``  may be one of ``data_gen.samplers.FRAME_SAMPLERS`` too, which reuse the frames before
     ``skip``     asked when a frame's turn has come whether to leave it out
-    ``stop``     asked after each pass: a frame that is broken off is not given, nor any after it
+    ``stop``     asked after each pass: a frame that is broken off has ``ngpt:unfinished`` (with ``dt`` it is not
+                 given), and none is given after it
 
     All else as of ``render_scene``; ``data_gen.frames.shot`` says more of seeds and motion. A shot that changes by
     other means than a file's parameters: ``data_gen.frames.shot.Shot``. Raises NgptError as ``render_scene``, and for
@@ -193,13 +201,15 @@ def render_frames(
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
     options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics}
-    found = render_shot(Shot(describe, size, camera), frames, spp, seed, dt, skip=skip, sampler=sampler, **options)
+    found = render_shot(
+        Shot(describe, size, camera, sensor=sensor), frames, spp, seed, dt, skip=skip, sampler=sampler, **options
+    )
 
     def whole() -> Iterator[tuple[int, GradientStack]]:
         for frame, stack in found:
+            yield frame, stack
             if stop():
                 return
-            yield frame, stack
 
     return whole()
 
@@ -214,14 +224,21 @@ def _start(variant: str | None) -> None:
     use_variant(variant or (mitsuba.variant() if mitsuba else None) or DEFAULT_VARIANT)
 
 
-def _loaded(scene: mi.Scene | str | Path, size: tuple[int, int] | None, parameters: Mapping[str, str] | None):
+def _loaded(
+    scene: mi.Scene | str | Path,
+    size: tuple[int, int] | None,
+    parameters: Mapping[str, str] | None,
+    sensor: int | str | None,
+) -> mi.Scene:
     from data_gen.scenes.load import check_scene, load_scene
 
     if isinstance(scene, str | Path):
-        return load_scene(str(scene), size, dict(parameters or {}))
+        return load_scene(str(scene), size, dict(parameters or {}), sensor=sensor)
     check_scene(scene)
-    if size is not None or parameters:
-        raise NgptError("a scene that is loaded has its size and parameters; load it with them: data_gen.load_scene")
+    if size is not None or parameters or sensor is not None:
+        raise NgptError(
+            "a scene that is loaded has its size, parameters and sensor; load it with them: data_gen.load_scene"
+        )
     return scene
 
 

@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_gen.session import render_frames
-from ngpt.errors import WrongUse
-from ngpt.io.exr import write
+from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name, write_part
+from data_gen.frames.pattern import filled
+from data_gen.samplers import FRAME_SAMPLERS
+from data_gen.session import DEFAULT_SPP, render_frames
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
 from ngpt.stack import GradientStack
 from ngpt.system.files import check_output
@@ -22,7 +24,7 @@ FRAMES_OF_A_PART = 8
 @dataclass
 class Written:
     """``frames``: of each that was written its ``output``, size and attributes; how many were ``skipped`` since their
-    files are there; and the one that was ``interrupted``, if any."""
+    files are there; and the first that has not all its samples since it was ``interrupted``, if any."""
 
     frames: list[dict[str, Any]] = field(default_factory=list)
     skipped: int = 0
@@ -57,29 +59,87 @@ def write_frames(
     for frame in ours:
         check_output(files[frame], overwrite or skip_existing, may_skip=True)
     written = Written()
+    asked = {frame: asked_of(scene, frame, **options) for frame in ours}
+    # Before the others, and those together of which as much is left: the scene stays in memory.
+    begun: dict[Rest, list[int]] = {}
+    for frame in ours:
+        if skip_existing and finished(files[frame]) and (rest := asked[frame].left(files[frame])):
+            begun_stack(files[frame], bool(options.get("diagnostics")))
+            begun.setdefault(rest, []).append(frame)
+    gone_on = {frame for frames in begun.values() for frame in frames}
+    made(written, len(ours))
 
     def skip(frame: int) -> bool:
         # Only when its turn has come, for several machines may be at work on one shot.
-        if part_of[frame] != number:
+        if part_of[frame] != number or frame in gone_on:
             return True
-        there = skip_existing and finished(files[frame])
+        there = skip_existing and finished(files[frame]) and asked[frame].left(files[frame]) is None
         written.skipped += there
         return there
 
-    stacks = render_frames(scene, list(files), skip=skip, stop=stop, **options)
-    made(written, len(ours))
-    for frame, stack in stacks:
+    def add(frame: int, stack: GradientStack) -> None:
+        asked[frame].name(stack)
+        cut = skip_existing and files[frame].exists() and not finished(files[frame])
         # Another machine may have been faster.
-        there = skip_existing and finished(files[frame])
-        cut = skip_existing and not there and files[frame].exists()
-        if not there:
-            write(files[frame], stack, overwrite=overwrite or cut)
-        more = {"in place of": "a file that was not whole"} if cut else {}
-        written.frames.append(report_of(stack, files[frame]) | more)
+        if not (skip_existing and asked[frame].done(files[frame])):
+            before = begun_stack(files[frame], bool(options.get("diagnostics"))) if frame in gone_on else None
+            stack = write_part(files[frame], stack, overwrite or cut, before)
+        said = {"in place of": "a file that was not whole"} if cut else {}
+        written.frames.append(report_of(stack, files[frame]) | said)
         made(written, len(ours))
-    if stop() and written.done < len(ours):
-        written.interrupted = ours[written.done]
+
+    def write_all(skip: Callable[[int], bool], more: Mapping[str, Any]) -> None:
+        try:
+            for frame, stack in render_frames(scene, list(files), skip=skip, stop=stop, **(options | more)):
+                add(frame, stack)
+        except Unfinished as error:
+            frame = error.stack.attributes["ngpt:frame"]
+            if not options.get("dt"):
+                add(frame, error.stack)
+                raise NgptError(f"{error}; {files[frame]} has the samples done before") from error
+            raise
+
+    for rest, frames in begun.items():
+        write_all(lambda frame, these=frozenset(frames): frame not in these, rest.options(options.get("seed", 0)))
+    write_all(skip, {})
+    if stop():
+        done = {report["frame"] for report in written.frames if "unfinished" not in report}
+        written.interrupted = next(
+            (frame for frame in ours if frame not in done and not asked[frame].done(files[frame])), None
+        )
     return written
+
+
+def asked_of(
+    scene: str,
+    frame: int,
+    *,
+    spp: int | None = None,
+    seed: int = 0,
+    sampler: str = "auto",
+    size: tuple[int, int] | None = None,
+    parameters: Mapping[str, str] | None = None,
+    camera: Any = None,
+    sensor: int | str | None = None,
+    fps: float = 24.0,
+    dt: int = 0,
+    seconds: float | None = None,
+    memory: int | None = None,
+    diagnostics: bool = False,
+    variant: str | None = None,
+    **options: Any,
+) -> Asked:
+    """What ``render_frames`` is asked for a frame: its arguments are those of that."""
+    remembers = FRAME_SAMPLERS.get(sampler)
+    if spp is None and (seconds is None or remembers):
+        spp = remembers.spp if remembers else DEFAULT_SPP
+    given = {name: filled(text, frame) for name, text in (parameters or {}).items()} | {
+        "--fps": str(fps),
+        "--dt": str(dt),
+    }
+    given |= {} if sensor is None else {"--sensor": str(sensor)}
+    name = scene_name(filled(scene, frame), given, str(camera) if camera is not None else None)
+    return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame)
 
 
 def report_of(stack: GradientStack, file: Path) -> dict[str, Any]:

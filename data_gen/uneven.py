@@ -12,7 +12,7 @@ import numpy as np
 from data_gen import passes
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, PACKET, SamplePass, foretold, lanes_within, recording
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import CameraSamples, bytes_of_rays
 from data_gen.paths.streams import first_round
 from data_gen.samplers.registry import LANE_BYTES
 
@@ -51,7 +51,7 @@ class UnevenRender:
         self.sample, self.sensor, self.seed, self.stop, self.report = sample, sensor, seed, stop, report
         self.blocks_left = (most or 1 << 62) // BLOCK
         # Raises NgptError where not even one row's worth fits.
-        self.at_once = lanes_within(memory, self.film, BLOCK * width, lane_bytes) // BLOCK
+        self.at_once = lanes_within(memory, self.film, BLOCK * width, lane_bytes + bytes_of_rays(sensor)) // BLOCK
         self.end = None if seconds is None else time.perf_counter() + seconds
         self.passes: list[tuple[int, float]] = []  # blocks and seconds of each
         self.ended = False

@@ -30,6 +30,8 @@ from ngpt.windows import Place, Window
 VARIANCES = {name: f"{name}_var" for name in ("primal", "dx", "dy", "caustic", "diffuse", "specular", "dt")}
 # Channels beside the layers that are means over samples too.
 DIAGNOSTICS = "diagnostics."
+# Attribute: what broke a render off before all that was asked for was done, "interrupted" or "failed"
+UNFINISHED = "ngpt:unfinished"
 # Samples of a pixel, of which headers count as many in 32 bits
 _MOST = 2.0**31
 
@@ -55,11 +57,11 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     are known of tiles that overlap by a pixel.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, and all other attributes are those of the first stack. Raises
-    NgptError for fewer than two stacks, stacks that differ in layers or sampler, or are of pictures of different size,
-    tiles that leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``,
-    ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded`` that are no numbers, results of
-    a reconstruction, and channels of unknown meaning.
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:unfinished`` is left out, and all other attributes are
+    those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or sampler, or
+    are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place, missing
+    ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded``
+    that are no numbers, results of a reconstruction, and channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -85,6 +87,7 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
         "ngpt:spp": max(1, round(float(total.mean()))),
         "ngpt:seed": " ".join(seeds),
     }
+    attributes.pop(UNFINISHED, None)
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)

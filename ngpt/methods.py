@@ -1,6 +1,7 @@
 """The reconstruction methods: one registry, one way to call them.
 
-A new method is one more entry in ``METHODS``; the command line, the reports and the tables find it there.
+A new method is one more entry in ``_OURS``; the command line, the reports and the tables find it in ``METHODS``. Other
+packages bring theirs by entry points of the group "ngpt.methods" (docs/methods/add-a-method.md).
 """
 
 import logging
@@ -12,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
+from ngpt.coverage import kept_within
 from ngpt.denoisers import caustic, nfor, nlm, oidn
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.io.primaries import converted, inside_rec709
@@ -22,6 +24,7 @@ from ngpt.network.run import OPTIONS, Shipped
 from ngpt.options import Option, as_text, settings, unusual
 from ngpt.repair import Repaired, finite_pixels, repair
 from ngpt.stack import GradientStack
+from ngpt.system.parts import Registry
 
 _LOG = logging.getLogger(__name__)
 
@@ -47,7 +50,7 @@ class Method:
     run: Callable[..., np.ndarray]
     options: dict[str, Option]
     standing: str = "niche"
-    missing: Callable[[], str] = lambda: ""
+    missing: Callable[[], str] = str
     uses: tuple[str, ...] = ()
     estimates: tuple[str, ...] = ()
     variant: str = ""
@@ -111,7 +114,7 @@ def _network(
     summary: str,
     needs: tuple[str, ...],
     standing: str = "use",
-    also_missing: Callable[[], str] = lambda: "",
+    also_missing: Callable[[], str] = str,
     estimates: tuple[str, ...] = (),
 ) -> Method:
     network = Shipped(name, also_missing)
@@ -127,7 +130,7 @@ def _variant(method: str, entry: Method, summary: str, **options: Any) -> Method
 _GRADIENTS = ("primal", "dx", "dy")
 _FEATURES = ("albedo", "normal", "depth")
 
-METHODS = {
+_OURS = {
     "primal": Method("the Monte Carlo estimate as it is", ("primal",), _primal, {}),
     "l2": _classical("l2", "screened Poisson, least squares: unbiased, fast"),
     "l1": _classical("l1", "screened Poisson, least norms: robust to outliers", "use"),
@@ -180,17 +183,18 @@ METHODS = {
         rec709=True,
     ),
 }
-METHODS |= {
-    "oidn-clean": _variant("oidn", METHODS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
-    "oidn-noisy": _variant("oidn", METHODS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
+_OURS |= {
+    "oidn-clean": _variant("oidn", _OURS["oidn"], "OIDN that takes the features for clean", auxiliary="clean"),
+    "oidn-noisy": _variant("oidn", _OURS["oidn"], "OIDN that is told the features are noisy", auxiliary="noisy"),
     "oidn-fast": _variant(
         "oidn",
-        METHODS["oidn"],
+        _OURS["oidn"],
         "OIDN's quickest network, with the features as they are",
         auxiliary="clean",
         quality="fast",
     ),
 }
+METHODS = Registry("ngpt.methods", "method", Method, _OURS)
 
 
 def by_standing(*standings: str) -> dict[str, Method]:
@@ -256,7 +260,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
     # What the weights of a network need, they say themselves.
     stack.require(*(("primal",) if own else entry.needs), why=f"weights {own}" if own else f"method '{name}'")
     reads = Shipped(name).reads(**values) if "weights" in entry.options else entry.needs
-    matrix = inside_rec709(stack) if entry.rec709 else None
+    given, matrix = stack, inside_rec709(stack) if entry.rec709 else None
     if matrix is not None:
         light = {name: converted(stack[name], matrix) for name in ("primal", "direct", "caustic") if name in stack}
         stack = stack.replace(**light)
@@ -285,7 +289,7 @@ def reconstruct(stack: GradientStack, method: str = "auto", **options) -> Result
             f"{enlarged(np.abs(data.image).max(), power):.3g}: scale the stack down, or use another method"
         )
     return Result(
-        np.ascontiguousarray(image, np.float32),
+        np.ascontiguousarray(kept_within(image, given), np.float32),
         weights.method if weights else name,
         seconds,
         data.pixels,

@@ -25,7 +25,6 @@ SETTINGS = {
     "run.steps": "60000",
     "run.save": "100",
     "optimizer.learning_rate": "2e-4",
-    "data.validation": "[]",
     "data.cache": "4096",
 }
 SETS = ("data-cpu", "data-pairs")

@@ -1,6 +1,7 @@
 """The commands as processes of their own: small work for each, what it leaves, and ways to end it before its time."""
 
 import json
+import multiprocessing
 import os
 import re
 import signal
@@ -33,6 +34,23 @@ def _hear_interrupts() -> None:
 def complete(arguments, **options) -> subprocess.CompletedProcess:
     options = {"capture_output": True, "text": True, "cwd": ROOT, "timeout": 300} | options
     return subprocess.run([str(a) for a in arguments], env=ENVIRONMENT, check=False, **options)
+
+
+needs_forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
+no_warning_of_forks = pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
+
+
+def in_a_child(work, i=0, seconds=60):
+    """What ``work(i)`` returns in a forked child, as bytes; fails where the child takes longer."""
+    ours, theirs = multiprocessing.Pipe(duplex=False)
+    child = multiprocessing.get_context("fork").Process(target=lambda: theirs.send_bytes(work(i).tobytes()))
+    child.start()
+    try:
+        assert ours.poll(seconds), "the child hangs"
+        return ours.recv_bytes()
+    finally:
+        child.kill()
+        child.join()
 
 
 def temporary_files(folder: Path) -> list[Path]:

@@ -111,6 +111,35 @@ def test_slurm(farm):
     assert all(call.frames == list(range(240)) for call in farm.calls())
 
 
+# Renders until it is told to stop, and the second time to the end.
+STOPPED = """#!/bin/bash
+echo "$@" >> "$FARM_LOG"
+[ -e "$FARM_LOG.stopped" ] && exit 0
+trap 'touch "$FARM_LOG.stopped"; sleep 0.2; exit 143' TERM
+kill -TERM $PPID
+for n in $(seq 100); do sleep 0.1; done
+"""
+SCONTROL = """#!/bin/bash
+echo scontrol "$@" >> "$FARM_LOG"
+"""
+
+
+def test_slurm_has_a_part_that_ran_out_of_time_run_again(farm, monkeypatch):
+    """As Slurm does it: it signals the script, ends with its status, and runs it again once it is queued anew."""
+    for name, text in (("ngpt", STOPPED), ("scontrol", SCONTROL)):
+        (farm.folder / "bin" / name).write_text(text)
+        (farm.folder / "bin" / name).chmod(0o755)
+    for name, number in (("SLURM_ARRAY_JOB_ID", "4711"), ("SLURM_ARRAY_TASK_ID", "2")):
+        monkeypatch.setenv(name, number)
+    script = [str(FARM / "slurm-still.sh"), farm.scene, str(farm.folder / "out"), "3", "500"]
+    statuses = [subprocess.run(script, timeout=60, check=False).returncode for _ in range(2)]
+    first, queued, again = (farm.folder / "log").read_text().splitlines()
+    assert statuses == [143, 0] and queued == "scontrol requeue 4711_2"
+    assert first == again and "--skip-existing" in first
+    # The signal goes to the script, which Slurm does not do by itself.
+    assert "--signal=B:TERM@" in (FARM / "slurm-still.sh").read_text()
+
+
 def check_still(farm, spp):
     """Three parts of so many samples, one stack of them, one image."""
     *renders, merge, denoise = farm.calls()

@@ -143,8 +143,59 @@ def test_without_crops_nothing_is_trained(window):
     programs, made = window(data=())
     assert "run-a" not in programs
     assert [part["told"] for part in made.parts if part["part"] == "a"] == [
-        "no crops: neither --data nor any that were rendered here"
+        "no crops: neither --data nor any that were rendered here in time"
     ]
+
+
+def set_of(folder, *scenes):
+    """A training set as far as its manifest."""
+    crop = {"spp": [2], "seconds": {}}
+    shards = [
+        {"file": f"shards/{s}.safetensors", "sha256": "", "bytes": 1, "scene": s, "crops": [crop], "failures": []}
+        for s in scenes
+    ]
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(
+        folder / "manifest.json",
+        {"format": "ngpt-dataset", "version": 1, "config": {}, "planned": 4, "shards": shards},
+    )
+
+
+def test_training_waits_for_the_first_crop_where_there_is_no_set(window, tmp_path, monkeypatch):
+    """Which a busy machine makes after the share of rendering."""
+    looks = iter([{}] * 40)
+    monkeypatch.setattr(conductor, "crops", lambda folder: next(looks, {"llvm_ad_rgb": 1}))
+    programs, made = window(took={"crops-gpu": 1e9, "crops-processors": 1e9, "run-a": 1e9}, data=())
+    assert "run-a" in programs and programs["run-a"].given > 60
+    assert programs["crops-gpu"].seconds <= 60
+    assert [part["part"] for part in made.parts][:2] == ["checks", "crops, gpu"]
+
+
+@pytest.mark.parametrize(
+    ("scenes", "expected"),
+    [
+        (("made-00000", "made-00001"), ["made-00001"]),
+        (("made-00000",), []),  # the scene that is kept apart is not rendered yet
+        (("made-00001",), []),  # nothing else is
+    ],
+)
+def test_scenes_are_kept_apart_as_far_as_they_are_there(window, tmp_path, scenes, expected):
+    set_of(tmp_path / "set", *scenes)
+    programs, _ = window()
+    assert f"data.validation={json.dumps(expected)}" in programs["run-a"].arguments
+
+
+def test_a_window_that_trains_nothing_is_an_error(tmp_path, monkeypatch, capsys):
+    """It says why, and what to do; what was trained before does not count."""
+    monkeypatch.setattr(conductor.Window, "run", lambda self: self.note("paper", 0, "no crops"))
+    call = ["--recipe", "rehearsal", "--work", str(tmp_path / "work"), "--out", str(tmp_path / "out")]
+    assert conductor.main(call) == 1
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "nothing was trained (paper: no crops); give it more time (--minutes 12)" in error
+    counts = iter([3, 3, 3, 4])
+    monkeypatch.setattr(conductor, "steps", lambda work: next(counts))
+    assert conductor.main(call) == 1
+    assert conductor.main(call) == 0
 
 
 def test_a_program_is_ended_with_all_that_it_started(tmp_path):

@@ -46,6 +46,17 @@ def test_merged_stacks_are_the_stack_of_all_samples(rng, counts):
     assert merged.attributes["ngpt:seconds"] == 1.5 * len(counts)
 
 
+def test_a_part_that_was_broken_off_is_named(rng, tmp_path, capsys):
+    samples = 5 + rng.normal(size=(6, *SHAPE))
+    ngpt.write(tmp_path / "a.exr", stack_of(samples[:2], 1, **{"ngpt:unfinished": "interrupted"}))
+    ngpt.write(tmp_path / "b.exr", stack_of(samples[2:], 2))
+    parts = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
+    assert main(["merge", *parts, "-o", str(tmp_path / "all.exr")]) == 0
+    told = capsys.readouterr().err
+    assert f"{parts[0]}: was interrupted at 2 samples per pixel; " in told and f"{parts[1]}: was" not in told
+    assert "ngpt:unfinished" not in ngpt.read(tmp_path / "all.exr").attributes
+
+
 def test_frames_are_not_merged_with_others_and_keep_their_motion(rng):
     motion = rng.normal(size=(*SHAPE[:2], 2)).astype(np.float32)
     motion[0, 0] = np.nan

@@ -20,7 +20,7 @@ ngpt.report.display ngpt.report.png
 ngpt.report.transforms ngpt.report.pictures
 ngpt.api.tensors ngpt.layers ngpt.windows ngpt.testing ngpt.sequence.warp ngpt.report.notebook
 ngpt.stack
-ngpt.renderer ngpt.repair ngpt.magnitude ngpt.io
+ngpt.renderer ngpt.repair ngpt.magnitude ngpt.coverage ngpt.io
 ngpt.merging
 ngpt.classical
 ngpt.denoisers ngpt.sequence.wcv_frames
@@ -46,7 +46,8 @@ data_gen.film data_gen.paths data_gen.samplers.registry
 data_gen.passes
 data_gen.uneven
 data_gen.samplers
-data_gen.adaptive
+data_gen.made
+data_gen.adaptive data_gen.begun
 data_gen.plugins
 data_gen.backend
 data_gen.render data_gen.inspect

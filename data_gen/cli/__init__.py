@@ -4,6 +4,9 @@ from ngpt.cli import CONTINUES, Verb
 
 ROOM = "data_gen.cli"
 
+# What the first pass of a render is at for seconds, where no earlier render of the scene has left them
+KERNELS = "compiling kernels ..."
+
 VERBS = {
     "render": Verb("render a scene to a gradient stack", ROOM, heading="rendering"),
     "advise": Verb("say which method and how many samples to use, for a time or an error", ROOM, heading="rendering"),

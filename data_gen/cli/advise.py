@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 # More are not advised.
 LARGEST_SPP = 1 << 20
+# The pilot is that of a render of so many seconds at least: with less, a busy machine compiles no kernels.
+LEAST_WHOLE = 60.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -28,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     goal.add_argument("--seconds", type=duration, help="time for rendering and reconstruction")
     goal.add_argument("--error", type=duration, metavar="ERROR", help="trimmed relMSE to reach")
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels (default: the scene's own)")
+    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
     parser.add_argument("--variant", help="Mitsuba variant (default: llvm_ad_rgb; cuda_ad_rgb for an NVIDIA GPU)")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -37,7 +40,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` are those of both."""
+    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` are those of both.
+
+    ``low`` and ``high`` are where eight of ten such errors turned out to lie.
+    """
 
     sampler: str
     method: str
@@ -45,6 +51,8 @@ class Row:
     spp: int
     seconds: float
     error: float
+    low: float
+    high: float
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
@@ -53,15 +61,19 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.choosing.plans import LONG, explore
+    from data_gen.choosing.plans import LONG, SHARE, SHARE_WITH_METHODS, explore
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
-    scene = load_scene(args.scene, args.size, dict(args.define))
-    # Its own time is not part of the time that it advises on.
-    seen = explore(scene, max(args.seconds or LONG, LONG), said=console.say)
+    scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
+    # Its own time is not part of the time that it advises on, but no more than that.
+    whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_WHOLE), LONG)
+    seen = explore(scene, whole, said=console.say)
+    if not seen and whole < LONG:
+        console.say(f"pilot: no trial ended within {SHARE * whole:.0f} s; once more with {SHARE * LONG:.0f} s")
+        seen = explore(scene, LONG, said=console.say)  # with the kernels that are there by now
     if not seen:
-        raise NgptError(f"{args.scene}: no sampler ended its trial within {LONG:g} s; give a smaller --size")
+        raise NgptError(f"{args.scene}: no sampler ended its trial within {SHARE * LONG:g} s; give a smaller --size")
     found = rows_of(seen, args.seconds, args.error)
     console.say(f"{args.scene}: pilot of {time.perf_counter() - start:.1f} s with compilation")
     if args.json:
@@ -70,10 +82,13 @@ def run(args: argparse.Namespace, console: Console) -> int:
         report = {"scene": args.scene, "size": [int(n) for n in film], "sampler": found[0].sampler}
         print_json(report | {"advice": rows})
         return 0
-    tell(f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}")
+    tell(
+        f"{'sampler':12}{'method':16}{'samples':12}{'spp':>7}{'seconds':>9}{'relMSE trimmed':>16}{'8 in 10 within':>22}"
+    )
     for row in found:
         shared = "adaptive" if row.adaptive else "even"
-        tell(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}")
+        within = f"{row.low:.2g} to {row.high:.2g}"
+        tell(f"{row.sampler:12}{row.method:16}{shared:12}{row.spp:7}{row.seconds:9.3g}{row.error:16.3g}{within:>22}")
     for line in ("", *commands_of(found[0], args)):
         tell(line)
     return 0
@@ -86,7 +101,7 @@ def rows_of(pipelines: list[Pipeline], seconds: float | None, error: float | Non
     for p in pipelines:
         spp = math.floor(p.samples(seconds)) if seconds is not None else math.ceil(p.needed(error))
         if max(p.least, 2) <= spp < LARGEST_SPP:
-            found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp)))
+            found.append(Row(p.sampler, p.method, p.shared, spp, p.takes(spp), p.expected(spp), *p.likely(spp)))
     if not found and seconds is not None:
         least = min(p.takes(max(p.least, 2)) for p in pipelines)
         raise NgptError(f"nothing fits into {seconds:g} s: the cheapest takes {brief(least)} s")
@@ -111,5 +126,6 @@ def commands_of(row: Row, args: argparse.Namespace) -> list[str]:
 def of_the_scene(args: argparse.Namespace) -> list[str]:
     """The options of this call that are those of a render too."""
     words = ["--size", "{}x{}".format(*args.size)] if args.size else []
+    words += ["--sensor", args.sensor] if args.sensor is not None else []
     words += ["--variant", args.variant] if args.variant else []
     return words + [word for name, value in args.define for word in ("-D", f"{name}={value}")]

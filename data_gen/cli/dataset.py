@@ -3,7 +3,9 @@
 import argparse
 from pathlib import Path
 
-from ngpt.cli.arguments import add_config, part
+from data_gen.cli import KERNELS
+from ngpt.cli.arguments import add_config, config_of, part, write_template
+from ngpt.errors import WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
 from ngpt.system.files import exclusive
@@ -13,7 +15,7 @@ from ngpt.training.dataset import Dataset
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "Run the same command again to continue a training set that was stopped."
     add_config(parser, configs.DATASET, "what to render")
-    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder of the training set")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the training set")
     parser.add_argument("--shard", type=part, default=(0, 1), metavar="i/n", help="make only this part, for job arrays")
     parser.add_argument(
         "--workers", type=int, default=1, help="processes (default: 1, which uses all cores by threads)"
@@ -29,7 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    path = configs.find_config(args.config, configs.DATASET)
+    path = config_of(args, configs.DATASET)
+    if args.init:
+        from data_gen.dataset.config import Config
+        from ngpt.system.templates import template
+
+        return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "dataset", console)
+    if not args.out:
+        raise WrongUse("--out is missing: the folder of the training set")
     # Only the verbs that render import the renderer.
     from data_gen.dataset.card import write_card
     from data_gen.dataset.config import read_config
@@ -37,7 +46,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
     config = read_config(path)
     executor = cluster(args.cluster) if args.cluster else processes(args.workers)
-    with executor as workers, console.progress(str(args.out), "crops") as progress:
+    with executor as workers, console.progress(str(args.out), "crops", begins=KERNELS) as progress:
         generate(config, args.out, workers, shard=args.shard, variant=args.variant, progress=progress)
     write_card(args.out)
     if args.layout:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
+from data_gen.cli import KERNELS
 from ngpt.cli.arguments import add_force, positive, size
 from ngpt.errors import WrongUse, did_you_mean
 from ngpt.io.exr import write
@@ -84,10 +85,10 @@ def demo_scene(name: str, args: argparse.Namespace, folder: Path, console: Conso
     methods = {m: entry for m, entry in METHODS.items() if not entry.variant and entry.standing != "study"}
     targets = {label: check_output(folder / f"{name}_{label}.exr", args.force) for label in ("stack", "ref", *methods)}
     scene = load_scene(name, args.size)
-    with console.progress(f"{name}: stack", "spp") as progress:
+    with console.progress(f"{name}: stack", "spp", begins=KERNELS) as progress:
         stack = render_stack(scene, args.spp, progress=progress)
     # Another seed than the stack's: a reference must not share its noise.
-    with console.progress(f"{name}: reference", "spp") as progress:
+    with console.progress(f"{name}: reference", "spp", begins=KERNELS) as progress:
         reference = render_stack(scene, args.reference_spp, seed=1, sampler="primal", progress=progress)["primal"]
     write(targets["stack"], stack, overwrite=args.force)
     write(targets["ref"], reference, overwrite=args.force)

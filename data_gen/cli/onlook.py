@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 
-from ngpt.errors import NgptError, WrongUse
+from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.report.live import LivePage
 from ngpt.report.preview import preview
 from ngpt.report.tev import Tev
@@ -27,7 +28,7 @@ class Onlookers:
 
     def __init__(self, page: LivePage | None, viewer: Tev | None, say: Callable[[str], None], unit: str):
         self.page, self.viewer, self.say, self.unit = page, viewer, say, unit
-        self.line, self.shown = "ended without an image", False
+        self.line, self.shown, self.failed = "ended without an image", False, False
         self.start, self.spent, self.expected, self.left = time.perf_counter(), 0.0, 0.0, 0.0
 
     @property
@@ -50,28 +51,45 @@ class Onlookers:
         if not self._watched():
             return
         begin = time.perf_counter()
-        made = None
-        if not self.expected:
-            made = stack()
-            self.expected = _LOAD + _PIXEL * made.width * made.height
-        if self._affordable(begin - self.start):
-            self._show(made or stack())
-            self.shown = True
-            # On a busy machine the next may well take longer.
-            self.expected = _CAUTION * (time.perf_counter() - begin)
+        with self._harmless():
+            made = None
+            if not self.expected:
+                made = stack()
+                self.expected = _LOAD + _PIXEL * made.width * made.height
+            if self._affordable(begin - self.start):
+                self.shown = True
+                try:
+                    self._show(made or stack())
+                finally:
+                    # On a busy machine the next may well take longer.
+                    self.expected = _CAUTION * (time.perf_counter() - begin)
         self.spent += time.perf_counter() - begin
 
     def last(self, stack: GradientStack, line: str) -> None:
         """Shows the stack that is written by now, and tells a last line."""
         self.line = line
         if self._watched():
-            self._show(stack)
+            with self._harmless():
+                self._show(stack)
 
     def close(self) -> None:
-        if self.viewer is not None:
-            self.viewer.close()
-        if self.page is not None:
-            self.page.close(self.line)
+        with self._harmless():
+            if self.viewer is not None:
+                self.viewer.close()
+        with self._harmless():
+            if self.page is not None:
+                self.page.close(self.line)
+
+    @contextmanager
+    def _harmless(self) -> Iterator[None]:
+        """Whatever fails in it, a method or the memory for an image, costs a line, once, and no render."""
+        try:
+            yield
+        except Exception as error:
+            stop_if_interrupted(error)
+            if not self.failed:
+                self.say(f"no image for who looks on: {error or type(error).__name__}; the render goes on")
+            self.failed = True
 
     def _watched(self) -> bool:
         return self.viewer is not None or (self.page is not None and self.page.watched)
@@ -107,7 +125,7 @@ def onlookers(live: bool, view: str | None, scene: str, command: str, console: C
         console.error(f"{error}; the render goes on")
     try:
         page = LivePage(f"{scene}, live", command) if live else None
-    except NgptError as error:
+    except (NgptError, RuntimeError, MemoryError) as error:  # no thread can be had for it
         console.error(f"{error}; the render goes on")
     if page is not None:
         console.say(f"live: {page.url}")

@@ -6,6 +6,8 @@ from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import Any
 
+from data_gen.begun import Asked, Unfinished, begun_stack, scene_name, write_part
+from data_gen.cli import KERNELS
 from data_gen.cli.frames import frames, targets
 from data_gen.frames.pattern import filled, varies
 from data_gen.samplers import by_standing, check_options
@@ -23,9 +25,9 @@ from ngpt.cli.arguments import (
     print_json,
     size,
 )
-from ngpt.errors import WrongUse
-from ngpt.io.exr import write
+from ngpt.errors import NgptError, WrongUse
 from ngpt.io.whole import finished
+from ngpt.merging import UNFINISHED
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
 
@@ -63,12 +65,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
         "too. --time is then that of pilot, render and method",
     )
-    parser.add_argument(
-        "--size",
-        type=size,
-        metavar="WxH",
-        help="pixels of the film, of which a crop window stays the same part (default: the scene's own)",
-    )
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the film (default: the scene's own)")
+    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
     first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
     others = ", ".join(by_standing("niche"))
     parser.add_argument(
@@ -84,7 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=[],
         type=assignment,
         metavar="NAME=VALUE",
-        help="an option of the sampler; may be repeated. See `ngpt info SAMPLER`",
+        help="of the sampler; may be repeated. See `ngpt info NAME`",
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
@@ -98,9 +96,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="serve a page on 127.0.0.1 that shows the render, noisy and denoised, while it goes on",
     )
-    parser.add_argument(
-        "--view", metavar="HOST:PORT", help="send the same to the viewer tev (its own: 127.0.0.1:14158)"
-    )
+    parser.add_argument("--view", metavar="HOST:PORT", help="send the same to tev (its own: 127.0.0.1:14158)")
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
     parser.add_argument(
         "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
@@ -140,7 +136,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing.add_argument(
         "--skip-existing",
         action="store_true",
-        help="leave out what is there already",
+        help="leave out what is there already with all that is asked for, and go on with what is there in part",
     )
     add_json(parser)
 
@@ -151,7 +147,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    names = ("spp", "seed", "sampler", "size", "memory", "diagnostics", "variant")
+    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "variant")
     options = dict(args.option)
     check_options(args.sampler, options)  # so that none of them goes by another's name
     given = {name: getattr(args, name) for name in names}
@@ -173,9 +169,29 @@ def image(args: argparse.Namespace, console: Console) -> int:
     if target.suffix.lower() != ".exr":
         raise WrongUse(f"{target}: ngpt writes OpenEXR; let the name end in .exr")
     output_file(target, args)
+    given, begun, there = asked(args), None, target.exists()
+    how = {"adaptive": args.adaptive, "error": args.error, "method": args.method}
+    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
+    whole = Asked(
+        scene_name(args.scene, dict(args.define) | ({"--sensor": args.sensor} if args.sensor else {})),
+        args.seed,
+        args.sampler,
+        dict(args.option),
+        args.size,
+        wanted,
+        args.time,
+        args.error,
+        (args.method or "auto") if args.adaptive else "",
+    )
     if args.skip_existing and finished(target):
-        console.say(f"{target}: skipped: the stack is there")
-        return 0
+        rest = whole.left(target)
+        if rest is None:
+            console.say(f"{target}: skipped: the stack is there")
+            return 0
+        begun = begun_stack(target, args.diagnostics)
+        given |= rest.options(args.seed)
+        how = {"adaptive": bool(rest.adaptive), "error": rest.error, "method": rest.method(args.method)}
+        console.say(f"{target}: has {begun.attributes['ngpt:spp']} samples per pixel; going on with it")
 
     def chosen(plan) -> None:
         how = f"{', samples shared out' if plan.shared else ''}, method '{plan.method}'" if plan.method else ""
@@ -185,7 +201,7 @@ def image(args: argparse.Namespace, console: Console) -> int:
     looking = onlookers(args.live, args.view, args.scene, args.command, console, unit)
     with (
         closing(looking),
-        console.progress(f"render {args.scene}", unit) as progress,
+        console.progress(f"render {args.scene}", unit, begins=KERNELS) as progress,
         stop_on_ctrl_c(ending) as stop,
     ):
 
@@ -196,20 +212,26 @@ def image(args: argparse.Namespace, console: Console) -> int:
             progress(done, total)
             looking.progress(done, total)
 
-        stack, plan = render_scene(
-            args.scene,
-            adaptive=args.adaptive,
-            error=args.error,
-            method=args.method,
-            progress=told,
-            stop=ended,
-            newest=looking.newest,
-            chosen=chosen,
-            said=console.say,
-            **asked(args),
-        )
+        failed = None
+        try:
+            stack, _ = render_scene(
+                args.scene,
+                progress=told,
+                stop=ended,
+                newest=looking.newest,
+                chosen=chosen,
+                said=console.say,
+                **how,
+                **given,
+            )
+        except Unfinished as error:
+            stack, failed = error.stack, error
         # Within it: the samples of an hour are not lost to a signal that comes while they are written.
-        write(target, stack, overwrite=args.force or args.skip_existing)
+        whole.name(stack)
+        if args.skip_existing and not there and whole.done(target):
+            console.say(f"{target}: skipped: the stack is there by now, of another process")
+            return 0
+        stack = write_part(target, stack, args.force or there, begun)
         looking.last(stack, f"ended: {target} is written")
     if stack.attributes["ngpt:discarded"]:
         console.say(f"{args.scene}: {stack.attributes['ngpt:discarded']} non-finite values were left out")
@@ -218,8 +240,9 @@ def image(args: argparse.Namespace, console: Console) -> int:
         expected, method = stack.attributes["ngpt:error"], stack.attributes["ngpt:adaptive"]
         short = "" if expected <= args.error else f", not {args.error:g}: it was ended before"
         console.say(f"{args.scene}: '{method}' is expected to have an error of {expected:.3g}{short}")
-    wanted = args.spp or (DEFAULT_SPP if args.time is None and args.error is None else None)
-    if interrupted := ended() and done != wanted:
+    if failed is not None:
+        raise NgptError(f"{failed}; {target} has the {done} samples per pixel done before")
+    if interrupted := UNFINISHED in stack.attributes:
         tell, how = (console.error, "interrupted") if stop() else (console.say, "enough")
         tell(f"{how}: {target} holds the {done} samples per pixel done by then")
     console.say(f"{args.scene} -> {target}: {stack.place}, {done} spp, {took:.2f} s")
@@ -228,8 +251,8 @@ def image(args: argparse.Namespace, console: Console) -> int:
             f"{args.scene}: it took longer than {args.time:g} s: kernels and a least pass ({done} spp) are not quicker "
             "on this machine now; a smaller --size is"
         )
-    if "ngpt:for" in stack.attributes:
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {plan.method}")
+    if method := stack.attributes.get("ngpt:for"):
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {method}")
     if args.json:
         print_json(report_of(stack, target) | {"layers": stack.names})
     return stop.status if interrupted else 0
@@ -244,7 +267,7 @@ def shot(args: argparse.Namespace, console: Console) -> int:
     files = targets(args.output, args.scene, args.frames)
     more = {"camera": args.camera, "fps": args.fps, "dt": args.dt}
     more |= {"overwrite": args.force, "skip_existing": args.skip_existing, **asked(args)}
-    with console.progress(f"render {args.scene}", "frames") as progress:
+    with console.progress(f"render {args.scene}", "frames", begins=KERNELS) as progress:
         said = 0
 
         def made(written: Written, total: int) -> None:
@@ -266,7 +289,9 @@ def shot(args: argparse.Namespace, console: Console) -> int:
                 shard = args.shard or (0, 1)
                 written = write_frames(args.scene, files, shard=shard, made=made, stop=stop, **more)
     if written.interrupted is not None:
-        console.error(f"interrupted: frame {written.interrupted} is left out; --skip-existing goes on with it")
+        part = next((each["spp"] for each in written.frames if each["frame"] == written.interrupted), None)
+        has = "is left out" if part is None else f"has {part} samples per pixel"
+        console.error(f"interrupted: frame {written.interrupted} {has}; --skip-existing goes on with it")
         return stop.status
     if written.skipped:
         console.say(f"{written.skipped} of {written.done} frames were skipped: their stacks are there")

@@ -14,6 +14,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
+from data_gen.made import Made
 from ngpt.errors import NgptError
 
 VIRTUAL_SIZE = (1280, 720)
@@ -67,10 +68,10 @@ class View:
 
 
 class Surroundings:
-    """What rays find in a scene, and how large its inhabited part is."""
+    """What rays find in a scene, how large its inhabited part is, and the samplers that are ``made`` for it."""
 
     def __init__(self, scene: mi.Scene, box: tuple | None = None):
-        self.scene, self.box = scene, box
+        self.scene, self.box, self.made = scene, box, Made()
         sensor = mi.traverse(scene.sensors()[0])
         matrix = np.array(sensor["to_world"].matrix, float).reshape(4, 4)
         self.start, self.up, self.fov = matrix[:3, 3], matrix[:3, 1], float(np.ravel(sensor["x_fov"])[0])

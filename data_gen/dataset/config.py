@@ -27,7 +27,27 @@ class Files:
 
 @dataclass(frozen=True)
 class Config:
-    """See configs/data-cpu.toml, which explains each entry."""
+    """A training set. ``ngpt dataset --init FILE`` writes all entries with their meanings.
+
+    ``seed``       of scenes, cameras and samples
+    ``size``       pixels of a crop's side
+    ``inputs``     stacks of each crop, their sample counts log-uniform and stratified within ``spp``
+    ``frames``     of a shot: 1 makes single crops, more make each crop a shot whose frames are crops of the set
+    ``spp``        least and greatest samples per pixel of the inputs
+    ``sampler``    of the inputs and references: a name of `ngpt info`, or "auto", chosen for each scene
+    ``samplers``   options of that sampler, a table [samplers.NAME]
+    ``roll``       the camera's largest roll, degrees
+    ``lens``       standard deviation of the aperture's radius, relative to the distance in focus
+    ``crops_per_shard``  what one job makes, and what is lost when it is killed; all of a scene compile kernels once
+    ``reference_spp``  samples per pixel of references, in two halves; 0 makes pairs, which have none
+    ``reference_method``  that reconstructs the references
+    ``scenes``     procedural scenes
+    ``varied``     whether some of them have further sights
+    ``sights``     share of the varied scenes that have each sight: fine, hair, bulbs, caustic, media
+    ``adaptive``   share of the inputs from 32 samples on whose samples are uneven, docs/use/adaptive.md
+    ``crops``      of each procedural scene
+    ``files``      scene files, a table [[files]] each: pattern and crops, and if you like parameters and boxes
+    """
 
     seed: int = 0
     size: int = 128

@@ -8,6 +8,7 @@ import zlib
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -41,6 +42,7 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
     import mitsuba as mi
 
     from data_gen.dataset.cameras import Surroundings
+    from data_gen.made import Made
     from data_gen.scenes.load import load_scene
 
     crops: list[CropData] = []
@@ -53,7 +55,8 @@ def make_shard(config: Config, job: Job, folder: str, variant: str, again: Again
             scene = load_scene(path, None, job.parameters, merged=config.frames == 1)
         if again:
             kept = Kept(Path(again.path))
-            makers = {crop: partial(make_inputs, config, scene, kept, i, again.seed) for crop, i in kept.places.items()}
+            again_by = partial(make_inputs, config, scene, Made(), kept)
+            makers = {crop: partial(again_by, i, again.seed) for crop, i in kept.places.items()}
         else:
             around = Surroundings(scene, job.box)
             makers = {crop: partial(make_crop, config, around, job.scene, crop) for crop in job.crops}
@@ -112,13 +115,14 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
     return [bool(rng.random() < config.adaptive) and n >= LEAST for n in counts]
 
 
-def render_input(config: Config, scene, spp: int, seed: int, uneven: bool) -> GradientStack:
-    """One input. All inputs of a set that has uneven ones have the layer ``samples``."""
+def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
+    """One input. All inputs of a set that has uneven ones have the layer ``samples``. ``made`` is that of
+    ``render_stack``."""
     from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
     adaptive = Adaptive() if uneven else None
-    stack = render_stack(scene, spp, seed, config.sampler, adaptive=adaptive, **config.options)
+    stack = render_stack(scene, spp, seed, config.sampler, adaptive=adaptive, made=made, **config.options)
     if config.adaptive and "samples" not in stack:
         stack = stack.replace(samples=np.full((stack.height, stack.width, 1), spp, np.float32))
     return stack
@@ -142,7 +146,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
         found = time.perf_counter() - clock
         seeds = _seeds(rng, config)
         clock = time.perf_counter()
-        first = render_input(config, scene, counts[0], seeds[0], uneven[0])
+        first = render_input(config, scene, counts[0], seeds[0], uneven[0], around.made)
         if np.mean(np.nan_to_num(first["primal"]).max(axis=-1) > 0) > LIT:
             break
     else:
@@ -157,8 +161,8 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
                 found = time.perf_counter() - clock
                 seeds = _seeds(rng, config)
                 clock = time.perf_counter()
-                first = render_input(config, scene, counts[0], seeds[0], uneven[0])
-            data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock)
+                first = render_input(config, scene, counts[0], seeds[0], uneven[0], around.made)
+            data, told = _crop(config, scene, first, counts, seeds, uneven, clock=clock, made=around.made)
             told = {"crop": crop, "view": movement.view_at(frame).record()} | told
             told["seconds"] = {part: round(value, 4) for part, value in (told["seconds"] | {"camera": found}).items()}
             if moving:
@@ -174,8 +178,11 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
     return made
 
 
-def make_inputs(config: Config, scene, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
-    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``."""
+def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
+    """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``.
+
+    ``made`` is that of ``render_stack``.
+    """
     from data_gen.dataset.cameras import View
 
     told = kept.record["crops"][place]
@@ -185,7 +192,7 @@ def make_inputs(config: Config, scene, kept: Kept, place: int, seed: int) -> lis
     uneven = uneven_inputs(config, kept.record["scene"], told["crop"], counts)
     clock = time.perf_counter()
     View.of(told["view"]).apply(scene)
-    cleaned = [finite(render_input(config, scene, *each)) for each in zip(counts, seeds, uneven, strict=True)]
+    cleaned = [finite(render_input(config, scene, *each, made)) for each in zip(counts, seeds, uneven, strict=True)]
     new = {"spp": counts, "seeds": seeds, "repaired": [count for _, count in cleaned]}
     new["seconds"] = {"inputs": round(time.perf_counter() - clock, 4)}
     return [(CropData([stack for stack, _ in cleaned], counts, *kept.images(place)), told | new)]
@@ -204,12 +211,14 @@ def _crop(
     uneven: list[bool],
     *,
     clock: float,
+    made: Any,
 ) -> tuple[CropData, dict]:
-    """The crop of which ``first`` is the first input, begun at ``clock``, and its record."""
+    """The crop of which ``first`` is the first input, begun at ``clock``, and its record; ``made`` is that of
+    ``render_stack``."""
     from data_gen.render import render_stack
 
     further = zip(counts[1:], seeds[1:-HALVES], uneven[1:], strict=True)
-    stacks = [first] + [render_input(config, scene, *each) for each in further]
+    stacks = [first] + [render_input(config, scene, *each, made) for each in further]
     seconds = {"inputs": time.perf_counter() - clock}
     cleaned = [finite(stack) for stack in stacks]
     told = {
@@ -223,7 +232,7 @@ def _crop(
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
-    halves = [render_stack(scene, spp, seed, config.sampler, **config.options) for seed in seeds[-HALVES:]]
+    halves = [render_stack(scene, spp, seed, config.sampler, made=made, **config.options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]

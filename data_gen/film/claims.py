@@ -43,10 +43,12 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
     order = np.argsort(around, kind="stable")
     order = order[: np.count_nonzero(good)]
     squares, variances = squares.ravel(), variances.ravel()
+    found = np.ones(around.shape)
+    if not len(order):
+        return found.reshape(*good.shape, 1)
     numbers, kind = np.unique(samples.ravel(), return_inverse=True)
     laws = [law(max(int(n), 2), net) for n in numbers]
     seen, truth = (np.array(each) for each in zip(*laws, strict=True))
-    found = np.ones(around.shape)
     for group in np.array_split(order, max(1, min(_GROUPS, len(order) // _LEAST))):
         claimed = np.bincount(kind[group], variances[group], len(numbers))
         total = claimed.sum()

@@ -83,9 +83,9 @@ class GradientFilm:
         self._pass[name] = (_components(value), active)
 
     def put_all(self, values: dict) -> None:
-        """``put`` for several values: name -> samples."""
+        """``put`` for several values: name -> samples, or (samples, which of them exist)."""
         for name, value in values.items():
-            self.put(name, value)
+            self.put(name, *(value if isinstance(value, tuple) else (value,)))
 
     def splat(self, name: str, pixel: mi.UInt32, value, active: bool | mi.Bool = True) -> None:
         """Adds values to any pixel: the ``pixel`` of each lane, numbered row by row. Only films with ``batches`` can.
@@ -139,11 +139,16 @@ class GradientFilm:
             stride, further = opaque(self.strands * self.pixels * block), opaque(self.strands * block)
             strands = Strands(first, opaque(lanes), opaque(block), stride, number, further)
             for name, (components, active) in values.items():
-                self.moments[name] = accumulate(self._moments(name, len(components)), components, active, strands)
+                new = accumulate(self._moments(name, len(components)), components, active, strands)
                 # One by one: the old moments and the new ones are in memory together.
-                dr.eval(self.moments[name])
+                dr.eval(new)
+                self.moments[name] = new
         self.samples += spp
         self.blocks += spp // block
+
+    def forget_pass(self) -> None:
+        """Leaves out what was put since the last pass ended: it was broken off."""
+        self._pass, self._splats = {}, {}
 
     def _add_some(self, values: dict, block: int | None, some: np.ndarray) -> None:
         """The samples of a pass whose blocks are those of ``some`` pixels."""

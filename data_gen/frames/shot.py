@@ -10,6 +10,7 @@ from typing import Any
 import mitsuba as mi
 import numpy as np
 
+from data_gen.begun import Unfinished, frame_seed
 from data_gen.frames.camera_path import CameraPath, horizontal
 from data_gen.frames.frame_sampler import Remembering
 from data_gen.frames.motion import Snapshot, depth, motion_vectors, seen, snapshot, window_moved
@@ -19,6 +20,7 @@ from data_gen.samplers import FRAME_SAMPLERS
 from data_gen.scenes.geometry import Geometry
 from data_gen.scenes.load import load_scene
 from ngpt.errors import NgptError
+from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 
 
@@ -28,6 +30,7 @@ class Shot:
     ``describe``  frame -> the scene's file or name, and its ``<default>`` values. The scene is loaded again only where
                   they change; kernels are compiled once, as long as frames consist of the same kinds of things.
     ``camera``    moves the first sensor
+    ``sensor``    number or id of the one that is rendered; None: the first
     ``update``    changes ``mi.traverse(scene)`` for a frame; what it sets once it must set in every frame
     """
 
@@ -37,8 +40,9 @@ class Shot:
         size: tuple[int, int] | None = None,
         camera: CameraPath | None = None,
         update: Callable[[mi.SceneParameters, int], None] | None = None,
+        sensor: int | str | None = None,
     ):
-        self.describe, self.size, self.camera, self.update = describe, size, camera, update
+        self.describe, self.size, self.camera, self.update, self.sensor = describe, size, camera, update, sensor
         self._loaded: Any = None
         self._scene: mi.Scene | None = None
         self._shapes: tuple[Geometry, ...] | None = None
@@ -50,7 +54,8 @@ class Shot:
         if self._scene is None or wanted != self._loaded:
             self._scene = self._shapes = None
             gc.collect()  # two scenes in memory would make kernels larger
-            self._scene, self._loaded = load_scene(name, self.size, wanted[1], merged=False), wanted
+            self._scene = load_scene(name, self.size, wanted[1], merged=False, sensor=self.sensor)
+            self._loaded = wanted
         scene = self._scene
         if self.update is not None:
             params = mi.traverse(scene)
@@ -69,7 +74,7 @@ class Shot:
 
     def twin(self) -> Shot:
         """The same shot, with a scene of its own."""
-        return Shot(self.describe, self.size, self.camera, self.update)
+        return Shot(self.describe, self.size, self.camera, self.update, self.sensor)
 
     def changes(self, frames: Sequence[int]) -> bool:
         """Whether anything but the camera may change in these frames."""
@@ -84,13 +89,6 @@ class Shot:
             width, height = sensor.film().size()
             params["x_fov"] = horizontal(view.fov, view.fov_axis, float(width) / float(height))
         params.update()
-
-
-def frame_seed(seed: int, frame: int, use: int = 0) -> int:
-    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
-    # Entropy must not be negative, frames may be.
-    entropy = [seed, frame % 2**64]
-    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
 
 
 def render_shot(
@@ -157,15 +155,27 @@ def render_shot(
                 far = None if what is None else depth(scene, now, what)
                 stack = remembering.render(scene, now.shapes, j, motion, far, progress(frame))
             else:
-                stack = render_stack(scene, spp, frame_seed(seed, frame), sampler, progress=progress(frame), **options)
+                try:
+                    own = frame_seed(seed, frame)
+                    stack = render_stack(scene, spp, own, sampler, progress=progress(frame), **options)
+                except Unfinished as error:
+                    placed = _placed(error.stack, frame, previous, motion + np.float32(shift))
+                    raise Unfinished(f"frame {frame}: {error}", placed) from error
             before, last = now, frame
         done = i + 1
-        stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
-        stack = stack.replace(motion=motion + np.float32(shift))
+        stack = _placed(stack, frame, previous, motion + np.float32(shift))
         del scene  # two scenes in memory would make kernels larger
+        if dt and UNFINISHED in stack.attributes:
+            return
         if dt:
             stack = _with_dt(stack, motion, (shot, frame), (other, previous), dt, frame_seed(seed, frame, 1))
         yield frame, stack
+
+
+def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:
+    """A stack as one of the shot's frames; ``motion`` is that of the picture."""
+    stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
+    return stack.replace(motion=motion)
 
 
 def _with_dt(

@@ -10,9 +10,14 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.streams import sample_streams
+from data_gen.scenes.cameras import camera_name
 
+# Shifts by half a pixel: with its own place, a sample then has one in each quarter of its pixel.
+QUARTERS = ("x", "y", "xy")
 # As in ``data_gen.passes``: rays of lanes side by side are traced together.
 _PACKET = 16
+# Origin, direction and length of eight rays
+_SEEN_BYTES = 8 * 7 * 4
 
 
 class CameraSamples:
@@ -27,7 +32,16 @@ class CameraSamples:
     ``net`` is the size of the first round of points (``data_gen.paths.streams``), or 0: independent samples.
 
     ``some``, UInt32, are the pixels to sample, which may repeat; ``first`` is then a UInt32 with a number for each.
+
+    Of an argument of functions that are recorded once (``data_gen.paths.frozen``), the fields of ``DRJIT_STRUCT`` are
+    all that they may use.
     """
+
+    DRJIT_STRUCT = dict.fromkeys(
+        ("sensor", "pixel", "random", "position", "lens", "time", "wavelength", "seen"), object
+    )
+    # (ray, importance) by shift; None where the camera can be asked
+    seen: dict | None = None
 
     def __init__(
         self,
@@ -77,7 +91,7 @@ class CameraSamples:
         self.random = sample_streams(seed, pixel, sample, int(self.size.x), net)
         self.position = self.random.next_2d()
         self.lens = self.random.next_2d() if self.sensor.needs_aperture_sample() else mi.Point2f(0.5)
-        self.time = self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d()
+        self.time = mi.Float(self.sensor.shutter_open() + self.sensor.shutter_open_time() * self.random.next_1d())
         self.wavelength = self.random.next_1d()
 
     def at(self, lanes: mi.UInt32) -> CameraSamples:
@@ -89,28 +103,48 @@ class CameraSamples:
         some = copy(self)
         some.random = self.random.at(lanes)
         some.position, some.lens, some.time, some.wavelength = map(
-            gather, (self.position, self.lens, mi.Float(self.time), self.wavelength)
+            gather, (self.position, self.lens, self.time, self.wavelength)
         )
         return some
 
     def rays(self, shift=(0, 0)) -> tuple[mi.RayDifferential3f, mi.Spectrum, mi.Bool]:
         """Camera rays displaced by ``shift`` = (x, y) pixels, their importance, and whether they are on the film.
 
-        The ``shift`` is a pair of numbers, or a Vector2f with one for each lane.
+        The ``shift`` is a pair of numbers, one of ``QUARTERS``, or a Vector2f with one for each lane.
         """
-        if not isinstance(shift, mi.Vector2f):
-            shift = mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
-        p = self.position + shift
+        p = self.position + self._shift(shift)
         inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.size.x) & (p.y < self.size.y)
+        if self.seen:
+            ray, importance = self.seen[shift]
+            return mi.RayDifferential3f(ray), importance, inside
         uv = p / mi.Vector2f(self.size)
         ray, importance = self.sensor.sample_ray_differential(self.time, self.wavelength, uv, self.lens)
         return ray, importance, inside
 
-    def quarters(self) -> list[mi.Vector2f]:
-        """Three shifts by half a pixel, for each lane: with its own place, one in each quarter of its pixel."""
-        within = self.position - mi.Point2f(self.pixel % self.size.x, self.pixel // self.size.x)
-        half = dr.select(within < 0.5, mi.Vector2f(0.5), -0.5)
-        return [mi.Vector2f(half.x, 0), mi.Vector2f(0, half.y), half]
+    def _shift(self, shift) -> mi.Vector2f:
+        if isinstance(shift, mi.Vector2f):
+            return shift
+        if shift in QUARTERS:
+            within = self.position - mi.Point2f(self.pixel % self.size.x, self.pixel // self.size.x)
+            half = dr.select(within < 0.5, mi.Vector2f(0.5), -0.5)
+            return mi.Vector2f(half.x if "x" in shift else 0, half.y if "y" in shift else 0)
+        return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
+
+    def look(self, *shifts: tuple[int, int] | str) -> Self:
+        """These samples, of which a function that is recorded once may ask the rays by such ``shifts``.
+
+        It cannot ask most cameras, whose arrays Dr.Jit 1.5 does not find. So they are asked before.
+        """
+        if bytes_of_rays(self.sensor):
+            rays = [self.rays(shift) for shift in shifts]
+            self.seen = {shift: (mi.Ray3f(ray), weight) for shift, (ray, weight, _) in zip(shifts, rays, strict=True)}
+            dr.eval(*self.seen.values())
+        return self
+
+
+def bytes_of_rays(sensor: mi.Sensor) -> int:
+    """What a lane may take for rays that are kept of the camera: see ``look``."""
+    return 0 if camera_name(sensor) == "perspective" else _SEEN_BYTES
 
 
 def in_packets(lanes: np.ndarray, camera: CameraSamples) -> tuple[np.ndarray, np.ndarray]:

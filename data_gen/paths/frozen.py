@@ -1,12 +1,14 @@
 """Functions whose kernels are recorded once in a render, and launched again from then on.
 
-A pass of photons has few camera samples and many kernels. To record them, and to find that they are known, would take
-longer than to run them.
+Python and Dr.Jit take a second to record the kernel of ``gpt``, however few its samples are, and a pass of photons has
+few camera samples and many kernels. A function is recorded again where it meets arrays of other types, where two of its
+arrays happen to be of one width, or of width 1, and where scenes come into the process or leave it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import logging
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import drjit as dr
@@ -14,77 +16,152 @@ import mitsuba as mi
 
 from ngpt.errors import stop_if_interrupted
 
+_LOG = logging.getLogger(f"ngpt.{__name__}")
+
 
 class Frozen:
     """Calls functions: ``frozen(f, *args)`` is ``f(*args)``, whose kernels are recorded when the types are new.
 
     All arrays that f uses are among its arguments, or belong to the ``scene``, or to attributes of the ``owners``. All
-    else that f uses does not change while this object lives. Within f nothing is evaluated, no width is a number.
+    else that f uses does not change while this object lives. Within f no width is a number. Where f cannot be recorded
+    it is called as it is, and a warning says so.
     """
 
     def __init__(self, scene: mi.Scene, *owners: Any):
-        self.state = [scene, *map(arrays, owners)]
+        # Not bound to ``self``: what is in no circle goes when the render does.
+        self.scene, state = scene, [scene, *map(arrays, owners)]
+        # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
+        self.options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
         self.functions: dict[Callable, Callable] = {}
+        _wake_lamps(scene)
+        self.settle = dr.freeze(lambda *_: None, **self.options)
 
-    def __call__(self, f: Callable, *args: Any, fixed: bool = False, sums: Callable | None = None) -> Any:
-        """``fixed``: all calls of f have arrays of the same widths. ``sums`` makes the last argument, which f adds to.
+    def __call__(self, f: Callable, *args: Any, sums: Callable | None = None) -> Any:
+        """``sums`` makes the last argument, which f adds to.
 
         A call that fails may have added already: the next try has others.
         """
-        if f not in self.functions:
-            # Not bound to ``self``: what is in no circle goes when the render does.
-            state = self.state
-            # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
-            options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
-            self.functions[f] = dr.freeze(f if fixed else without_constants(f), **options)
-        try:
-            return self.functions[f](*args, *([sums()] if sums else []))
-        except RuntimeError as error:
-            stop_if_interrupted(error)
-            # Dr.Jit 1.5 does not find what lies behind two calls of objects, as the texture of a lamp does, be it of
-            # another scene. It records anew where scenes come and go, so this may be later than at the first call.
-            self.functions[f] = f
+
+        def tried(f: Callable) -> Any:
             return f(*args, *([sums()] if sums else []))
 
+        try:
+            if f not in self.functions:
+                self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)
+                # Dr.Jit makes an array of each number that it meets, and one that belongs to several objects becomes
+                # several arrays, which are one again from the next call on. What does nothing is recorded for that.
+                tried(self.settle)
+            return tried(self.functions[f])
+        except RuntimeError as error:
+            stop_if_interrupted(error)
+        try:
+            # There may be a new scene in the process.
+            _wake_lamps(self.scene)
+            tried(self.settle)
+            return tried(self.functions[f])
+        except RuntimeError as error:
+            stop_if_interrupted(error)
+            result, self.functions[f] = tried(f), f
+            _say(f, " ".join(str(error.__cause__ or error).split()))
+            return result
 
-def without_constants(f: Callable) -> Callable:
-    """f, which must not return a constant for an array: Dr.Jit 1.5 keeps its width of the call that was recorded."""
 
-    def checked(*args: Any) -> Any:
-        result = f(*args)
-        if any(leaf.state == dr.VarState.Literal and dr.width(leaf) > 1 for leaf in leaves(result)):
-            raise RuntimeError("a constant among the results")
-        return result
-
-    return checked
+# Functions of which the warning has been given
+_SAID: set[str] = set()
 
 
-def leaves(value: Any) -> Iterator:
+def _say(f: Callable, reason: str) -> None:
+    name = getattr(getattr(f, "func", f), "__qualname__", repr(f))
+    if name not in _SAID:
+        _SAID.add(name)
+        _LOG.warning("%s is recorded anew in each pass, which may take a second of each: %s", name, reason)
+
+
+def _wake_lamps(scene: mi.Scene) -> None:
+    """Has lamps of all scenes in the process make what they are sampled by, such as the distribution of a texture.
+
+    They make it when they are first asked, and a call asks them all. Dr.Jit records no function amid which that is.
+    """
+    if scene.emitters():
+        scene.emitters_dr().sample_direction(dr.zeros(mi.SurfaceInteraction3f), mi.Point2f(0.5), True)
+
+
+def as_wide_as_arguments(f: Callable) -> Callable:
+    """f, with constants among its results that depend on an argument: else Dr.Jit 1.5 keeps the width of the first."""
+
+    def widened(*args: Any) -> Any:
+        by_width = {dr.width(leaf): leaf for leaf in leaves(args)}
+
+        def depending(leaf: Any) -> Any:
+            width = dr.width(leaf)
+            if leaf.state != dr.VarState.Literal or width == 1:
+                return leaf
+            if width not in by_width:
+                raise RuntimeError(f"a constant among the results, {width} wide as no argument is")
+            return dr.select(_always(by_width[width]), leaf, dr.zeros(type(leaf)))
+
+        return mapped(depending, f(*args))
+
+    return widened
+
+
+def _always(leaf: Any) -> Any:
+    """True, but Dr.Jit does not know."""
+    mask = leaf if dr.is_mask_v(leaf) else leaf == 0
+    return (dr.select(mask, dr.uint32_array_t(mask)(1), 2)) > 0
+
+
+def mapped(f: Callable, value: Any) -> Any:
+    """A tree whose flat arrays are what f makes of them; objects in it are changed in place."""
+    if isinstance(value, list | tuple):
+        return type(value)(mapped(f, part) for part in value)
+    if isinstance(value, dict):
+        return {key: mapped(f, part) for key, part in value.items()}
+    if dr.is_array_v(value):
+        if not dr.is_jit_v(value):
+            return value
+        return f(value) if dr.depth_v(value) == 1 else type(value)(*(mapped(f, part) for part in value))
+    for name in fields(value):
+        setattr(value, name, mapped(f, getattr(value, name)))
+    return value
+
+
+def leaves(value: Any) -> list:
     """The flat arrays of a tree."""
     if isinstance(value, list | tuple):
         parts = value
+    elif isinstance(value, dict):
+        parts = value.values()
     elif dr.is_array_v(value):
-        parts = value if dr.depth_v(value) > 1 else ()
         if dr.is_jit_v(value) and dr.depth_v(value) == 1:
-            yield value
+            return [value]
+        parts = value if dr.is_jit_v(value) else ()
     else:
-        names = getattr(type(value), "DRJIT_STRUCT", None) or getattr(value, "__dataclass_fields__", ())
-        parts = [getattr(value, name) for name in names]
-    for part in parts:
-        yield from leaves(part)
+        parts = [getattr(value, name) for name in fields(value)]
+    return [leaf for part in parts for leaf in leaves(part)]
 
 
-def call(f: Callable, *args: Any, fixed: bool = False) -> Any:
+def fields(value: Any) -> Iterable[str]:
+    """The names of an object's parts that may hold arrays."""
+    of_type = getattr(type(value), "DRJIT_STRUCT", None) or getattr(value, "__dataclass_fields__", None)
+    return of_type or (vars(value) if type(value).__module__.startswith("data_gen.") else ())
+
+
+def call(f: Callable, *args: Any) -> Any:
     """The same, recorded each time."""
     return f(*args)
 
 
 def arrays(owner: Any) -> list:
-    """The arrays in the attributes of an object, and of objects there."""
+    """The arrays in the attributes of an object, and of objects there, which become copies.
+
+    Kernels tell arrays by how their memory is aligned, and NumPy's is so or so: they would have to be compiled again.
+    """
     found: list = []
-    for value in vars(owner).values() if hasattr(owner, "__dict__") else ():
+    for name, value in list(vars(owner).items()) if hasattr(owner, "__dict__") else ():
         if value is not None and dr.is_jit_v(value):
-            found.append(value)
+            setattr(owner, name, dr.opaque(value))
+            found.append(getattr(owner, name))
         elif type(value).__module__.startswith("data_gen."):
             found += arrays(value)
     return found

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.scenes.places import Chosen, Places
 
 # Shapes that Mitsuba samples uniformly by area, besides meshes; of spheres it samples the part that is visible.
@@ -182,7 +182,7 @@ def emission_in_pixel(
     """
     if not any(visible(emitter) for emitter in scene.emitters()):
         return Le
-    for shift in camera.quarters():
+    for shift in QUARTERS:
         ray, importance, _ = camera.rays(shift)
         Le = Le + importance * emission(ray)
     return Le / 4

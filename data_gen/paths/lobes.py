@@ -37,7 +37,8 @@ class Lobes:
         table = np.full(max(materials, default=0) + 1, _HEARS, np.float32)
         for number, bsdf in materials.items():
             table[number] = _lambert(bsdf)
-        self.size = len(table)
+        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        self.size = dr.opaque(mi.UInt32, len(table))
         self.lambert = mi.Float(table)
         dr.eval(self.lambert)
 

@@ -44,7 +44,7 @@ class Media:
         table = np.zeros(max(matched, default=0) + 1, bool)
         table[list(matched)] = list(matched.values())
         self.boundaries = bool(table.any())
-        self.size, self.matched = len(table), mi.Bool(table)
+        self.size, self.matched = dr.opaque(mi.UInt32, len(table)), mi.Bool(table)
         dr.eval(self.matched)
 
     def passes(self, shape: mi.ShapePtr) -> mi.Bool:

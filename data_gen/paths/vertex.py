@@ -60,7 +60,8 @@ class Materials:
             self.unconnectable.append("those inside shape groups")
         self.unconnectable.sort()
         self.all_connectable = not self.unconnectable
-        self.size = len(table)
+        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        self.size = dr.opaque(mi.UInt32, len(table))
         self.rough = mi.Bool(table)
         dr.eval(self.rough)
 

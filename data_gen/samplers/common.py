@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from functools import partial
 
 import drjit as dr
@@ -12,12 +12,14 @@ import numpy as np
 from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass, render_passes
 from data_gen.paths import segments
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.media import Media
 from data_gen.paths.walk import Limits
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.cameras import check_camera
+from data_gen.scenes.integrators import own_estimate
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import path_depths, reference_integrator
 from data_gen.scenes.places import Places
@@ -36,10 +38,19 @@ def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[...
     depths = path_depths(integrator) if integrator.class_name() == "PathIntegrator" else {}
     if holes and depths and not scene.environment() and not integrator.hide_emitters:
         prb = mi.load_dict({"type": "prb", **depths})
-        return lambda sampler, ray, medium, active: prb.sample(
-            dr.ADMode.Primal, scene, sampler, ray, None, None, active
-        )[0]
-    return lambda sampler, ray, medium, active: integrator.sample(scene, sampler, ray, medium, active)[0]
+        return own_estimate(scene, prb)
+    return own_estimate(scene, integrator)
+
+
+def recorded(
+    scene: mi.Scene, samples: Callable[[CameraSamples], dict], *owners: object, shifts: Iterable = QUARTERS
+) -> SamplePass:
+    """The pass that puts what ``samples`` gives, recorded once: see ``Frozen``, also for the ``owners``.
+
+    Beside the rays of the camera samples it asks for those by the ``shifts``.
+    """
+    frozen = Frozen(scene, *owners)
+    return lambda camera, film: film.put_all(frozen(samples, camera.look((0, 0), *shifts)))
 
 
 class GradientIntegrator(mi.SamplingIntegrator):

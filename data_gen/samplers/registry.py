@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from ngpt.errors import NgptError, WrongUse, did_you_mean
 from ngpt.options import STANDINGS, Option, as_text, settings, unusual
+from ngpt.system.parts import Registry
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -170,8 +171,9 @@ class FrameSampler(Entry):
     alone: str = field(kw_only=True)
 
 
-SAMPLERS: dict[str, Sampler] = {}
 FRAME_SAMPLERS: dict[str, FrameSampler] = {}
+# Other packages bring theirs by entry points.
+SAMPLERS: Registry[Sampler] = Registry("ngpt.samplers", "sampler", Sampler, {}, FRAME_SAMPLERS)
 
 
 def register(entry: Sampler | FrameSampler) -> None:
@@ -215,13 +217,17 @@ def choose(facts: Facts) -> tuple[str, str]:
 
 
 def check_options(name: str, given: Mapping[str, Any]) -> None:
-    """Raises WrongUse for options that the sampler of that name, which may be "auto", does not take."""
+    """Raises WrongUse for options that the sampler of that name does not take, or not all that "auto" may stand for."""
     if name != "auto":
         (FRAME_SAMPLERS[name] if name in FRAME_SAMPLERS else find(name)).settings(given)
-    elif given:
-        option = next(iter(given))
-        having = [name for name, entry in by_standing("use").items() if option in entry.options] or ["gpt"]
-        raise WrongUse(f"option '{option}' is a sampler's own; name the sampler: --sampler {', or '.join(having)}")
+        return
+    able = [sampler for sampler in SAMPLERS.values() if sampler.rank or sampler.tried]
+    shared = {o: option for o, option in COMMON.items() if all(o in sampler.options for sampler in able)}
+    for option in given:
+        having = [entry.name for entry in (*SAMPLERS.values(), *FRAME_SAMPLERS.values()) if option in entry.options]
+        if having and option not in shared:
+            raise WrongUse(f"option '{option}' needs a sampler that has it, not 'auto': {', '.join(having)}")
+    settings("sampler 'auto'", shared, given)
 
 
 def by_standing(standing: str) -> dict[str, Sampler | FrameSampler]:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from difflib import get_close_matches
+
 import mitsuba as mi
 import numpy as np
 
-from ngpt.errors import NgptError
+from ngpt.errors import NgptError, WrongUse
 from ngpt.windows import Place, Window
 
 # By the names of their classes, since a loaded camera does not know its plugin
@@ -51,3 +54,25 @@ def check_camera(sensor: mi.Sensor) -> None:
         scale = np.linalg.norm(np.array(sensor.world_transform().matrix, np.float64).reshape(4, 4)[:3, 2])
         if abs(scale - 1) > _SCALE:
             raise NgptError(f"camera '{name}': its to_world is scaled by {scale:.3g}; remove <scale> from it")
+
+
+def sensor_number(wanted: int | str | None, ids: Sequence[str], scene: str) -> int:
+    """The place of the sensor that is ``wanted``, by id or number, among those of a scene, whose ``ids`` may be "".
+
+    None: the first. Raises WrongUse for one that is not there.
+    """
+    if wanted is None:
+        return 0
+    name = str(wanted)
+    if name in ids and name:
+        return ids.index(name)
+    if name.isdecimal() and int(name) < len(ids):
+        return int(name)
+    near = get_close_matches(name, [known for known in ids if known], 1)
+    meant = f"did you mean '{near[0]}'? " if near else ""
+    raise WrongUse(f"{scene}: there is no sensor '{name}'; {meant}choose one of: {sensor_names(ids)}")
+
+
+def sensor_names(ids: Sequence[str]) -> str:
+    """A scene's sensors in words, by number and id."""
+    return ", ".join(f"{number} '{known}'" if known else str(number) for number, known in enumerate(ids))

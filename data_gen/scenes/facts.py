@@ -7,20 +7,15 @@ from dataclasses import dataclass
 import mitsuba as mi
 
 from data_gen.scenes.cameras import camera_name, check_camera
-
-# By the names of their classes, the integrators that matter here
-_PLUGINS = {
-    "PathIntegrator": "path",
-    "VolumetricPathIntegrator": "volpath",
-    "VolpathMisIntegratorImpl": "volpathmis",
-}
+from data_gen.scenes.integrators import check_integrator, followed, plugin_name
 
 
 @dataclass(frozen=True)
 class Facts:
     """Facts about a scene, known without rendering it.
 
-    ``integrator``  the plugin name of the scene's own integrator, or the name of its class; "path" if it has none
+    ``integrator``  the plugin name of the integrator whose image is rendered, or the name of its class; "path" if the
+                    scene has none: see ``data_gen.scenes.integrators.followed``
     ``media``       the names of its media, sorted
     ``polarised``   the name of a variant that renders polarised light, or ""
     ``mirrors``     whether there are mirrors or clear glass; known of scene files that were inspected
@@ -39,9 +34,11 @@ class Facts:
 
 
 def scene_facts(scene: mi.Scene) -> Facts:
-    """The facts about a scene that is loaded. Raises NgptError for a camera that no sampler renders."""
+    """The facts about a scene that is loaded. Raises NgptError for a camera or integrator that no sampler renders."""
     camera = scene.sensors()[0]
     check_camera(camera)
+    if scene.integrator() is not None:
+        check_integrator(scene.integrator())
     media = media_of(scene)
     names = {medium.id() or medium.class_name() for medium in media}
     grids = any(not medium.is_homogeneous() for medium in media)
@@ -66,12 +63,8 @@ def _has_hair(bsdf: mi.BSDF | None) -> bool:
 
 
 def integrator_name(scene: mi.Scene) -> str:
-    """The plugin name of the scene's own integrator if it is one of ours to follow, or the name of its class."""
-    if scene.integrator() is None:
-        return "path"
-    # A loaded integrator knows its class, not its plugin.
-    name = scene.integrator().class_name()
-    return _PLUGINS.get(name, name)
+    """The plugin name of the integrator whose image is rendered, or the name of its class."""
+    return "path" if scene.integrator() is None else plugin_name(followed(scene.integrator()))
 
 
 def media_of(scene: mi.Scene) -> list[mi.Medium]:

@@ -8,7 +8,9 @@ from pathlib import Path
 import mitsuba as mi
 
 from data_gen.scenes.builtin import SCENES, no_scene
-from data_gen.scenes.merging import load_merged
+from data_gen.scenes.cameras import sensor_number
+from data_gen.scenes.integrators import check_integrator, followed
+from data_gen.scenes.merging import load_file
 from ngpt.errors import NgptError, stop_if_interrupted
 
 
@@ -18,22 +20,25 @@ def load_scene(
     parameters: dict[str, str] | None = None,
     *,
     merged: bool = True,
+    sensor: int | str | None = None,
 ) -> mi.Scene:
     """Loads a Mitsuba 3 scene file, or the built-in scene of that name.
 
     ``size`` is (width, height) in pixels and replaces that of the scene's film; a crop window stays the same part of
     it. ``parameters`` sets the file's ``<default>`` values. Meshes of one material are ``merged`` into one, which
-    renders the same and starts much sooner; where they are to move, or to be found by name, they must not be. Raises
-    NgptError with the file and Mitsuba's own complaint when it cannot.
+    renders the same and starts much sooner; where they are to move, or to be found by name, they must not be.
+    ``sensor``, a number or an id, is the only one that the scene then has. Raises NgptError with the file and Mitsuba's
+    own complaint when it cannot.
     """
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            scene = load_merged(name, parameters) if merged else mi.load_file(name, optimize=False, **parameters)
+            scene = load_file(name, parameters, merged, sensor)
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
-            scene = mi.load_dict(SCENES[name](), optimize=False)
+            scene = mi.load_dict(SCENES[name](), parallel=False, optimize=False)
+            sensor_number(sensor, [camera.id() for camera in scene.sensors()], name)
         else:
             raise no_scene(name)
     except (RuntimeError, TypeError, ValueError) as error:
@@ -107,11 +112,8 @@ def path_depths(path: mi.SamplingIntegrator) -> dict[str, int]:
 
 
 def reference_integrator(scene: mi.Scene) -> mi.SamplingIntegrator:
-    """The scene's own integrator, or Mitsuba's ``path`` if it has none; it decides what transport is rendered."""
+    """What decides which transport is rendered: the scene's own integrator, or the one of the same image that is
+    followed in its place, or Mitsuba's ``path`` if it has none. Raises NgptError for one without camera rays."""
     integrator = scene.integrator() or mi.load_dict({"type": "path"})
-    if not isinstance(integrator, mi.SamplingIntegrator):
-        raise NgptError(
-            f"integrator '{integrator.class_name()}' does not trace paths from the camera, so it has no gradients; "
-            "give the scene a 'path' or 'volpath' integrator"
-        )
-    return integrator
+    check_integrator(integrator)
+    return followed(integrator)

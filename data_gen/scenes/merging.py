@@ -1,7 +1,7 @@
-"""Scene files whose meshes are merged by material.
+"""Scene files, whose meshes are merged by material and of whose sensors one may be chosen.
 
-Each shape of a scene is a case of its own in the kernels, which Dr.Jit records anew for each pass. A room of 800 meshes
-takes seconds for that, and a tenth of it once meshes of one material are one.
+Each shape of a scene is a case of its own in the kernels, which Dr.Jit records before the first ray. A room of 800
+meshes takes seconds for that, and a tenth of it once meshes of one material are one.
 """
 
 from __future__ import annotations
@@ -11,24 +11,33 @@ from pathlib import Path
 
 import mitsuba as mi
 
+from data_gen.scenes.cameras import sensor_number
+
 # The plugins that read meshes, and those of their settings by which normals differ.
 _MESHES = ("obj", "ply", "serialized")
 _NORMALS = ("face_normals", "flip_normals")
 
 
-def load_merged(path: str, parameters: dict[str, str]) -> object:
-    """What ``mi.load_file`` gives, but meshes of one material that neither shine nor bound a medium are one.
+def load_file(path: str, parameters: dict[str, str], merged: bool, sensor: int | str | None) -> object:
+    """What ``mi.load_file`` gives, with no sensor but the one of that number or id, where one is named.
 
-    They lose their names. Merged as Mitsuba would (``optimize=True``), shapes and emitters come in another order each
-    time, and with them other bits; here they have the file's order, each group the place of its first mesh.
+    Where ``merged``, meshes of one material that neither shine nor bound a medium are one, and lose their names. Merged
+    as Mitsuba would (``optimize=True``), shapes and emitters come in another order each time, and with them other bits;
+    here they have the file's order, each group the place of its first mesh.
     """
     config = mi.parser.ParserConfig(mi.variant())
     config.merge_equivalent = config.merge_meshes = False
+    # In parallel objects are numbered as they come, which differs from process to process, and with it the kernel: it
+    # would be compiled again.
+    config.parallel = False
     with _found_beside(path):
         state = mi.parser.parse_file(config, path, **parameters)
         mi.parser.transform_all(config, state)
         if state.root.props.plugin_name() == "scene":
-            _merge(state)
+            if merged:
+                _merge(state)
+            if sensor is not None:
+                _keep(state, sensor, path)
         return mi.parser.instantiate(config, state)
 
 
@@ -50,6 +59,21 @@ def _merge(state: mi.parser.ParserState) -> None:
         scene[names[0]] = mi.Properties.ResolvedReference(len(state.nodes) - 1)
         for name in names[1:]:
             del scene[name]
+
+
+def _keep(state: mi.parser.ParserState, sensor: int | str, path: str) -> None:
+    """Leaves out all sensors of the scene but that one. Raises WrongUse where it is not there."""
+    scene, found = state.root.props, {}
+    for name, reference in scene.items():
+        if isinstance(reference, mi.Properties.ResolvedReference):
+            node = state.nodes[reference.index()]
+            if node.type == mi.ObjectType.Sensor:
+                found[name] = node.props.id()
+    if found:
+        kept = sensor_number(sensor, list(found.values()), path)
+        for number, name in enumerate(found):
+            if number != kept:
+                del scene[name]
 
 
 def _group(state: mi.parser.ParserState, number: int) -> tuple | None:

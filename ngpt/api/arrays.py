@@ -138,7 +138,8 @@ class Denoiser:
     ``albedo``, ``normals``  whether they will be given; what is not announced is refused
     ``temporal``    whether the calls are frames of one shot, in order, with ``flow``: each result is blended with those
                     before it (``ngpt.Temporal``)
-    ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is
+    ``denoise_alpha``  whether an alpha channel is denoised as well, as a grey image; otherwise it comes back as it is,
+                    and where it is 0 and ``noisy`` has no light, the result has none
     ``method``      as of ``ngpt.denoise``: "auto", the default, takes the best method for the layers each call gives
     ``options``     of the method
 
@@ -263,7 +264,9 @@ class Denoiser:
             arrays["motion"] = -arrays.pop("flow")
             if previous is not None and np.array_equal(previous, pixels[..., :3], equal_nan=True):
                 del arrays["motion"]  # a cut
-        stack = _stack("Denoiser", pixels, arrays, self.method, self.options)
+        # Alpha that is denoised itself is 0 in many pixels by chance: it bounds nothing.
+        given_alpha = pixels[..., :3] if self.denoise_alpha else pixels
+        stack = _stack("Denoiser", given_alpha, arrays, self.method, self.options)
         result = reconstruct(stack, self.method, **self.options).image
         if self._temporal is not None:
             result = self._temporal.next(stack, result, previous)
@@ -277,7 +280,8 @@ def _stack(
     where: str, image: np.ndarray, layers: Mapping[str, np.ndarray], method: str, options: Mapping[str, Any]
 ) -> GradientStack:
     """What the method needs; ``where`` begins the messages."""
-    stack = GradientStack({"primal": image[..., :3], **layers}, path=where)
+    alpha = {"alpha": image[..., 3:]} if image.shape[2] > 3 else {}
+    stack = GradientStack({"primal": image[..., :3], **alpha, **layers}, path=where)
     needs = METHODS[method].needs if method in METHODS and not options.get("weights") else ()
     if lacking := [name for name in needs if name not in stack]:
         arguments = ", ".join(f"{name}=..." for name in lacking)

@@ -62,7 +62,7 @@ def denoised(
     ``method``, ``options``  those that made ``whole``. Groups have neither gradients nor variances; a method that
     needs them is replaced by the one that "auto" takes for an image with the stack's features.
     """
-    features = {name: stack[name] for name in ("albedo", "normal", "depth") if name in stack}
+    features = {name: stack[name] for name in ("albedo", "normal", "depth", "alpha") if name in stack}
     if method == "auto" or not set(METHODS[method].needs) <= {"primal", *features}:
         method, options = choose(("primal", *features)), {}
     light = {name: np.asarray(group, np.float32) for name, group in groups.items()}

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from scipy.ndimage import gaussian_filter
 
+from ngpt.coverage import empty_pixels
 from ngpt.errors import NgptError
 from ngpt.layers import DIFFERENCES
 from ngpt.merging import VARIANCES
@@ -104,6 +105,8 @@ def noisier(stack: GradientStack) -> GradientStack:
         drawn = rng.standard_normal(stack["primal"].shape, np.float32)
         if name in stack and variance in stack:
             known = np.maximum(np.nan_to_num(stack[variance], posinf=0.0), 0)
+            if name in ("primal", "caustic"):
+                known = np.where(empty_pixels(stack)[..., None], 0, known)
             layers[name] = stack[name] + np.sqrt(known) * drawn
     if "caustic" in layers:
         # Part of the primal, whose variance is that of the rest.

@@ -5,6 +5,7 @@ The solvers beside this file know arrays only. Here is what they are given of a 
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -45,13 +46,12 @@ def _cv(data: Repaired) -> np.ndarray:
     return controlvariates.cv(data.image, data.dx, data.dy, data.trusted)
 
 
-def _with_variances(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
-    return lambda data: solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
+def _with_variances(solver: Callable[..., np.ndarray], data: Repaired) -> np.ndarray:
+    return solver(data.image, data.dx, data.dy, *data.variances, data.trusted)
 
 
-def _keeping_energy(solver: Callable[..., np.ndarray]) -> Callable[[Repaired], np.ndarray]:
-    solve = _with_variances(solver)
-    return lambda data: keep_energy(solve(data), data.image)
+def _keeping_energy(solver: Callable[..., np.ndarray], data: Repaired) -> np.ndarray:
+    return keep_energy(_with_variances(solver, data), data.image)
 
 
 def _alpha(data: Repaired, alpha: float | str, norm: int) -> float:
@@ -79,8 +79,8 @@ CLASSICAL = {
     "l2": Classical(_GRADIENTS, _l2, {"alpha": weight_of_primal("auto")}),
     "l1": Classical(_GRADIENTS, _l1, {"alpha": weight_of_primal(poisson.DEFAULT_ALPHA)}),
     "cv": Classical(_GRADIENTS, _cv, {}),
-    "wcv": Classical(_ALL, _keeping_energy(controlvariates.wcv), {}),
-    "wl2": Classical(_ALL, _keeping_energy(weighted.wl2), {}),
+    "wcv": Classical(_ALL, partial(_keeping_energy, controlvariates.wcv), {}),
+    "wl2": Classical(_ALL, partial(_keeping_energy, weighted.wl2), {}),
 }
 
 # Those a network can start from: they cost less than itself. Of wcv the sweeps alone, which see no more of the image
@@ -88,5 +88,5 @@ CLASSICAL = {
 BASES = {
     "l2": CLASSICAL["l2"],
     "cv": CLASSICAL["cv"],
-    "wcv": Classical(_ALL, _with_variances(controlvariates.wcv), {}),
+    "wcv": Classical(_ALL, partial(_with_variances, controlvariates.wcv), {}),
 }

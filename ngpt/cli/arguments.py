@@ -4,14 +4,17 @@ import argparse
 import json
 import logging
 import re
-from collections.abc import Mapping
+from collections.abc import Container, Iterator, Mapping
 from pathlib import Path
 
+from ngpt.errors import WrongUse
 from ngpt.io.frames import input_files, is_shot
 from ngpt.layers import LAYERS
 from ngpt.system import configs
-from ngpt.system.console import Console, by_names
-from ngpt.system.files import check_output, make_folder
+from ngpt.system.console import Console
+from ngpt.system.files import atomic_output, check_output, make_folder
+from ngpt.system.parts import Registry
+from ngpt.system.text import by_names
 
 _LOG = logging.getLogger(__name__)
 
@@ -34,9 +37,45 @@ def output_file(path: str | Path, args: argparse.Namespace) -> Path:
 
 
 def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:
-    """``--config``, for one of the kinds of ``ngpt.system.configs``."""
+    """``--config`` and ``--init``, for one of the kinds of ``ngpt.system.configs``."""
     known = ", ".join(configs.names(kind))
-    parser.add_argument("--config", required=True, metavar="CONFIG", help=f"{what}: a TOML file, or one of: {known}")
+    parser.add_argument("--config", metavar="CONFIG", help=f"{what}: a TOML file, or one of: {known}")
+    parser.add_argument(
+        "--init",
+        metavar="FILE",
+        help=f"write the configuration (default: {configs.STARTS[kind]}) to this file, with all that could be set, and "
+        "stop there",
+    )
+
+
+def config_of(args: argparse.Namespace, kind: str) -> Path:
+    """The configuration that ``--config`` names. Raises WrongUse where it is missing."""
+    if args.config is None and args.init is None:
+        raise WrongUse(f"--config is missing: a TOML file, or one of: {', '.join(configs.names(kind))}")
+    return configs.find_config(args.config or configs.STARTS[kind], kind)
+
+
+def write_template(args: argparse.Namespace, text: str, verb: str, console: Console) -> int:
+    """Writes the file of ``--init``, and says what to do with it."""
+    make_folder(Path(args.init).parent)
+    target = check_output(args.init)
+    with atomic_output(target) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+    console.say(f"{target}: all that could be set; then: ngpt {verb} --config {target} --out DIR")
+    return 0
+
+
+class Names(Container[str]):
+    """The names of a registry and "auto", as choices of an option. Others' entries are listed once imported."""
+
+    def __init__(self, registry: Registry):
+        self.registry = registry
+
+    def __contains__(self, name: object) -> bool:
+        return name == "auto" or name in self.registry
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(("auto", *self.registry))
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:

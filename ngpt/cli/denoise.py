@@ -13,6 +13,7 @@ from typing import Any
 from ngpt.api import lightgroups
 from ngpt.api.uncertainty import reconstruct_with_error
 from ngpt.cli.arguments import (
+    Names,
     add_files,
     add_force,
     add_json,
@@ -32,11 +33,13 @@ from ngpt.cli.reference import Reference
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.exr import read_views
+from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
 from ngpt.methods import METHODS, by_standing, reconstruct
 from ngpt.network.identity import identify
 from ngpt.network.run_onnx import MEMORY
+from ngpt.options import as_text, settings, unusual
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.system.console import Console
@@ -65,7 +68,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--method",
         default="auto",
         metavar="NAME",
-        choices=["auto", *METHODS],
+        choices=Names(METHODS),
         help=f"auto: the best that layers and machine allow (default); {first}; for some stacks: "
         f"{', '.join(by_standing('niche'))}. See `ngpt info`",
     )
@@ -159,7 +162,14 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
     options |= dict(args.option)
     # One stack has no progress to tell, but somebody who looks on sees that it is at work.
     bar = console.progress("denoise", "frames") if len(pairs) > 1 or console.terminal else nullcontext(_unseen)
-    overwrite = partial(write_frame, overwrite=args.force, transform=args.transform, exposure=args.exposure)
+    overwrite = partial(
+        write_frame,
+        overwrite=args.force,
+        transform=args.transform,
+        exposure=args.exposure,
+        # Of a folder, whose disk may be full, the next call makes again what is missing.
+        keep=len(pairs) == 1,
+    )
     frames: Any
     windows = False
     if args.temporal and not all(args.skip_existing and finished(target) for _, target in pairs):
@@ -222,6 +232,8 @@ def read_frame(
     source, target = pair
     # Only now, for several machines may be at work on one folder.
     there = args.skip_existing and finished(target)
+    if there and target.suffix.lower() == ".exr":
+        _check_result(source, target, args)
     if there and target not in again:
         return Frame(source, target, None, there=True)
     cut = args.skip_existing and not there and target.exists()
@@ -230,6 +242,24 @@ def read_frame(
     if others and (what := one_view_only(target, args, files)):
         raise NgptError(f"{source}: has several views, and {what}; choose one, as in --view {first.view}")
     return first._replace(others=tuple(others))
+
+
+def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
+    """Raises NgptError where a result is not that of this stack by what is asked for."""
+    result, stack = first_attributes(target), first_attributes(source)
+    asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
+    asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
+    if args.method in METHODS and not args.weights:
+        options = METHODS[args.method].options
+        given = as_text(unusual(options, settings(f"method '{args.method}'", options, dict(args.option))))
+        asked |= {"ngpt:method": args.method, "ngpt:options": given or None}
+    for name, value in asked.items():
+        if result.get(name) != value:
+            what = name.removeprefix("ngpt:")
+            raise NgptError(
+                f"{target}: is another result: {what} {result.get(name, 'none')}, not {value or 'none'}; give another "
+                "name, or --force in place of --skip-existing to replace it"
+            )
 
 
 def compute_frame(

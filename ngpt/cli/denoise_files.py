@@ -19,6 +19,7 @@ from ngpt.methods import METHODS, Result
 from ngpt.report.pictures import write_picture
 from ngpt.report.transforms import shown
 from ngpt.stack import GradientStack
+from ngpt.system.files import save
 from ngpt.version import __version__
 
 
@@ -48,21 +49,30 @@ class Frame(NamedTuple):
         return self.stack.source.view.name if self.stack is not None and self.stack.source is not None else ""
 
 
-def write_frame(frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0) -> dict:
-    """Writes the result, and returns what there is to report."""
+def write_frame(
+    frame: Frame, overwrite: bool, transform: str = "standard", exposure: float | str = 0.0, keep: bool = False
+) -> dict:
+    """Writes the result, with ``keep`` elsewhere where it must, and returns what there is to report."""
     source, target, stack, result, errors, groups, there, cut, over_time, reason, others = frame
     report: dict[str, Any] = {"input": str(source), "output": str(target)}
     if there or stack is None or result is None:
         return report | {"skipped": True}
     made = {**result.attributes, **over_time}
-    if target.suffix.lower() == ".exr":
-        views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
-        write(target, [image for image, _ in views], [of for _, of in views], overwrite or cut, made)
-    elif target.suffix.lower() == ".pfm":
-        write_pfm(target, converted(result.image, to_rec709(stack.attributes)), overwrite)
+
+    def save_to(path: Path, overwrite: bool) -> None:
+        if path.suffix.lower() == ".exr":
+            views = [(one.result.image, one.stack) for one in (frame, *others) if one.result and one.stack]
+            write(path, [image for image, _ in views], [of for _, of in views], overwrite, made)
+        elif path.suffix.lower() == ".pfm":
+            write_pfm(path, converted(result.image, to_rec709(stack.attributes)), overwrite)
+        else:
+            light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
+            write_picture(path, shown(light, transform, exposed(exposure, light)), overwrite)
+
+    if keep:
+        save(target, save_to, overwrite or cut)
     else:
-        light = in_picture(converted(result.image, to_rec709(stack.attributes)), stack.place)
-        write_picture(target, shown(light, transform, exposed(exposure, light)), overwrite)
+        save_to(target, overwrite or cut)
     report |= {
         "method": result.method,
         "weights": {"file": result.weights.file, "sha256": result.weights.sha256} if result.weights else None,

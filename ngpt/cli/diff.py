@@ -38,9 +38,9 @@ def compare_files(names: Sequence[str], args: argparse.Namespace, console: Conso
     image, reference = both.of(images)
     if both.line:
         console.say(both.line)
-    metrics = compare(image, reference)
     usable, lacks = available(*image.shape[:2])
-    metrics |= judge([name for name in ("SSIM", "FLIP") if name in usable], image, reference)[0]
+    metrics = compare(image, reference)
+    metrics |= judge([name for name in usable if name not in metrics], image, reference)[0]
     agree = metrics["relMSE"] <= args.tolerance and metrics["nonfinite"] == 0
     if args.json:
         print_json({"agree": agree, "tolerance": args.tolerance, "metrics": metrics})

@@ -4,7 +4,8 @@ import argparse
 from dataclasses import replace
 from pathlib import Path
 
-from ngpt.cli.arguments import add_config
+from ngpt.cli.arguments import add_config, config_of, write_template
+from ngpt.errors import WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
 
@@ -15,13 +16,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "in DIR/cache: an interrupted run goes on when it is started again, and only what changed is computed anew."
     )
     add_config(parser, configs.EVALUATION, "scenes, methods and metrics")
-    parser.add_argument("--out", required=True, type=Path, metavar="DIR", help="folder of the results")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="folder of the results")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="further scenes, files or patterns")
     parser.add_argument("--cache", type=Path, metavar="DIR", help="stacks and cells (default: OUT/cache)")
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    path = configs.find_config(args.config, configs.EVALUATION)
+    path = config_of(args, configs.EVALUATION)
+    if args.init:
+        from ngpt.evaluation.config import Config
+        from ngpt.system.templates import template
+
+        return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
+    if not args.out:
+        raise WrongUse("--out is missing: the folder of the results")
     # Here and not above: a mistyped option is said at once.
     from ngpt.evaluation.config import read_config
     from ngpt.evaluation.run import evaluate

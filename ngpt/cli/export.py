@@ -18,21 +18,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--method", choices=["l2"], help="l2, the default: least-squares screened Poisson")
     parser.add_argument("--alpha", type=float, default=DEFAULT_ALPHA, help=f"of l2; default: {DEFAULT_ALPHA}")
     parser.add_argument("--precision", choices=["float32", "float16"], default="float32", help="of a network's body")
-    parser.add_argument("--statistics", type=Path, metavar="FILE.onnx", help="also write the graph that tiling needs")
     parser.add_argument("--vector", type=Path, metavar="FOLDER", help="also write an example of inputs and output")
-    what = "model to write: .onnx, .tza for OIDN, or .safetensors: weights in 16 bits"
+    what = (
+        "model to write: .onnx, and for a network beside it .statistics.onnx, which hosts need for tiles; "
+        ".tza for OIDN; or .safetensors: weights in 16 bits"
+    )
     parser.add_argument("-o", "--output", type=Path, required=True, metavar="FILE", help=what)
     add_force(parser)
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    if not args.weights and (args.statistics or args.vector):
-        raise WrongUse("--statistics and --vector belong to networks; leave them out for a classical method")
-    if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.statistics or args.vector):
+    if not args.weights and args.vector:
+        raise WrongUse("--vector belongs to networks; leave it out for a classical method")
+    if args.output.suffix in (".tza", ".safetensors") and (not args.weights or args.vector):
         raise WrongUse(f"{args.output}: a file of this kind holds a network and no more; give it --weights alone")
-    for path in (args.output, args.statistics):
-        if path is not None:
-            output_file(path, args)
+    output_file(args.output, args)
     for path in write(args):
         console.say(f"{path}: {path.stat().st_size} bytes")
     return 0
@@ -59,16 +59,15 @@ def write(args: argparse.Namespace) -> list[Path]:
     elif kind_of(args.weights) == "temporal":
         from ngpt.sequence.export import temporal_model
 
-        if args.statistics or args.vector:
-            raise NgptError(f"{args.weights}: blends frames; leave --statistics and --vector out")
+        if args.vector:
+            raise NgptError(f"{args.weights}: blends frames; leave --vector out")
         models = {args.output: temporal_model(args.weights)}
     else:
         from ngpt.export.network import network_model, statistics_model
 
-        name = args.weights.stem
+        name, beside = args.weights.stem, output_file(args.output.with_suffix(".statistics.onnx"), args)
         models = {args.output: network_model(args.weights, name, args.precision)}
-        if args.statistics:
-            models[args.statistics] = statistics_model(args.weights, name)
+        models[beside] = statistics_model(args.weights, name)
     for path, model in models.items():
         with atomic_output(path, args.force) as temporary:
             temporary.write_bytes(model.SerializeToString())

@@ -96,6 +96,7 @@ def file(args: argparse.Namespace, console: Console) -> int:
 def overview() -> dict:
     """What this installation offers."""
     titles = {"methods": "use", "methods for some stacks": "niche", "methods to compare with": "study"}
+    METHODS.load()
     report: dict[str, Any] = {"version": __version__}
     for title, standing in titles.items():
         report[title] = {name: method.missing() or method.summary for name, method in by_standing(standing).items()}
@@ -148,6 +149,7 @@ def stack(stack: GradientStack) -> dict:
         [[int(n) for n in corner] for corner in main.header[f"{name}Window"]] for name in ("data", "display")
     )
     further = pass_through(stack)
+    METHODS.load()
     rates = {name: channel for name, channel in further.items() if name.startswith(DIAGNOSTICS)}
     layers = {}
     for name in stack.names:

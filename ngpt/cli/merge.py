@@ -4,8 +4,9 @@ import argparse
 
 from ngpt.cli.arguments import add_force, add_json, output_file, print_json
 from ngpt.io.exr import read, write
-from ngpt.merging import merge
+from ngpt.merging import UNFINISHED, merge
 from ngpt.system.console import Console
+from ngpt.system.files import save
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -19,8 +20,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace, console: Console) -> int:
     target = output_file(args.output, args)
-    merged = merge([read(path) for path in args.stacks])
-    write(target, merged, overwrite=args.force)
+    stacks = [read(path) for path in args.stacks]
+    merged = merge(stacks)
+    for stack in stacks:
+        if UNFINISHED in stack.attributes:
+            told = (
+                f"{stack.path}: was {stack.attributes[UNFINISHED]} at {stack.attributes['ngpt:spp']} samples per pixel"
+            )
+            console.say(f"{told}; `ngpt render --skip-existing` as before goes on with it")
+    save(target, lambda path, overwrite: write(path, merged, overwrite=overwrite), args.force)
     spp, seed = merged.attributes["ngpt:spp"], merged.attributes["ngpt:seed"]
     console.say(f"{len(args.stacks)} stacks -> {target}: {merged.place}, {spp} spp, seeds {seed}")
     if args.json:

@@ -19,8 +19,9 @@ from ngpt.report.content import REFERENCE, Entry, Overview, Scene
 from ngpt.report.layers import of_stack
 from ngpt.report.page import oversize, write_report
 from ngpt.sequence.flicker import change_maps, flicker, flicker_maps
-from ngpt.system.console import Console, by_names, tell
+from ngpt.system.console import Console, tell
 from ngpt.system.files import atomic_output
+from ngpt.system.text import by_names
 from ngpt.training.run_page import page, read_run
 from ngpt.training.run_summary import is_run
 from ngpt.version import __version__

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ngpt.errors import NgptError, WrongUse
-from ngpt.system.console import called
+from ngpt.system.text import called
 
 STREAM = "-"
 

@@ -3,13 +3,12 @@
 import argparse
 import json
 from contextlib import ExitStack
-from pathlib import Path
 
-from ngpt.cli.arguments import add_config
+from ngpt.cli.arguments import add_config, config_of, write_template
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
-from ngpt.system.files import atomic_output, check_output, exclusive, make_folder
+from ngpt.system.files import atomic_output, exclusive, make_folder
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -22,40 +21,31 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", help="change a setting, for example run.steps=1000"
     )
-    parser.add_argument(
-        "--init",
-        metavar="FILE",
-        help="write the configuration to this file, with all that could be set, and stop there",
-    )
     parser.add_argument("--dry-run", action="store_true", help="print size and cost of the network, and do not train")
 
 
 def run(args: argparse.Namespace, console: Console) -> int:
-    config = configs.find_config(args.config, configs.TRAINING)
+    config = config_of(args, configs.TRAINING)
     # Here and not above: a mistyped option is said at once, not after the seconds that torch takes to come in.
     from ngpt.system.parts import find_renderer
     from ngpt.training.cost import cost
     from ngpt.training.distributed import Processes
-    from ngpt.training.examples import Mixture, split
+    from ngpt.training.examples import Mixture
     from ngpt.training.folders import open_crops
     from ngpt.training.loss import make_loss
     from ngpt.training.run_record import write_record
     from ngpt.training.run_summary import PAGE
     from ngpt.training.settings import read_settings
+    from ngpt.training.split import split
     from ngpt.training.trainer import Trainer, show
 
     settings = read_settings(config, args.set)
     if args.init:
         if args.set:
             raise NgptError("--init writes what can be set by hand then; leave --set out")
-        from ngpt.training.parameters import template
+        from ngpt.training.parameters import training_template
 
-        make_folder(Path(args.init).parent)
-        target = check_output(args.init)
-        with atomic_output(target) as temporary:
-            temporary.write_text(template(config.read_text()))
-        console.say(f"{target}: {args.config}, and all that could be set; ngpt train --config {target} --out DIR")
-        return 0
+        return write_template(args, training_template(config.read_text(encoding="utf-8")), "train", console)
     if args.dry_run:
         print(cost(settings))
         return 0
@@ -69,7 +59,10 @@ def run(args: argparse.Namespace, console: Console) -> int:
         if processes.rank == 0:
             stack.enter_context(exclusive(out))
         on_disk = [folder for folder in settings.data.folders if not folder.endswith(".toml")]
-        crops, held_out = split([crop for f in on_disk for crop in open_crops(f)], settings.data.validation)
+        found = [crop for folder in on_disk for crop in open_crops(folder)]
+        crops, held_out, told = split(found, settings.data.validation, settings.data.validation_share)
+        if told and processes.rank == 0:
+            say(told)
         made = [configs.find_config(f, configs.DATASET) for f in settings.data.folders if f.endswith(".toml")]
         streams = [stack.enter_context(find_renderer().stream(config, settings.data.kept)) for config in made]
         trainer = Trainer(settings, Mixture(crops, *streams), held_out, loss, out, processes, say=say)

@@ -1,12 +1,11 @@
 """Intel Open Image Denoise as a method: it needs the primal and features, no gradients. Imported when first called."""
 
 from collections.abc import Mapping
-from functools import lru_cache
 from importlib.util import find_spec
-from typing import Any
 
 import numpy as np
 
+from ngpt.denoisers.oidn_filters import filtered
 from ngpt.errors import NgptError
 from ngpt.options import Option
 from ngpt.repair import Repaired
@@ -36,8 +35,6 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     ``quality``    "high", "balanced" or "fast"
     """
     require_oidn()
-    import mitsuba_oidn
-
     features = {}
     if auxiliary == "prefiltered":
         features = prefiltered(data.features, "high")
@@ -46,9 +43,8 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     # With the light sources seen, as a renderer hands it over and OIDN was trained.
     image = np.ascontiguousarray(data.image + data.direct, np.float32)
     clean = bool(features) and auxiliary in ("prefiltered", "clean")
-    options = {"hdr": True, "clean_aux": clean, "quality": _level(quality)}
-    # A copy: the result is a view of a buffer that OIDN owns.
-    return np.array(mitsuba_oidn.denoise(image, **features, **options)) - data.direct
+    images = {"color": image, **features}
+    return filtered(images, hdr=True, clean_aux=clean, quality=QUALITIES[quality]) - data.direct
 
 
 def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, np.ndarray]:
@@ -62,12 +58,6 @@ def prefiltered(features: Mapping[str, np.ndarray], quality: str) -> dict[str, n
     return {name: _prefiltered(name, layer, quality) for name, layer in _in_range(features).items()}
 
 
-def _level(quality: str) -> Any:
-    import mitsuba_oidn
-
-    return getattr(mitsuba_oidn.Quality, QUALITIES[quality])
-
-
 def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
     if "albedo" not in features:
         return {}
@@ -77,29 +67,7 @@ def _in_range(features: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
 
 def _prefiltered(name: str, layer: np.ndarray, quality: str) -> np.ndarray:
     """A feature denoised by OIDN's own model for it."""
-    if not layer.any():
-        return layer
-    result = np.zeros_like(layer)
-    device, held = _filters()
-    key = (name, layer.shape, quality)
-    if key not in held:
-        if len(held) > 8:
-            held.clear()
-        held[key] = device.new_filter("RT")
-        held[key].quality = _level(quality)
-    held[key].set_image(name, layer)
-    held[key].set_image("output", result)
-    held[key].execute()
-    return result
-
-
-@lru_cache(maxsize=1)
-def _filters() -> tuple[Any, dict]:
-    """The device, and its filters by feature, size and quality: to make one takes longer than to run it."""
-    import mitsuba_oidn
-
-    # On the CPU arrays are used where they lie; results would have to be copied from elsewhere.
-    return mitsuba_oidn.Device(mitsuba_oidn.DeviceType.CPU), {}
+    return filtered({name: layer}, "cpu", quality=QUALITIES[quality]) if layer.any() else layer
 
 
 def require_oidn() -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from ngpt.errors import NgptError, did_you_mean
 from ngpt.evaluation.config import Column, Config
-from ngpt.evaluation.keys import file_hash, library_hash
+from ngpt.evaluation.keys import code_of, file_hash, library_hash
 from ngpt.evaluation.references import Reference
 from ngpt.io.exr import write
 from ngpt.measure.metrics import METRICS, scores
@@ -40,6 +40,7 @@ class Scorer:
         lacks = {name: missing(**self.options.get(name, {})) for name, missing in found.items() if missing}
         self.absent_metrics = {name: lack for name, lack in lacks.items() if lack}
         self.metrics = [name for name in config.metrics if name not in self.absent_metrics]
+        self._code += filter(None, (code_of(METRICS[name].function) for name in self.metrics))
 
     def cell(
         self, column: Column, stack: Callable[[], GradientStack], reference: Reference, key: list, image: Path | None
@@ -49,6 +50,7 @@ class Scorer:
         ``key`` is what the stack depends on; ``stack`` is called only when the cell is not in the cache.
         """
         parts = [key, column.method, column.options, file_hash(column.options.get("weights", ""))]
+        parts += filter(None, [code_of(METHODS[column.method].run)])
         path = self._path(parts, reference)
         if path.exists() and (image is None or image.exists()):
             return json.loads(path.read_text())

@@ -43,7 +43,28 @@ class Column:
 
 @dataclass(frozen=True)
 class Config:
-    """See configs/eval-tiny.toml, which explains each entry."""
+    """An evaluation. configs/eval-tiny.toml shows entries at work; ``ngpt evaluate --init FILE`` writes all of them.
+
+    ``title``     of the report
+    ``scenes``    built-in scenes, scene files, patterns, or folders of stacks: KIND-SPP-SEED.exr and reference.exr
+    ``size``      width and height in pixels
+    ``spp``       samples per pixel of the stacks by ``clock``; other stacks have as many as take that time
+    ``seeds``     renders of each stack
+    ``methods``   of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
+    ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options
+    ``clock``     the sampler whose samples ``spp`` counts
+    ``time``      "wall", or "processor": all cores together, which other work on the machine does not change
+    ``metrics``   the first is measured always; E-LPIPS needs a table [elpips] with backbone and weights
+    ``primary``   the metric of tables and plots
+    ``reference_spp``, ``reference_seconds``  samples per pixel of a reference, or if that is 0 seconds of rendering
+    ``reference_sampler``  one that finds all the light of the scenes
+    ``timing_spp``, ``timing_repeats``  renders that measure what a sample costs
+    ``images``    pictures to keep: of the "first" seed, of "all", or "none"
+    ``elpips``    files of E-LPIPS: backbone and weights
+    ``references``  references from elsewhere, NAME = "FILE" or NAME = ["FILE", "FILE"] for two halves
+    ``groups``    of scenes, NAME = ["SCENE", ...]: rows of means in the tables
+    ``variants``  methods with options of their own, by name
+    """
 
     title: str = "Evaluation"
     scenes: tuple[str, ...] = ()
@@ -67,7 +88,8 @@ class Config:
     references: dict[str, Any] = field(default_factory=dict)
     groups: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
-    sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict)
+    # What tables in the place of ``samplers`` hold: files have no entry of this name.
+    sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})
 
     def __post_init__(self) -> None:
         low = min((*self.spp, self.seeds, *self.size, self.timing_spp, self.timing_repeats), default=0)

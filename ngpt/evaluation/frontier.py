@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from html import escape
 
 from ngpt.report.axes import Axes
+from ngpt.system.text import markup
 
 # Of the samplers of one method.
 DASHES = ("", "7 3", "2 3", "7 3 2 3", "12 4", "1 5")
@@ -58,7 +58,7 @@ def draw(points: list[Point], title: str, metric: str, doubt: float | None = Non
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
         for p in own:
             shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
-            name = escape(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
+            name = markup(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
             look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
             parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")
     parts += axes.legend([(method, *look) for method, look in looks.items()])

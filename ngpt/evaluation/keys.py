@@ -8,8 +8,10 @@ from __future__ import annotations
 import ast
 import hashlib
 import re
+import sys
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 # Of the library: rooms that decide no image and no number.
 _PRESENTATION = ("cli", "evaluation", "export", "report", "system")
@@ -47,6 +49,18 @@ def library_hash() -> str:
     for path in sorted((folder / "weights").iterdir()):
         digest.update(path.read_bytes())
     return digest.hexdigest()
+
+
+def code_of(function: Any) -> str:
+    """SHA-256 of the package that a function is from; "" of our own, which ``library_hash`` is of."""
+    root = getattr(function, "func", function).__module__.partition(".")[0]
+    file = getattr(sys.modules.get(root), "__file__", None)
+    if root == "ngpt" or not file:
+        return ""
+    path = Path(file)
+    if path.name == "__init__.py":
+        return source_hash(path.parent)
+    return hashlib.sha256(code_text(path).encode()).hexdigest()
 
 
 def scene_hash(scene: str) -> str:

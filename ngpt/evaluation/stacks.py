@@ -26,6 +26,7 @@ from ngpt.evaluation.renders import DEFAULTS, Render
 from ngpt.io.exr import read, write
 from ngpt.renderer import Renderer
 from ngpt.stack import GradientStack
+from ngpt.system.files import save
 from ngpt.system.machine import version
 from ngpt.system.writing import write_json
 from ngpt.version import __version__
@@ -101,8 +102,7 @@ class SceneStacks:
                 scene = self.load()
                 spp = math.ceil(config.reference_spp / 2) or None
                 seconds = None if spp else config.reference_seconds / 2
-                path.parent.mkdir(parents=True, exist_ok=True)
-                write(path, self.renderer.render(scene, render.options, spp, REFERENCE_SEED + i, seconds=seconds))
+                _keep(path, self.renderer.render(scene, render.options, spp, REFERENCE_SEED + i, seconds=seconds))
         return read_reference(paths)
 
     def costs(self, renders: Iterable[Render] = ()) -> Costs:
@@ -173,8 +173,7 @@ class SceneStacks:
             self._warm_up(render)
             stack, seconds = self.renderer.timed(self.load(), render.options, spp, seed, self.config.time)
             stack.attributes["ngpt:seconds"] = seconds
-            path.parent.mkdir(parents=True, exist_ok=True)
-            write(path, stack)
+            _keep(path, stack)
         # Without gradients beside it the reader takes this name for direct light, not for emission seen directly.
         return read(path, {"direct": "direct"} if render.kind == "features" and not self.given else None)
 
@@ -211,6 +210,12 @@ class SceneStacks:
             self.lacks[render.name] = f"sampler '{render.sampler}' renders {what}: list it under {entry}"
             return False
         return True
+
+
+def _keep(path: Path, stack: GradientStack) -> None:
+    """Puts a stack into the cache, if no other process was faster."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite), alike=True)
 
 
 def _sampler(stack: GradientStack) -> str:

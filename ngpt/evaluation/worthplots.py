@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +13,7 @@ from ngpt.io.exr import read_image
 from ngpt.measure.metrics import relative_squared_error
 from ngpt.report.axes import Axes
 from ngpt.report.display import coloured
+from ngpt.system.text import markup
 from ngpt.system.writing import write_text
 
 RANGE = 3.0  # powers of two at either end of the colours
@@ -97,14 +97,14 @@ def draw_map(panels: list[tuple[str, np.ndarray]], title: str) -> str:
         f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width:.0f} {height:.0f}" font-family="sans-serif" '
         'font-size="12">',
         f'<rect width="{width:.0f}" height="{height:.0f}" fill="white"/>',
-        f'<text x="6" y="18" font-size="14">{escape(title)}</text>',
+        f'<text x="6" y="18" font-size="14">{markup(title)}</text>',
     ]
     for i, (label, ratio) in enumerate(panels):
         left = 6 + i * (_WIDTH + 12)
         for (y, x), colour in zip(np.ndindex(rows, columns), _hex(ratio.ravel()), strict=True):
             place = f'x="{left + x * edge:.2f}" y="{30 + y * edge:.2f}" width="{edge:.2f}" height="{edge:.2f}"'
             parts.append(f'<rect {place} fill="{colour}" shape-rendering="crispEdges"/>')
-        parts.append(f'<text x="{left}" y="{30 + rows * edge + 15:.1f}">{escape(label)}</text>')
+        parts.append(f'<text x="{left}" y="{30 + rows * edge + 15:.1f}">{markup(label)}</text>')
     return "\n".join([*parts, *_legend(30 + rows * edge + 26), "</svg>"]) + "\n"
 
 
@@ -142,7 +142,7 @@ def draw_worth(worth: dict[str, Any]) -> str:
         dashes = f' stroke-dasharray="{dash}"' if dash else ""
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
         for row in own:
-            name = escape(f"{scene}, {row['spp']} spp: {row['mark']}{row['W/C']:.2f}, {row['method']}, {row['rival']}")
+            name = markup(f"{scene}, {row['spp']} spp: {row['mark']}{row['W/C']:.2f}, {row['method']}, {row['rival']}")
             place = f'cx="{axes.x(row["spp"]):.1f}" cy="{axes.y(row["W/C"]):.1f}"'
             # Hollow where W is not between measured samples.
             fill = "white" if row["mark"] else color

@@ -28,8 +28,10 @@ import numpy as np
 import OpenEXR
 
 from ngpt.errors import NgptError
+from ngpt.io import openexr_copies
 from ngpt.io.header import PartHeader, read_headers
 from ngpt.system.files import atomic_output
+from ngpt.system.forks import hold_while_forking
 from ngpt.system.limits import free_address_space, processors
 from ngpt.system.reading import regular_file
 
@@ -56,11 +58,14 @@ _ATTRIBUTE_TYPES = (
 )
 # Where open files have names by their number, which open them anew; Linux alone has such.
 _NUMBERS = Path("/proc/self/fd")
-# Lest one call ends the threads of another. OpenEXR keeps Python's lock anyway.
+# Two calls would end the threads of each other, and each would restore the other's stdout and stderr instead of the
+# program's. OpenEXR keeps Python's lock anyway.
 _one_at_a_time = threading.Lock()
+hold_while_forking(_one_at_a_time)
 # MiB of address space that a thread may reserve, for its stack and its share of the heap.
 _THREAD = 256
 _FLOAT_MAX = float(np.finfo(np.float32).max)
+openexr_copies.register()
 
 
 @dataclass(frozen=True)
@@ -114,6 +119,20 @@ def read_exr(path: str | os.PathLike) -> ExrImage:
     )
 
 
+def read_header(path: str | os.PathLike) -> tuple[dict[str, Any], tuple[int, int]]:
+    """The attributes of a file's first part and its (width, height), without its pixels; raises NgptError."""
+    path = Path(path)
+    with regular_file(path) as file:
+        size = read_headers(file, str(path))[0].size
+        name = _numbered(file)
+        try:
+            with _without_native_stderr():
+                return dict(OpenEXR.File(name, header_only=True).parts[0].header), size
+        except Exception as error:
+            reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, path.name)
+            raise NgptError(f"{path}: cannot be read ({reason}); render or copy it again") from error
+
+
 def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False) -> Path:
     """Writes ``image`` to ``path``, complete or not at all, and returns the path.
 
@@ -126,7 +145,7 @@ def write_exr(path: str | os.PathLike, image: ExrImage, overwrite: bool = False)
     parts = [_writable(part, str(path)) for part in image.parts]
     with atomic_output(path, overwrite) as temporary, _name_to_write(temporary) as name:
         try:
-            with _all_cores():
+            with _one_at_a_time, _all_cores():
                 OpenEXR.File([OpenEXR.Part(*part) for part in parts]).write(name)
         except Exception as error:
             reason = (str(error).splitlines() or [type(error).__name__])[0].replace(name, Path(path).name)
@@ -160,7 +179,7 @@ def _decode(file: BinaryIO, path: Path, headers: list[PartHeader]) -> list[Any]:
     # OpenEXR skips a part whose pixels it cannot read, and only prints a warning to Python's stdout.
     printed = io.StringIO()
     try:
-        with contextlib.redirect_stdout(printed), _without_native_stderr(), _all_cores():
+        with _one_at_a_time, contextlib.redirect_stdout(printed), _without_native_stderr(), _all_cores():
             parts = OpenEXR.File(name, separate_channels=True).parts
     except MemoryError as error:
         size = sum(header.bytes for header in headers) / 2**20
@@ -204,15 +223,14 @@ def _all_cores() -> Iterator[None]:
     is short there are none, and where the caller has set a number it holds.
     """
     short = free_address_space() < processors() * _THREAD
-    with _one_at_a_time:
-        if short or OpenEXR.global_thread_count():
-            yield
-            return
-        OpenEXR.set_global_thread_count(processors())
-        try:
-            yield
-        finally:
-            OpenEXR.set_global_thread_count(0)
+    if short or OpenEXR.global_thread_count():
+        yield
+        return
+    OpenEXR.set_global_thread_count(processors())
+    try:
+        yield
+    finally:
+        OpenEXR.set_global_thread_count(0)
 
 
 def _writable(part: ExrPart, path: str) -> tuple[dict[str, Any], dict[str, Any], str]:

@@ -3,11 +3,14 @@
 ``ngpt.measure.distances.flip`` is its differentiable twin, for training.
 """
 
+import ctypes
 import math
+from pathlib import Path
 
 import numpy as np
 
 from ngpt.measure.images import check_size
+from ngpt.system.forks import in_children
 
 
 def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
@@ -19,6 +22,7 @@ def flip(image: np.ndarray, reference: np.ndarray) -> tuple[float, np.ndarray]:
     check_size(image, reference)
     import flip_evaluator
 
+    in_children(_one_thread)
     start, stop, count = flip_exposures(reference)
     parameters = {"startExposure": start, "stopExposure": stop, "numExposures": count, "tonemapper": "ACES"}
     x, r = (np.ascontiguousarray(np.clip(i, 0, 1e30), np.float32) for i in (image, reference))
@@ -42,3 +46,11 @@ def flip_exposures(reference: np.ndarray) -> tuple[float, float, int]:
     white = (-q + math.sqrt(q * q - 4 * p * s)) / (2 * p)
     start, stop = math.log2(white / float(lit.max())), math.log2(white / median)
     return start, stop, max(2, math.ceil(stop - start))
+
+
+def _one_thread() -> None:
+    """The package's own OpenMP on one thread: a child would wait for its parent's for ever."""
+    import flip_evaluator
+
+    for library in Path(f"{Path(flip_evaluator.__file__).parent}.libs").glob("libgomp*"):
+        ctypes.CDLL(str(library)).omp_set_num_threads(1)

@@ -21,6 +21,7 @@ import numpy as np
 from ngpt.errors import NgptError
 from ngpt.measure import flip, perceptual
 from ngpt.measure.images import check_size, middle, reinhard
+from ngpt.system.parts import Registry
 
 # Published relMSE values differ in this constant; ours is that of gradient-domain VCM and photon mapping.
 EPSILON = 1e-3
@@ -112,7 +113,7 @@ class Metric:
     missing: Callable[..., str] | None = None
 
 
-METRICS = {
+_OURS = {
     "relMSE": Metric("mean of (x - r)² / (r² + 0.001) over pixels and channels", "lower", relmse, squared=True),
     "relMSE trimmed": Metric("relMSE without the worst 0.1 % of the pixels", "lower", relmse_trimmed, squared=True),
     "relMSE NGPT": Metric(
@@ -144,6 +145,8 @@ METRICS = {
         missing=perceptual.elpips_lack,
     ),
 }
+# Other packages bring theirs by entry points.
+METRICS = Registry("ngpt.metrics", "metric", Metric, _OURS)
 
 
 def scores(

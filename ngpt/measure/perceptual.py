@@ -11,6 +11,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.measure.images import check_size, reinhard
+from ngpt.system.forks import in_children
 from ngpt.system.install import install_command
 
 # Of the random transforms of E-LPIPS; the standard error of the mean is then a few per cent.
@@ -67,7 +68,9 @@ def _elpips(backbone: str, weights: str) -> Callable[[np.ndarray, np.ndarray], f
     import torch
 
     from ngpt.measure.distances.perceptual import PerceptualDistance
+    from ngpt.network.run_torch import one_thread
 
+    in_children(one_thread)
     measure = PerceptualDistance("elpips-squeeze", _DRAWS, 8, backbone, weights)
 
     def distance(image: np.ndarray, reference: np.ndarray) -> float:

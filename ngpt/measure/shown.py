@@ -11,11 +11,12 @@ _WITH_MAP = {"SSIM": perceptual.ssim, "FLIP": flip}
 
 
 def available(height: int, width: int) -> tuple[list[str], dict[str, str]]:
-    """The metrics of SHOWN for images of this size, and why others cannot be computed here: name -> a line."""
-    lacks = {name: missing() for name in SHOWN if (missing := METRICS[name].missing)}
+    """The metrics of SHOWN and of other packages for images of this size, and why others cannot be: name -> a line."""
+    names = (*SHOWN, *METRICS.load())
+    lacks = {name: missing() for name in names if (missing := METRICS[name].missing)}
     if min(height, width) < 11:
         lacks["SSIM"] = f"SSIM needs images of 11x11 pixels, and these are {width}x{height}"
-    return [name for name in SHOWN if not lacks.get(name)], {name: lack for name, lack in lacks.items() if lack}
+    return [name for name in names if not lacks.get(name)], {name: lack for name, lack in lacks.items() if lack}
 
 
 def judge(names: list[str], image: np.ndarray, reference: np.ndarray) -> tuple[dict[str, float], dict[str, np.ndarray]]:

@@ -35,7 +35,7 @@ class Shipped:
     """
 
     name: str
-    also_missing: Callable[[], str] = lambda: ""
+    also_missing: Callable[[], str] = str
 
     @property
     def path(self) -> Path:

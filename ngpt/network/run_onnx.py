@@ -8,7 +8,6 @@ from __future__ import annotations
 import logging
 import math
 from collections.abc import Callable, Mapping
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,7 @@ from ngpt.classical.bases import BASES
 from ngpt.errors import NgptError
 from ngpt.network import tiles
 from ngpt.network.exposure import statistics
+from ngpt.system.forks import until_fork
 from ngpt.system.install import package_command
 from ngpt.system.limits import free_address_space, processors
 
@@ -48,7 +48,7 @@ class _OutOfMemory(NgptError):
 
 
 class Network:
-    """A network's file, loaded; thread-safe.
+    """A network's file, loaded; thread-safe, and right in forked children and when it was pickled.
 
     ``path``     model.onnx, as ``ngpt export`` writes it
     ``device``   one of ``DEVICES``; "auto" is "cpu"
@@ -60,7 +60,6 @@ class Network:
 
     def __init__(self, path: str | Path, device: str = "auto", threads: int = 0):
         self.path, self.device, self.threads = Path(path), "cpu" if device == "auto" else device, threads
-        self.session = session(self.path, self.device, threads)
         metadata = self.session.get_modelmeta().custom_metadata_map
         try:
             names = metadata["ngpt.inputs"].split(", ")
@@ -79,6 +78,11 @@ class Network:
         if metadata.get("ngpt.emission") == "true" or metadata.get("ngpt.optional", "direct") != "direct":
             raise NgptError(f"{path}: a network of colour alone, as earlier versions had; use one of today")
         self._check()
+
+    @property
+    def session(self) -> Any:
+        """ONNX Runtime's, shared by all networks of the file. No network holds it: it does not outlive a fork."""
+        return session(self.path, self.device, self.threads)
 
     def _check(self) -> None:
         """Raises NgptError unless the metadata make sense, and are those of the graph beside them."""
@@ -157,6 +161,7 @@ class Network:
         _LOG.debug("%s: %d tiles of %dx%d", self.path, len(pieces), columns, rows)
         shared = statistics(layers)
         image = np.empty((height, width, 3), np.float32)
+        session = self.session
         progress(0, len(pieces))
         for first in range(0, len(pieces), batch):
             if stop():
@@ -166,7 +171,7 @@ class Network:
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
             if self.asks_for_direct:
                 feed["direct"] = np.zeros_like(feed["primal"])
-            results = self._run(self.session, feed | {"statistics": shared})
+            results = self._run(session, feed | {"statistics": shared})
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]
                 image[inner_y, inner_x] = np.moveaxis(part, 0, -1)
@@ -236,7 +241,7 @@ def runtime() -> Any:
     return onnxruntime
 
 
-@lru_cache(maxsize=8)
+@until_fork(8)
 def _made(path: str, _modified: int, device: str, threads: int):
     onnxruntime = runtime()
     if device not in DEVICES:

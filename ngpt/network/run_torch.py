@@ -15,6 +15,7 @@ from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.network.weights import load_weights
 from ngpt.repair import Repaired
+from ngpt.system.forks import in_children
 
 # Padded pixels of a tile's side. Larger images are cut, so that memory does not grow with them; 640 holds 480x270.
 TILE = 640
@@ -87,9 +88,15 @@ def _loaded(path: str | Path, device: str) -> Reconstructor:
 def _model(path: str, _modified: int, device: str) -> Reconstructor:
     """The model of a file; read again when the file has changed."""
     model, _ = load_weights(path)
+    in_children(one_thread)
     if device == "auto":
         device = "cuda" if torch.cuda.is_available() else "cpu"
     try:
         return model.to(device)
     except (RuntimeError, AssertionError) as error:
         raise NgptError(f"device '{device}': cannot be used: {' '.join(str(error).split())[:200]}") from error
+
+
+def one_thread() -> None:
+    """PyTorch on one thread, as in the workers of its ``DataLoader``: a child would wait for its parent's for ever."""
+    torch.set_num_threads(1)

@@ -16,6 +16,9 @@ from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
 
+# Of the shipped networks, as PyTorch has them: in an installed package beside their .onnx, in the repository apart.
+_PACKAGE = Path(__file__).parents[1]
+FOLDERS = (_PACKAGE / "weights", _PACKAGE.parent / "export" / "weights")
 FORMAT = 1
 _TYPES = (torch.float16, torch.bfloat16, torch.float32, torch.float64)
 
@@ -30,10 +33,19 @@ def write_tensors(
         temporary.write_bytes(save(tensors, metadata={"ngpt": json.dumps({"format": FORMAT} | header)}))
 
 
+def shipped() -> dict[str, Path]:
+    """The networks that come with ngpt, by name: "ngpt-fast", ..."""
+    return {path.stem: path for folder in reversed(FOLDERS) for path in sorted(folder.glob("*.safetensors"))}
+
+
 def read_tensors(path: str | Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
-    """What ``write_tensors`` wrote. Raises NgptError for anything else."""
+    """What ``write_tensors`` wrote into a file, or a network of ``shipped`` by its name. Raises NgptError for anything
+    else."""
     if not Path(path).is_file():
-        raise NgptError(f"{path}: no such file")
+        names = shipped()
+        if str(path) not in names:
+            raise NgptError(f"{path}: no such file; networks that come with ngpt: {', '.join(names)}")
+        path = names[str(path)]
     try:
         with safe_open(str(path), framework="pt") as file:
             header = parse_json((file.metadata() or {}).get("ngpt", "null"), f"{path}: its header")
@@ -56,7 +68,7 @@ def save_weights(path: str | Path, model: Reconstructor, provenance: dict[str, A
 
 
 def load_weights(path: str | Path) -> tuple[Reconstructor, dict[str, Any]]:
-    """The model, ready for inference, and the header of its file.
+    """The model, ready for inference, and the header of its file; ``path`` may be a name of ``shipped``.
 
     Raises NgptError where the file is no weights of ngpt, tensors are missing, superfluous, of another shape, or hold
     values that are not finite.

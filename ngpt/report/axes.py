@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from html import escape
+
+from ngpt.system.text import markup
 
 
 @dataclass(frozen=True)
@@ -41,7 +42,7 @@ class Axes:
             f'<svg xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {self.width} {self.height}" '
             'font-family="sans-serif" font-size="12">',
             f'<rect width="{self.width}" height="{self.height}" fill="white"/>',
-            f'<text x="{self.left}" y="18" font-size="14">{escape(title)}</text>',
+            f'<text x="{self.left}" y="18" font-size="14">{markup(title)}</text>',
         ]
         for value in ticks(*self.y_range):
             parts.append(f'<path d="M{self.left} {self.y(value):.1f}H{self.right}" stroke="#e4e4e4"/>')
@@ -50,10 +51,10 @@ class Axes:
             parts.append(f'<path d="M{self.x(value):.1f} 30V{self.bottom}" stroke="#e4e4e4"/>')
             parts.append(f'<text x="{self.x(value):.1f}" y="{self.bottom + 16}" text-anchor="middle">{value:g}</text>')
         middle = (self.left + self.right) / 2
-        parts.append(f'<text x="{middle}" y="{self.height - 10}" text-anchor="middle">{escape(x_label)}</text>')
+        parts.append(f'<text x="{middle}" y="{self.height - 10}" text-anchor="middle">{markup(x_label)}</text>')
         parts.append(
             f'<text transform="translate(16 {(self.bottom + 30) / 2}) rotate(-90)" text-anchor="middle">'
-            f"{escape(y_label)}</text>"
+            f"{markup(y_label)}</text>"
         )
         return parts
 
@@ -62,7 +63,7 @@ class Axes:
         y = self.y(value)
         return (
             f'<path d="M{self.left} {y:.1f}H{self.right}" stroke="{color}" stroke-dasharray="4 4"/>'
-            f'<text x="{self.left + 6}" y="{y - 4:.1f}" fill="{color}" font-size="11">{escape(label)}</text>'
+            f'<text x="{self.left + 6}" y="{y - 4:.1f}" fill="{color}" font-size="11">{markup(label)}</text>'
         )
 
     def legend(self, names: list[tuple[str, str, str]]) -> list[str]:
@@ -72,7 +73,7 @@ class Axes:
             y = 40 + 17 * i
             dashes = f' stroke-dasharray="{dash}"' if dash else ""
             parts.append(f'<path d="M{self.right + 10} {y}h18" stroke="{color}" stroke-width="3"{dashes}/>')
-            parts.append(f'<text x="{self.right + 34}" y="{y + 4}">{escape(name)}</text>')
+            parts.append(f'<text x="{self.right + 34}" y="{y + 4}">{markup(name)}</text>')
         return parts
 
 

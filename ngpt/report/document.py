@@ -2,8 +2,9 @@
 
 import base64
 import hashlib
-from html import escape
 from importlib.resources import files as package_files
+
+from ngpt.system.text import markup
 
 
 def document(title: str, body: str, *, command: str = "", style: str = "", refresh: int = 0) -> str:
@@ -18,8 +19,8 @@ def document(title: str, body: str, *, command: str = "", style: str = "", refre
         f'<!DOCTYPE html>\n<html lang="en" data-ready="true">\n<head>\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{policy}">\n'
         f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f'<meta name="color-scheme" content="dark">\n{again}<title>{escape(title)}</title>\n'
-        f"<style>{sheet}</style>\n</head>\n<body>\n<header><h1>{escape(title)}</h1></header>\n"
+        f'<meta name="color-scheme" content="dark">\n{again}<title>{markup(title)}</title>\n'
+        f"<style>{sheet}</style>\n</head>\n<body>\n<header><h1>{markup(title)}</h1></header>\n"
         f"<main>\n{body}\n</main>\n"
-        f"<footer><code>{escape(command)}</code></footer>\n</body>\n</html>\n"
+        f"<footer><code>{markup(command)}</code></footer>\n</body>\n</html>\n"
     )

@@ -10,20 +10,26 @@ told nothing: requests by another name than ours are refused, and so is an ``eno
 
 import json
 import os
+import socket
 import threading
 import time
-from html import escape
+from contextlib import suppress
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 from ngpt.errors import NgptError
 from ngpt.report.page import auto_exposure, page_text
 from ngpt.report.preview import Preview
+from ngpt.system.text import markup, printable
 from ngpt.version import __version__
 
 ADDRESS, PORT = "127.0.0.1", 8642
 # Seconds after which somebody who asked no more has gone; and that those who look on are waited for at the end.
 _GONE, _FAREWELL = 5.0, 2.5
+# Connections at a time, each with a thread of its own: some browsers', with six each.
+MOST = 32
+# Seconds that a request and its answer may take together: a large page may go through a slow tunnel.
+_LONGEST = 60.0
 _FIRST = """<!DOCTYPE html><html lang="en"><meta charset="utf-8"><meta http-equiv="refresh" content="1">
 <meta name="viewport" content="width=device-width, initial-scale=1"><meta name="color-scheme" content="dark">
 <title>{title}</title><body style="margin: 2em; font: 15px/1.5 sans-serif; background: #191919; color: #e0e0e0">
@@ -91,7 +97,7 @@ class LivePage:
 
     def _first(self) -> str:
         """The page while there are no images."""
-        return _FIRST.format(title=escape(self.title), line=escape(self.line), command=escape(self.command))
+        return _FIRST.format(title=markup(self.title), line=markup(self.line), command=markup(self.command))
 
     def answer(self, path: str) -> tuple[str, str] | None:
         """Type and text of what there is at ``path``, None if there is nothing."""
@@ -100,7 +106,7 @@ class LivePage:
             return "text/html", self.text or self._first()
         if path == "/status":
             self._asked = time.monotonic()
-            news = {"number": self.number, "text": self.line, "ended": self.ended}
+            news = {"number": self.number, "text": printable(self.line), "ended": self.ended}
             if self.ended:
                 self._told_end.set()
             return "application/json", json.dumps(news)
@@ -116,8 +122,55 @@ def _listening(port: int, page: LivePage) -> ThreadingHTTPServer:
 
 
 class _Server(ThreadingHTTPServer):
+    """Answers each connection in a thread, ``MOST`` at a time, each for ``_LONGEST`` seconds at most.
+
+    Who connects while all are taken takes the place of the oldest: honest requests last some milliseconds. So neither
+    many connections nor slow ones keep the page from its reader, or take the render's memory and file descriptors.
+    """
+
     daemon_threads = True
     allow_reuse_address = os.name != "nt"  # There two could listen on one port.
+    request_queue_size = 128  # who finds no place among those that wait tries again after seconds
+
+    def __init__(self, *args):
+        self._open: dict[socket.socket, float] = {}  # when they began, the oldest first
+        self._changed = threading.Condition()
+        super().__init__(*args)
+
+    def process_request(self, request, client_address) -> None:
+        with self._changed:
+            if len(self._open) >= MOST:
+                _hang_up(next(iter(self._open)))
+                self._changed.wait_for(lambda: len(self._open) < MOST, timeout=1.0)
+            free = len(self._open) < MOST
+            if free:
+                self._open[request] = time.monotonic()
+        if free:
+            super().process_request(request, client_address)
+        else:
+            self.shutdown_request(request)
+
+    def shutdown_request(self, request) -> None:
+        with self._changed:
+            self._open.pop(request, None)
+            self._changed.notify_all()
+        super().shutdown_request(request)
+
+    def service_actions(self) -> None:
+        """Called again and again while it serves: hangs up where it has lasted too long."""
+        with self._changed:
+            for connection, begun in self._open.items():
+                if time.monotonic() - begun > _LONGEST:
+                    _hang_up(connection)
+
+    def handle_error(self, request, client_address) -> None:
+        """Says nothing of what went wrong with a request: the terminal belongs to the render."""
+
+
+def _hang_up(connection: socket.socket) -> None:
+    """Ends what its thread waits for."""
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
 
 
 class _Handler(BaseHTTPRequestHandler):

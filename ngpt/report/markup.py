@@ -3,13 +3,13 @@
 import base64
 import math
 from collections.abc import Mapping, Sequence
-from html import escape
 
 import numpy as np
 
 from ngpt.report import display
 from ngpt.report.content import Overview, Scene, median
 from ngpt.report.png import encode_palette_png, encode_png
+from ngpt.system.text import markup
 
 THUMBNAIL_WIDTH = 240
 NOTHING = "&ndash;"
@@ -37,8 +37,8 @@ def section(number: int, scene: Scene, stops: float) -> str:
     layers = [_figure(name, display.layer_view(name, layer)) for name, layer in scene.layers.items()]
     parts = [
         f'<section class="scene" id="scene-{number}">',
-        f"<h2>{escape(scene.name)}</h2>",
-        f'<p class="caption">{escape(scene.caption)}</p>',
+        f"<h2>{markup(scene.name)}</h2>",
+        f'<p class="caption">{markup(scene.caption)}</p>',
         '<div class="slot"></div>',
         '<h3>Pictures</h3><div class="thumbs">' + "".join(pictures) + "</div>",
         "<h3>Measurements</h3>" + _table(scene) if measured else "",
@@ -51,12 +51,12 @@ def section(number: int, scene: Scene, stops: float) -> str:
 def _figure(name: str, picture: np.ndarray, note: str = "", maps: Mapping[str, np.ndarray] | None = None) -> str:
     height, width = picture.shape[:2]
     source = "data:image/png;base64," + base64.b64encode(encode_png(picture)).decode()
-    hidden = "".join(f'<img hidden alt="" data-map="{escape(key)}" src="{_map(m)}">' for key, m in (maps or {}).items())
+    hidden = "".join(f'<img hidden alt="" data-map="{markup(key)}" src="{_map(m)}">' for key, m in (maps or {}).items())
     small = ' class="pixelated"' if width <= THUMBNAIL_WIDTH // 2 else ""
     return (
-        f'<figure data-name="{escape(name)}"><div class="frame">'
-        f'<img{small} width="{width}" height="{height}" alt="{escape(name)}" src="{source}">{hidden}'
-        f"</div><figcaption><b>{escape(name)}</b>{note}</figcaption></figure>"
+        f'<figure data-name="{markup(name)}"><div class="frame">'
+        f'<img{small} width="{width}" height="{height}" alt="{markup(name)}" src="{source}">{hidden}'
+        f"</div><figcaption><b>{markup(name)}</b>{note}</figcaption></figure>"
     )
 
 
@@ -67,7 +67,7 @@ def _map(values: np.ndarray) -> str:
 
 
 def _note(metric: str, value: float) -> str:
-    return f"<small>{escape(metric)} {_number(value)}</small>"
+    return f"<small>{markup(metric)} {_number(value)}</small>"
 
 
 def _table(scene: Scene) -> str:
@@ -77,7 +77,7 @@ def _table(scene: Scene) -> str:
     baseline = scene.baseline
     timed = any(entry.seconds is not None for entry in scene.entries)
     heads = [
-        f'<th scope="col">{escape(metric)} <i>{"↑" if metric in scene.rising else "↓"}</i><small></small></th>'
+        f'<th scope="col">{markup(metric)} <i>{"↑" if metric in scene.rising else "↓"}</i><small></small></th>'
         for metric in metrics
     ]
     rows = []
@@ -91,10 +91,10 @@ def _table(scene: Scene) -> str:
             cells.append(f"<td{mark}><span>{_number(value)}</span>{_spread(values)}<small>{compared}</small></td>")
         seconds = NOTHING if entry.seconds is None else f"{entry.seconds:.3g} s"
         cells += [f"<td><span>{seconds}</span></td>"] if timed else []
-        rows.append(f'<tr><th scope="row">{escape(entry.name)}</th>{"".join(cells)}</tr>')
+        rows.append(f'<tr><th scope="row">{markup(entry.name)}</th>{"".join(cells)}</tr>')
     heads += ['<th scope="col">time</th>'] if timed else []
     head = f'<tr><th scope="col">picture</th>{"".join(heads)}</tr>'
-    comparison = f"&times; ratio to {escape(baseline.name)} (&plusmn; difference)"
+    comparison = f"&times; ratio to {markup(baseline.name)} (&plusmn; difference)"
     legend = f"↓ lower is better, ↑ higher is better; bold: best; {comparison}"
     return (
         f'<div class="scroll"><table><thead>{head}</thead><tbody>{"".join(rows)}</tbody></table></div>'
@@ -112,8 +112,8 @@ def _spread(values: float | Sequence[float]) -> str:
 def overview_html(overview: Overview) -> str:
     """Plots, tables and formulas, each under its title."""
     plots = f"<h3>Plots</h3>{plots_html(overview.plots)}" if overview.plots else ""
-    tables = "".join(f"<h3>{escape(title)}</h3>{plain_table(rows)}" for title, rows in overview.tables.items())
-    formulas = "".join(f"<dt>{escape(key)}</dt><dd>{escape(text)}</dd>" for key, text in overview.formulas.items())
+    tables = "".join(f"<h3>{markup(title)}</h3>{plain_table(rows)}" for title, rows in overview.tables.items())
+    formulas = "".join(f"<dt>{markup(key)}</dt><dd>{markup(text)}</dd>" for key, text in overview.formulas.items())
     formulas = f'<h3>Metrics</h3><dl class="formulas">{formulas}</dl>' if formulas else ""
     body = tables + plots + formulas
     return f'<details id="overview" open><summary>Overview</summary>{body}</details>' if body else ""
@@ -125,14 +125,14 @@ def plots_html(plots: Mapping[str, str]) -> str:
     for title, svg in plots.items():
         # As a picture of its own, so that no script or link in it does anything.
         data = base64.b64encode(svg.encode()).decode()
-        image = f'<img alt="{escape(title)}" src="data:image/svg+xml;base64,{data}">'
-        parts.append(f'<figure class="plot">{image}<figcaption><b>{escape(title)}</b></figcaption></figure>')
+        image = f'<img alt="{markup(title)}" src="data:image/svg+xml;base64,{data}">'
+        parts.append(f'<figure class="plot">{image}<figcaption><b>{markup(title)}</b></figcaption></figure>')
     return '<div class="plots">' + "".join(parts) + "</div>"
 
 
 def plain_table(rows: list[list[str]]) -> str:
     """Rows of text, the first is the head."""
-    head, *body = [[escape(cell) for cell in row] for row in rows]
+    head, *body = [[markup(cell) for cell in row] for row in rows]
     lines = [f'<tr><th scope="row">{row[0]}</th>' + "".join(f"<td>{c}</td>" for c in row[1:]) + "</tr>" for row in body]
     heads = "".join(f'<th scope="col">{cell}</th>' for cell in head)
     return f'<div class="scroll"><table><thead><tr>{heads}</tr></thead><tbody>{"".join(lines)}</tbody></table></div>'

@@ -2,12 +2,12 @@
 
 import base64
 from collections.abc import Mapping
-from html import escape
 
 import numpy as np
 
 from ngpt.report import display
 from ngpt.report.png import encode_png
+from ngpt.system.text import markup
 
 WIDTH = 160  # pixels of the picture
 
@@ -25,8 +25,8 @@ def stack_html(title: str, layers: Mapping[str, np.ndarray]) -> str:
     rows = "".join(_row(name, layer) for name, layer in layers.items())
     heads = "".join(f"<th>{head}</th>" for head in ("layer", "min", "mean", "max", "pixels not finite"))
     return (
-        f"<p>{escape(title)}</p>"
-        f'<img alt="{escape(name)}" src="{source}">'
+        f"<p>{markup(title)}</p>"
+        f'<img alt="{markup(name)}" src="{source}">'
         f"<table><thead><tr>{heads}</tr></thead><tbody>{rows}</tbody></table>"
     )
 
@@ -36,4 +36,4 @@ def _row(name: str, layer: np.ndarray) -> str:
     values = layer[finite]
     numbers = [values.min(), values.mean(dtype=np.float64), values.max()] if values.size else [np.nan] * 3
     cells = [*(f"{number:.4g}" for number in numbers), str(np.count_nonzero(~finite.all(axis=-1)))]
-    return f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
+    return f"<tr><th>{markup(name)}</th>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"

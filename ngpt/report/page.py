@@ -11,9 +11,9 @@ import hashlib
 import json
 import os
 import re
-from html import escape
 from importlib.resources import files as package_files
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -22,6 +22,7 @@ from ngpt.report import display, pixelcodec
 from ngpt.report.content import REFERENCE, Overview, Scene
 from ngpt.report.markup import overview_html, section
 from ngpt.system.files import atomic_output
+from ngpt.system.text import markup, printable
 
 _SOURCES = ("report.html", "live.js")
 PAGE_LIMIT = 40e6  # bytes: what mail and a browser still take without complaint
@@ -95,18 +96,27 @@ def page_text(
         "toe": pixelcodec.TOE,
     }
     page |= {"live": live} if live else {}
-    notes = "".join(f"<div><dt>{escape(key)}</dt><dd>{escape(value)}</dd></div>" for key, value in footer.items())
+    notes = "".join(f"<div><dt>{markup(key)}</dt><dd>{markup(value)}</dd></div>" for key, value in footer.items())
     return _filled(
         live=bool(live),
-        TITLE=escape(title),
-        COMMAND=escape(command),
+        TITLE=markup(title),
+        COMMAND=markup(command),
         OVERVIEW=after,
         SCENES="\n".join(sections),
         FOOTER=notes,
         # '<' as an escape: a name that contains '</script>' must stay a name.
-        PAGE=json.dumps(page, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
+        PAGE=json.dumps(_printable(page), separators=(",", ":"), allow_nan=False).replace("<", "\\u003c"),
         PIXELS="\n".join(pixels),
     )
+
+
+def _printable(value: Any) -> Any:
+    """What JSON holds, with all its texts as they are in the markup, for the script finds one by the other."""
+    if isinstance(value, dict):
+        return {printable(key): _printable(each) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return [_printable(each) for each in value]
+    return printable(value) if isinstance(value, str) else value
 
 
 def oversize(path: str | os.PathLike) -> str:

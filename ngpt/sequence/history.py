@@ -30,6 +30,7 @@ from typing import Literal
 
 import numpy as np
 
+from ngpt.coverage import kept_within
 from ngpt.magnitude import WIDE, enlarged, magnitude, scaled
 from ngpt.repair import repair
 from ngpt.sequence.evidence import agreement, weighed
@@ -135,7 +136,8 @@ class Temporal:
         # In the units of the stack: the next one may be of another magnitude.
         light, direct = enlarged(now, power), enlarged(data.direct, power)
         self._history = _History(light, direct, relative, features, stack.place, frame)
-        return enlarged((now + data.direct).astype(np.float32), power)
+        # History keeps what this leaves out: where nothing was found by chance, there may be light in the next frame.
+        return kept_within(enlarged((now + data.direct).astype(np.float32), power), stack)
 
     def assume(self, variance: float) -> None:
         """Takes the last result for one of so much of a frame's own variance, as of 1 / ``variance`` frames."""

@@ -132,15 +132,15 @@ class Network:
 
     def __init__(self, path: str | Path):
         self.path = Path(path)
-        self._session = run_onnx.session(self.path, "cpu", 0)
-        metadata = self._session.get_modelmeta().custom_metadata_map
+        session = run_onnx.session(self.path, "cpu", 0)
+        metadata = session.get_modelmeta().custom_metadata_map
         if metadata.get(FRAMES) != ", ".join(INPUTS):
             raise NgptError(f"{path}: is no network that blends frames, or of another version of ngpt; export it anew")
         try:
             self.alignment, self.overlap = (int(metadata[f"ngpt.{name}"]) for name in ("alignment", "overlap"))
         except (KeyError, ValueError) as error:
             raise NgptError(f"{path}: its metadata {error} is missing, or no whole number; export it anew") from error
-        self.types, self.output = run_onnx.floats(self._session, self.path)
+        self.types, self.output = run_onnx.floats(session, self.path)
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
         """In strips of rows; their height does not change the result."""
@@ -148,9 +148,10 @@ class Network:
         padded = np.pad(inputs, [(0, -height % self.alignment), (0, -width % self.alignment), (0, 0)], mode="edge")
         rows = max(STRIP // padded.shape[1] // self.alignment, 1) * self.alignment
         result = np.empty((*padded.shape[:2], BANDS), np.float32)
+        session = run_onnx.session(self.path, "cpu", 0)
         for strip, around in tiles.spans(len(padded), rows, self.overlap):
             given: np.ndarray = run_onnx.planes(padded[around])[None].astype(self.types["inputs"], copy=False)
-            (made,) = self._session.run([self.output], {"inputs": given})
+            (made,) = session.run([self.output], {"inputs": given})
             result[strip] = np.moveaxis(made[0, :, tiles.within(strip, around)], 0, -1)
         return result[:height, :width]
 

@@ -15,6 +15,7 @@ from functools import cached_property
 import numpy as np
 
 from ngpt.classical.bases import CLASSICAL
+from ngpt.coverage import kept_within
 from ngpt.denoisers import caustic
 from ngpt.errors import NgptError
 from ngpt.magnitude import enlarged, magnitude, scaled
@@ -84,6 +85,7 @@ class _Member:
         image = enlarged((self.sum / self.weight + self.data.direct).astype(np.float32), self.power)
         if not np.isfinite(image).all():
             raise NgptError(f"{self.stack.path}: method 'wcv' over time gave non-finite pixels; scale the stacks down")
+        image = kept_within(image, self.stack)
         return self.number, self.stack, Result(image, "wcv", self.seconds, self.data.pixels, self.data.gradients)
 
 

@@ -11,6 +11,8 @@ FOLDER = next((f for f in (_PACKAGE / "configs", _PACKAGE.parent / "configs") if
 
 # Three kinds, by what their names begin with; those of training begin with neither of the others.
 DATASET, EVALUATION, TRAINING = "data-", "eval-", ""
+# What a configuration of one's own begins with where none is named
+STARTS = {DATASET: "data-cpu", EVALUATION: "eval-tiny", TRAINING: "fast"}
 
 
 def names(kind: str) -> list[str]:

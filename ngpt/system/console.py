@@ -16,6 +16,7 @@ from typing import TextIO
 from ngpt.errors import NgptError, WrongUse
 from ngpt.system.interrupts import raised
 from ngpt.system.limits import address_space
+from ngpt.system.text import printable
 
 # Elsewhere than on a terminal, a line at most this often, and the next when work has gone on for one part more of so
 # many that it took: a log should show life, not fill up.
@@ -80,41 +81,6 @@ def _check_address_space() -> None:
         raise NgptError(
             f"the address space is limited to {limit >> 20} MiB (ulimit -v); {FEWEST_MIB} are the least that works"
         )
-
-
-# Files that stand for what has no file, by path: what it is called in all that is said.
-_names: dict[str, str] = {}
-
-
-@contextmanager
-def called(path: str, name: str) -> Iterator[None]:
-    """Within the block messages and results say ``name`` for the file ``path``, and so do errors that leave it."""
-    _names[path] = name
-    try:
-        yield
-    except NgptError as error:
-        raise type(error)(by_names(str(error))) from error
-    finally:
-        del _names[path]
-
-
-def by_names(text: str) -> str:
-    """The text with the names of files that are ``called`` by others."""
-    for path, name in _names.items():
-        text = text.replace(path, name)
-    return text
-
-
-def printable(text: str) -> str:
-    """One line of text as it may go to a terminal: what files call their things may hold sequences that control one.
-
-    Files go by what they are ``called``. Control characters, line breaks and marks of direction become what Python
-    writes for them, ``\\x1b``.
-    """
-    text = by_names(text)
-    if text.isprintable():
-        return text
-    return "".join(letter if letter.isprintable() else repr(letter)[1:-1] for letter in text)
 
 
 def tell(line: str) -> None:
@@ -220,32 +186,38 @@ class Console:
         return not self.quiet and sys.stderr.isatty()
 
     @contextmanager
-    def progress(self, label: str, unit: str, rate: bool = False) -> Iterator[Callable[[int, int], None]]:
-        """Yields ``update(done, total)``; the first call says what was done before. ``rate``: units per second, too."""
+    def progress(
+        self, label: str, unit: str, rate: bool = False, begins: str = ""
+    ) -> Iterator[Callable[[int, int], None]]:
+        """Yields ``update(done, total)``; the first call says what was done before, and from it on time counts.
+
+        ``rate``: units per second are told, too. ``begins``: what goes on until the second call.
+        """
         if self.quiet:
             yield lambda done, total: None
         elif self.terminal:
-            with _bar(printable(label), unit, rate) as update:
+            with _bar(printable(label), unit, _Pace(unit, rate, begins)) as update:
                 yield update
         else:
-            yield _Lines(self, label, unit, rate)
+            yield _Lines(self, label, unit, _Pace(unit, rate, begins))
 
 
 class _Pace:
     """What is left, at the pace of the later half of the time so far: what lay ready in a cache is soon forgotten."""
 
-    def __init__(self, unit: str, rate: bool):
-        self.unit, self.rate = unit, rate
-        self.start, self.elapsed = time.monotonic(), 0.0
+    def __init__(self, unit: str, rate: bool, begins: str):
+        self.unit, self.rate, self.begins = unit, rate, begins
+        self.start, self.elapsed = 0.0, 0.0
         # (seconds, done), the first of them at half the time or before.
         self.past: deque[tuple[float, int]] = deque()
 
     def __call__(self, done: int, total: int) -> list[str]:
         """What there is to tell of the pace, in a few words each."""
-        self.elapsed = time.monotonic() - self.start
         if not self.past:
+            self.start = time.monotonic()
             self.past.append((0.0, done))
-            return []
+            return [self.begins] if self.begins and done < total else []
+        self.elapsed = time.monotonic() - self.start
         while len(self.past) > 1 and self.past[1][0] <= self.elapsed / 2:
             self.past.popleft()
         then, before = self.past[0]
@@ -272,7 +244,7 @@ def span(seconds: float) -> str:
 
 
 @contextmanager
-def _bar(label: str, unit: str, rate: bool) -> Iterator[Callable[[int, int], None]]:
+def _bar(label: str, unit: str, pace: _Pace) -> Iterator[Callable[[int, int], None]]:
     # Imported only here: a pipeline without a terminal does not pay for it.
     from rich.console import Console as Terminal
     from rich.progress import (
@@ -294,15 +266,20 @@ def _bar(label: str, unit: str, rate: bool) -> Iterator[Callable[[int, int], Non
         TextColumn("{task.fields[pace]}"),
     ]
     phrase: Callable[[list[str]], str] = ", ".join
-    pace, taken = _Pace(unit, rate), WIDE + (RATE if rate else 0)
+    taken = WIDE + (RATE if pace.rate else 0)
     if terminal.width < taken + LABEL:
         # What counts is how far it is and how long it takes.
         columns, phrase, taken = [columns[0], columns[2], columns[5]], _last, NARROW
     label = _shortened(label, terminal.width - taken)
     # Lines on standard output go above the bar, unless they go into a file.
     with Progress(*columns, console=terminal, redirect_stdout=sys.stdout.isatty()) as progress:
-        task = progress.add_task(label, total=None, pace="")
-        yield lambda done, total: progress.update(task, completed=done, total=total, pace=phrase(pace(done, total)))
+        task = progress.add_task(label, total=None, pace="", start=False)
+
+        def update(done: int, total: int) -> None:
+            progress.start_task(task)
+            progress.update(task, completed=done, total=total, pace=phrase(pace(done, total)))
+
+        yield update
 
 
 def _shortened(text: str, most: int) -> str:
@@ -318,16 +295,18 @@ def _last(words: list[str]) -> str:
 class _Lines:
     """Progress as lines of text: the first, the last, and now and then one between."""
 
-    def __init__(self, console: Console, label: str, unit: str, rate: bool):
-        self.console, self.label, self.unit, self.pace = console, label, unit, _Pace(unit, rate)
+    def __init__(self, console: Console, label: str, unit: str, pace: _Pace):
+        self.console, self.label, self.unit, self.pace = console, label, unit, pace
         self.first: int | None = None
-        self.last = 0.0
+        self.last, self.told = 0.0, (-1, -1)
 
     def __call__(self, done: int, total: int) -> None:
         words, elapsed = self.pace(done, total), self.pace.elapsed
         begun, self.first = self.first is not None, done if self.first is None else self.first
         if begun and done != total and elapsed - self.last < max(SECONDS_BETWEEN_LINES, elapsed / LINES):
             return
-        self.last = elapsed
+        if done == total and (done, total) == self.told:
+            return
+        self.last, self.told = elapsed, (done, total)
         times = [f"{elapsed:.1f} s"] if done > self.first else []
         self.console.say(", ".join([f"{self.label}: {done}/{total} {self.unit}", *times, *words]))

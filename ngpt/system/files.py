@@ -5,12 +5,15 @@ import re
 import tempfile
 import time
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
+from itertools import islice
 from pathlib import Path
+from threading import Lock
 
 from ngpt.errors import NgptError
+from ngpt.system.forks import hold_while_forking
 
 try:
     import fcntl
@@ -20,6 +23,9 @@ except ImportError:  # Windows, where a locked file could not be written by the 
 # Temporary files have names of their own, so that what killed processes leave behind is known for what it is.
 _PREFIX = ".ngpt-"
 _LEFTOVER = re.compile(r"\.ngpt-[a-z0-9_]{8}(\.[^.]*)?")
+_MOST = 99  # names that are tried for what cannot have its own
+_one_at_a_time = Lock()
+hold_while_forking(_one_at_a_time)
 _FORGOTTEN = 24 * 3600.0  # seconds without a change, after which they are swept where nothing can be locked
 
 
@@ -51,6 +57,44 @@ def check_output(path: str | os.PathLike, overwrite: bool = False, may_skip: boo
     return path
 
 
+def save(
+    path: str | os.PathLike, write: Callable[[Path, bool], object], overwrite: bool = False, *, alike: bool = False
+) -> None:
+    """``write(path, overwrite)``; where that fails, what was made is written elsewhere, and NgptError says where.
+
+    For what took long to make. Places, in order: another name beside ``path``, "a.kept.exr" for "a.exr", the working
+    directory, and the folder for temporary files. Nothing is overwritten there. ``write`` is called again for each, and
+    makes files complete or not at all, as ``atomic_output`` does.
+
+    ``alike`` is for folders that are made by several processes, all of whose files count: whoever makes this file makes
+    the same, so that one which is there by now will do; and nothing is put beside it.
+    """
+    path = Path(path)
+    try:
+        write(path, overwrite)
+    except (NgptError, OSError) as error:
+        if alike and path.is_file():
+            return
+        for other in _other_places(path, not alike):
+            try:
+                write(other, False)
+            except (NgptError, OSError):
+                continue
+            raise NgptError(f"{error}; what was made is kept in {other}") from error
+        raise NgptError(f"{error}; nor can it be written elsewhere, so it is lost") from error
+
+
+def _other_places(path: Path, beside: bool) -> Iterator[Path]:
+    """A free name in each folder where a file may go that cannot be written to ``path``."""
+    names = [f"{path.stem}.kept{f'-{n}' if n > 1 else ''}{path.suffix}" for n in range(1, _MOST + 1)]
+    folders: list[Callable[[], str | Path]] = [Path.cwd, tempfile.gettempdir]
+    for find in [lambda: path.parent, *folders] if beside else folders:
+        with suppress(OSError):  # a working directory that was removed, or no folder for temporary files
+            folder = Path(find())
+            free = (folder / name for name in names if not os.path.lexists(folder / name))
+            yield from islice(free, 1)
+
+
 @contextmanager
 def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[Path]:
     """Yields a temporary path beside ``path`` and renames it to ``path`` when the block succeeds.
@@ -71,9 +115,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
         with open(temporary, "r+b") as file:  # Windows flushes only what may be written
             os.fsync(file.fileno())
         # mkstemp makes private files; give the result the permissions that open() would have given it.
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)
+        os.chmod(temporary, 0o666 & ~_umask())
         _publish(temporary, path, overwrite)
         _sync_folder(path.parent)
     except OSError as error:
@@ -84,6 +126,14 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
                 temporary.unlink(missing_ok=True)
         if handle is not None:
             os.close(handle)
+
+
+def _umask() -> int:
+    """Of the process. It is known only by setting it: two threads that did so at once would leave it at 0."""
+    with _one_at_a_time:
+        umask = os.umask(0)
+        os.umask(umask)
+    return umask
 
 
 def _temporary(path: Path) -> tuple[Path, int | None]:

@@ -1,10 +1,18 @@
-"""What other packages bring, by entry points: the renderer, whom nothing in ngpt imports, and the verbs that render."""
+"""What other packages bring, by entry points: the renderer, whom nothing in ngpt imports, and verbs that render.
 
-from collections.abc import Iterator
-from typing import Any
+Methods, samplers, losses and metrics of anyone, too: each registry is a ``Registry``.
+"""
+
+import sys
+from collections.abc import Container, Iterator
+from importlib.util import find_spec
+from typing import Any, TypeVar
 
 from ngpt.errors import NgptError
+from ngpt.system.console import print_line
 from ngpt.system.install import install_command
+
+T = TypeVar("T")
 
 
 def no_renderer() -> str:
@@ -12,19 +20,104 @@ def no_renderer() -> str:
     return f"rendering needs the package data_gen, which is not installed; `{install_command('render')}`"
 
 
-def brought(group: str) -> Iterator[Any]:
-    """What the entry points of a ``group`` name, without those of packages that are not there any more."""
+def warn(text: str) -> None:
+    """A line on standard error about a package that cannot be used; the work goes on without it."""
+    print_line(f"ngpt: {text}", sys.stderr)
+
+
+def points(group: str) -> Iterator[Any]:
+    """The entry points of a ``group``, without those of packages that are not there any more; nothing is imported."""
     from importlib.metadata import entry_points  # takes 50 ms
 
     for point in entry_points(group=group):
+        if find_spec(point.module.partition(".")[0]):
+            yield point
+
+
+def loaded(point: Any) -> Any:
+    """What an entry point names. Raises NgptError where it cannot be imported, whatever its package raises."""
+    try:
+        return point.load()
+    except Exception as error:
+        raise NgptError(f"{_owner(point)} cannot be imported: {type(error).__name__}: {error}") from error
+
+
+def brought(group: str) -> Iterator[Any]:
+    """What the entry points of a ``group`` name; a package that cannot be imported costs a line, and is left out."""
+    for point in points(group):
         try:
-            yield point.load()
-        except ModuleNotFoundError:
-            continue
+            yield loaded(point)
+        except NgptError as error:
+            warn(str(error))
 
 
 def find_renderer() -> Any:
-    """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed."""
-    for renderer in brought("ngpt.renderers"):
-        return renderer
+    """The renderer, see ``ngpt.renderer.Renderer``. Raises NgptError where none is installed, or it is broken."""
+    for point in points("ngpt.renderers"):
+        return loaded(point)
     raise NgptError(no_renderer())
+
+
+class Registry(dict[str, T]):
+    """Entries by name: ours, and those that other packages bring by entry points of a ``group``.
+
+    An entry of another package is imported when it is asked for by its name. Iteration goes over ours, and over others'
+    that have been imported; who lists all of them calls ``load`` before. Nobody looks for others to find one of ours.
+
+    ``what``   what an entry is, for messages: "method"
+    ``kind``   the class of an entry, or ``Callable``
+    ``taken``  further names that no other package's entry may have
+    """
+
+    def __init__(self, group: str, what: str, kind: Any, ours: dict[str, T], taken: Container[str] = ()):
+        super().__init__(ours)
+        self.group, self.what, self.kind, self.taken = group, what, kind, taken
+        self._imported: set[str] = set()
+
+    def __contains__(self, name: object) -> bool:
+        return super().__contains__(name) or any(point.name == name for point in self._others())
+
+    def __missing__(self, name: str) -> T:
+        named = [point for point in self._others() if point.name == name]
+        if not named:
+            raise KeyError(name)
+        if len(named) > 1:
+            packages = " and ".join(f"'{point.dist.name}'" for point in named)
+            raise NgptError(f"{self.what} '{name}': the packages {packages} both bring one; uninstall one of them")
+        entry = loaded(named[0])
+        if not isinstance(entry, self.kind) or getattr(entry, "name", name) != name:
+            raise NgptError(f"{_owner(named[0])} names {entry!r:.80}, which is no {self.what} of that name")
+        self[name] = entry
+        self._imported.add(name)
+        return entry
+
+    def get(self, name: str, default: Any = None) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            return default
+
+    def load(self) -> list[str]:
+        """Imports the entries of all other packages; returns their names. A broken one costs a line and is left out."""
+        for point in points(self.group):
+            if self._is_taken(point):
+                warn(f"{_owner(point)} is left out: ngpt has a {self.what} of that name; its package must rename it")
+        for name in dict.fromkeys(point.name for point in self._others()):
+            try:
+                self[name]
+            except NgptError as error:
+                warn(str(error))
+        return [name for name in self if name in self._imported]
+
+    def _others(self) -> list[Any]:
+        return [point for point in points(self.group) if not self._is_taken(point)]
+
+    def _is_taken(self, point: Any) -> bool:
+        ours = super().__contains__(point.name) and point.name not in self._imported
+        return ours or point.name == "auto" or point.name in self.taken
+
+
+def _owner(point: Any) -> str:
+    """An entry point and its package: "ngpt.methods: 'median' of the package 'ngpt-median'"."""
+    package = f" of the package '{point.dist.name}'" if point.dist else ""
+    return f"{point.group}: '{point.name}'{package}"

@@ -3,8 +3,9 @@
 import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import cache
 from typing import Any
+
+from ngpt.system.forks import until_fork
 
 
 def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
@@ -15,11 +16,6 @@ def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
     return list(_threads().map(function, parts))
 
 
-@cache
+@until_fork(1)
 def _threads() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ngpt")
-
-
-if hasattr(os, "register_at_fork"):
-    # The threads of the parent are none of a forked child's, which would wait for them for ever.
-    os.register_at_fork(after_in_child=_threads.cache_clear)

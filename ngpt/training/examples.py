@@ -165,7 +165,8 @@ class Examples(TorchDataset):
         height, width = layers["primal"].shape[-2:]
         if height < self.size or width < self.size:
             raise NgptError(
-                f"a crop is {width}x{height}, smaller than the {self.size} pixels of an example; lower data.crop"
+                f"a crop is {width}x{height}, smaller than the {self.size} pixels of an example; "
+                f"--set data.crop={min(height, width)}"
             )
         y, x = int(rng.integers(height - self.size + 1)), int(rng.integers(width - self.size + 1))
         window = np.s_[..., y : y + self.size, x : x + self.size]
@@ -232,24 +233,3 @@ def _scaled(layers: Layers, judge: Layers) -> tuple[Layers, Layers]:
     return {name: layer[0] for name, layer in scaled.items()}, {
         name: layer / exposure[0] if name in light else layer for name, layer in judge.items()
     }
-
-
-def split(crops: Sequence[Any], validation: tuple[str, ...]) -> tuple[list[Any], list[Any]]:
-    """Training and validation crops; whole scenes of which the name starts with one of ``validation`` are kept out.
-
-    Pairs of these are in neither: they have no reference to measure by.
-
-    Raises NgptError for a name that no scene starts with: such a run would be judged by nothing, or by less than asked.
-    """
-    scenes = sorted({crop.scene for crop in crops})
-    for name in validation if scenes else ():
-        if not any(scene.startswith(name) for scene in scenes):
-            some = ", ".join(scenes[:8]) + (", ..." if len(scenes) > 8 else "")
-            raise NgptError(
-                f"data.validation: no scene has a name that begins with '{name}'; there are {some}. "
-                "--set data.validation='[]' trains without"
-            )
-    held = [crop.scene.startswith(tuple(validation)) if validation else False for crop in crops]
-    return [c for c, out in zip(crops, held, strict=True) if not out], [
-        c for c, out in zip(crops, held, strict=True) if out and not c.paired
-    ]

@@ -1,7 +1,11 @@
-"""What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it."""
+"""What training minimises: a perceptual distance over random transforms, and pixelwise terms beside it.
+
+Other packages bring terms by entry points of the group "ngpt.losses", docs/train/add-a-loss.md.
+"""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields
 from typing import Any
 
 import torch
@@ -10,11 +14,23 @@ from torch import Tensor
 from ngpt.errors import NgptError
 from ngpt.measure.distances import perceptual
 from ngpt.measure.distances.perceptual import PerceptualDistance
+from ngpt.system.parts import Registry
 from ngpt.system.records import from_table
 from ngpt.training import pixelwise
 from ngpt.training.halves import halves
 
-KINDS = (*perceptual.KINDS, "pu", "l1")
+# A term: prediction and target, scene-linear (N, 3, H, W) float32 over the exposure -> a scalar, the mean over all.
+Term = Callable[[Tensor, Tensor], Tensor]
+_OURS: dict[str, Term] = {
+    "l1": pixelwise.l1,
+    "gradient": pixelwise.gradient_l1,
+    "relative": pixelwise.relative,
+    "logarithmic": pixelwise.logarithmic,
+    "huber": pixelwise.huber,
+    "pyramid": pixelwise.pyramid,
+    "flip": pixelwise.flip,
+}
+KINDS = (*perceptual.KINDS, "pu")
 
 
 @dataclass(frozen=True)
@@ -22,7 +38,7 @@ class LossSettings:
     """The table [loss] of a configuration.
 
     ``kind``         the perceptual part: "structural" (no weights needed), "elpips-squeeze" (NGPT's), "elpips-vgg",
-                     "pu" (OIDN's), or "l1" for none
+                     "pu" (OIDN's), or for none the name of a term, such as "l1", whose weight is 1 then
     ``evaluations``  draws of the random transforms that are averaged in each step
     ``scales``       largest downscaling among the transforms; NGPT trains with 2
     ``l1``, ``gradient``, ``relative``, ``logarithmic``, ``huber``, ``pyramid``, ``flip``
@@ -46,6 +62,11 @@ class LossSettings:
     weights: str = ""
 
 
+# Weights of other packages' terms stand beside these in [loss], by the terms' names.
+_TAKEN = (*KINDS, *(field.name for field in fields(LossSettings)))
+TERMS: Registry[Term] = Registry("ngpt.losses", "loss", Callable, _OURS, _TAKEN)
+
+
 class Loss:
     """Call it with prediction and target, scene-linear (N, 3, H, W) float32, and a generator on their device.
 
@@ -54,8 +75,14 @@ class Loss:
     Returns the weighted sum, a mean over the predictions, and its parts, by name, before weighting.
     """
 
-    def __init__(self, settings: LossSettings):
+    def __init__(self, settings: LossSettings, others: dict[str, float] | None = None):
+        """``others``: weights of other packages' terms, by name."""
         self.settings = settings
+        weights = {name: getattr(settings, name) for name in _OURS} | (others or {})
+        if settings.kind in TERMS:
+            # Without a perceptual part its weight would only scale the learning rate.
+            weights[settings.kind] = 1.0
+        self._terms = [(name, weight, TERMS[name]) for name, weight in weights.items() if weight]
         self._distance: PerceptualDistance | None = None
         if settings.kind in perceptual.KINDS:
             self._distance = PerceptualDistance(
@@ -91,30 +118,28 @@ class Loss:
         if s.kind == "pu":
             parts["pu"] = pixelwise.pu(prediction, target)
             total = total + parts["pu"]
-        for name, weight, function in (
-            # Alone, L1 is the loss, and its weight would only scale the learning rate.
-            ("l1", s.l1 if s.kind != "l1" else 1.0, pixelwise.l1),
-            ("gradient", s.gradient, pixelwise.gradient_l1),
-            ("relative", s.relative, pixelwise.relative),
-            ("logarithmic", s.logarithmic, pixelwise.logarithmic),
-            ("huber", s.huber, pixelwise.huber),
-            ("pyramid", s.pyramid, pixelwise.pyramid),
-            ("flip", s.flip, pixelwise.flip),
-        ):
-            if weight:
-                parts[name] = function(prediction, target)
-                total = total + weight * parts[name]
+        for name, weight, term in self._terms:
+            parts[name] = term(prediction, target)
+            if parts[name].shape != ():
+                shape = tuple(parts[name].shape)
+                raise NgptError(f"[loss]: {name}: returned a tensor of shape {shape}; return its mean, a scalar")
+            total = total + weight * parts[name]
         return total, parts
 
 
 def make_loss(settings: dict[str, Any]) -> Loss:
     """The loss of a table [loss]. Raises NgptError for unknown keys and kinds, negative weights, and missing files."""
-    result = from_table(LossSettings, settings, "[loss]")
+    known = {field.name for field in fields(LossSettings)}
+    others = {name: value for name, value in settings.items() if name not in known and name in TERMS}
+    result = from_table(LossSettings, {n: v for n, v in settings.items() if n not in others}, "[loss]")
     for name, value in settings.items():
-        if isinstance(value, int | float) and not 0 <= value < math.inf:
+        number = isinstance(value, int | float) and not isinstance(value, bool)
+        if name in others and not number:
+            raise NgptError(f"[loss]: {name} = {value!r}: must be a number, the weight of that term")
+        if number and not 0 <= value < math.inf:
             raise NgptError(f"[loss]: {name} = {value!r}: must be finite and not negative")
-    if result.kind not in KINDS:
-        raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join(KINDS)}")
+    if result.kind not in KINDS and result.kind not in TERMS:
+        raise NgptError(f"[loss]: kind = '{result.kind}': choose one of: {', '.join((*KINDS, *TERMS))}")
     if result.evaluations < 1 or result.scales < 1:
         raise NgptError("[loss]: evaluations and scales must be at least 1")
-    return Loss(result)
+    return Loss(result, others)

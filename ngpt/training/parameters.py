@@ -5,18 +5,17 @@ in the first sentence of its file.
 """
 
 import re
-import textwrap
-import tomllib
 from dataclasses import MISSING, Field, fields
 from inspect import cleandoc
-from typing import Any, get_type_hints
+from typing import get_type_hints
 
 from ngpt.network.model import ModelConfig, Reconstructor, parameters
 from ngpt.system import configs
 from ngpt.system.records import described
+from ngpt.system.templates import entries, template, toml
 from ngpt.training.augment import Augmentation
 from ngpt.training.cost import per_pixel
-from ngpt.training.loss import LossSettings
+from ngpt.training.loss import TERMS, LossSettings
 from ngpt.training.settings import DataSettings, OptimizerSettings, RunSettings, Settings, read_settings
 
 # The tables of a configuration and what reads them; "" is its top.
@@ -29,20 +28,6 @@ TABLES: dict[str, type] = {
     "optimizer": OptimizerSettings,
     "run": RunSettings,
 }
-
-
-def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
-    """The parameters that share an entry of the docstring, and what it says: ``one``, ``two``  meaning."""
-    found: list[tuple[tuple[str, ...], str]] = []
-    inside = False
-    for line in cleandoc(kind.__doc__ or "").splitlines():
-        if entry := re.match(r"((?:``\w+``, )*``\w+``)(?:  +(.*))?$", line):
-            found.append((tuple(re.findall(r"``(\w+)``", entry[1])), entry[2] or ""))
-        elif line.startswith(" ") and inside:
-            names, meaning = found[-1]
-            found[-1] = names, f"{meaning} {line.strip()}".strip()
-        inside = bool(entry) or (inside and line.startswith(" "))
-    return found
 
 
 def parameter_tables() -> str:
@@ -59,46 +44,17 @@ def parameter_tables() -> str:
     return "\n".join(lines)
 
 
-def template(text: str) -> str:
-    """A configuration, with a comment for every parameter that it leaves at its default: what it means, and what that
-    is. What is set by it stays as it is."""
-    given = tomllib.loads(text)
-    sections = re.split(r"^(?=\[\w+\])", text, flags=re.M)
-    present = [match[1] if (match := re.match(r"\[(\w+)\]", section)) else "" for section in sections]
-    for table in TABLES:
-        if table not in present:
-            sections.append(f"[{table}]\n")
-            present.append(table)
-    lines = []
-    for table, section in zip(present, sections, strict=True):
-        rest = _commented(table, given.get(table, {}) if table else given) if table in TABLES else ""
-        lines.append(f"{section.rstrip()}\n{rest}\n")
-    return "\n".join(line.rstrip("\n") + "\n" for line in lines)
-
-
-def _commented(table: str, given: dict[str, Any]) -> str:
-    """Lines for the parameters of a table that are not ``given``."""
-    known: dict[str, Field] = {field.name: field for field in fields(TABLES[table])}
-    lines = []
-    for names, meaning in entries(TABLES[table]):
-        others = [name for name in names if name not in given]
-        if others:
-            told = textwrap.wrap(meaning.replace("``", ""), 116, initial_indent="# ", subsequent_indent="#   ")
-            lines += [*told, *(f"# {name} = {_toml(known[name].default)}" for name in others)]
-    return "\n".join(lines)
+def training_template(text: str) -> str:
+    """``ngpt.system.templates.template`` of a configuration, with the weights of other packages' terms."""
+    others = {
+        name: f"weight of another package's term: {cleandoc(TERMS[name].__doc__ or name)}" for name in TERMS.load()
+    }
+    return template(text, TABLES, {"loss": {name: (meaning, 0.0) for name, meaning in others.items()}})
 
 
 def _default(field: Field) -> str:
     """As TOML has it."""
-    return "none: must be given" if field.default is MISSING else f"`{_toml(field.default)}`"
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    return f'"{value}"' if isinstance(value, str) else repr(value)
+    return "none: must be given" if field.default is MISSING else f"`{toml(field.default)}`"
 
 
 def configuration_table() -> str:

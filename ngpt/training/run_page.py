@@ -10,7 +10,6 @@ import io
 import json
 import math
 from dataclasses import dataclass, field
-from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +20,7 @@ from ngpt.report.markup import plain_table, plots_html
 from ngpt.system.console import span
 from ngpt.system.files import atomic_output
 from ngpt.system.records import read_json
+from ngpt.system.text import markup
 from ngpt.training.run_summary import LOG, PAGE, SETTINGS, entries_of
 from ngpt.training.settings_text import difference, flat
 
@@ -116,7 +116,7 @@ def page(runs: list[Run], command: str = "") -> str:
     alone = runs[0] if len(runs) == 1 else None
     going = alone is not None and alone.done < alone.steps
     parts = ["<h3>Runs</h3>", plain_table(_overview(runs))]
-    parts += [f'<p class="hint">{escape(_state(alone))}</p>' if alone else ""]
+    parts += [f'<p class="hint">{markup(_state(alone))}</p>' if alone else ""]
     parts += [_pictures(run) for run in runs]
     parts += ["<h3>Curves</h3>", plots_html(_plots(runs))]
     parts += [_settings("Settings that differ", _differing(runs))] if len(runs) > 1 else []
@@ -215,7 +215,7 @@ def _pictures(run: Run) -> str:
     heads = '<div class="heads">' + "".join(f"<span>{name}</span>" for name in COLUMNS) + "</div>"
     strips = []
     for row, view in enumerate(told["views"]):
-        text = f"{escape(str(view['scene']))}, {view['spp']} spp"
+        text = f"{markup(str(view['scene']))}, {view['spp']} spp"
         given, made = (_number(view.get(name, math.nan)) for name in ("relMSE primal", "relMSE"))
         errors = f"relMSE {given} &rarr; {made}"
         strip = f'<div class="strip {_key(run)} row{row}"></div>'
@@ -224,7 +224,7 @@ def _pictures(run: Run) -> str:
             f"<figcaption><b>{text}</b> <small>{errors}</small></figcaption></figure>"
         )
     step = int(path.stem.rpartition("-")[2])
-    return f'<h3>{escape(run.name)}, step {step:,}: views held out</h3><div class="views">{"".join(strips)}</div>'
+    return f'<h3>{markup(run.name)}, step {step:,}: views held out</h3><div class="views">{"".join(strips)}</div>'
 
 
 def _key(run: Run) -> str:
@@ -261,7 +261,7 @@ def _share(row: int, count: int) -> float:
 
 def _settings(title: str, rows: list[list[str]]) -> str:
     """A table under its title, "" where it has no row but its head."""
-    head = f"<h3>{escape(title)}</h3>" if title else ""
+    head = f"<h3>{markup(title)}</h3>" if title else ""
     return f'{head}<div class="settings">{plain_table(rows)}</div>' if len(rows) > 1 else ""
 
 

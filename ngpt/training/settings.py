@@ -20,16 +20,19 @@ class DataSettings:
 
     ``folders``     datasets (``python -m data_gen``) or folders of stacks with references; all are mixed
     ``validation``  beginnings of the names of scenes that are kept out of training
+    ``validation_share``  share of the scenes that are kept out where ``validation`` names none, at least one scene; 0
+                    keeps none out
     ``crop``        pixels of an example's side
     ``pairs``       share of the examples that have no reference but another half, where there are both kinds
     ``kept``        folder for references of sets that are rendered while the network trains: made once, they are met
                     again with inputs of new noise. "" renders new ones for ever
-    ``workers``     processes that prepare examples; 0 prepares them in between
+    ``workers``     processes that prepare examples, as many as there are processors at most; 0 prepares them in between
     ``cache``       MiB of memory, for each of these, to keep what was prepared in
     """
 
     folders: tuple[str, ...] = ()
     validation: tuple[str, ...] = ()
+    validation_share: float = 0.1
     crop: int = 128
     pairs: float = 0.5
     kept: str = ""
@@ -90,7 +93,8 @@ class RunSettings:
 class Settings:
     """All of a run. ``loss`` is for ``ngpt.training.loss.make_loss``.
 
-    ``initial``  a file of weights to start from, with the same [model]; "" starts from chance
+    ``initial``  weights to start from, with the same [model]: a file, or a network that comes with ngpt, by its name;
+                 "" starts from chance
     """
 
     model: ModelConfig
@@ -158,6 +162,10 @@ def _check(settings: Settings, path: str) -> None:
             raise NgptError(f"{path}: run.{name} = {getattr(settings.run, name)}: must be at least 1")
     if not 0 < settings.data.pairs < 1:
         raise NgptError(f"{path}: data.pairs = {settings.data.pairs}: must be a share between 0 and 1")
+    if not 0 <= settings.data.validation_share < 1:
+        raise NgptError(
+            f"{path}: data.validation_share = {settings.data.validation_share}: must be at least 0 and below 1"
+        )
     if not 0 <= settings.optimizer.ema < 1:
         raise NgptError(f"{path}: optimizer.ema = {settings.optimizer.ema}: must be at least 0 and below 1")
 

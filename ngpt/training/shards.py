@@ -38,6 +38,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
+from ngpt.system import files
 from ngpt.system.files import atomic_output
 from ngpt.system.install import install_command
 from ngpt.system.records import check, parse_json
@@ -154,12 +155,12 @@ def write_shard(path: Path, crops: Sequence[CropData], record: Mapping[str, Any]
     # Of arrays in another order of memory safetensors writes the bytes as they lie there.
     tensors = {name: np.ascontiguousarray(tensor) for name, tensor in tensors.items()}
     data = save(tensors, {"ngpt": json.dumps(record)})
-    try:
-        with atomic_output(path) as temporary:
+
+    def write(path: Path, overwrite: bool) -> None:
+        with atomic_output(path, overwrite) as temporary:
             temporary.write_bytes(data)
-    except NgptError:
-        if not path.is_file():
-            raise
+
+    files.save(path, write, alike=True)
 
 
 class Shard:

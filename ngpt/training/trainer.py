@@ -12,6 +12,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from ngpt.errors import NgptError
 from ngpt.network import padding, weights
 from ngpt.network.model import Reconstructor, parameters
 from ngpt.network.transfer import signed_exp
+from ngpt.system import files, limits
 from ngpt.system.console import print_line
 from ngpt.system.files import atomic_output
 from ngpt.system.records import check
@@ -162,9 +164,11 @@ class Trainer:
                 progress(self.step, run.steps)
                 last = self.step == run.steps
                 if self.step % run.log == 0 or last:
-                    self._log(entry | {"seconds": round(self.seconds, 1)} | meter.read(self.step))
+                    with self._saved():
+                        self._log(entry | {"seconds": round(self.seconds, 1)} | meter.read(self.step))
                 if (self.step % run.validate == 0 or last) and self.held_out:
-                    self.validate()
+                    with self._saved():
+                        self.validate()
                 if self.step % run.save == 0 and not last:
                     self.save()
                 out_of_time = run.minutes and time.monotonic() - start > 60 * run.minutes
@@ -175,8 +179,20 @@ class Trainer:
         self.save()
         return self.step >= run.steps
 
+    @contextmanager
+    def _saved(self) -> Iterator[None]:
+        """Should what is in it fail, as records do where a disk is full, the steps since the last checkpoint stay."""
+        try:
+            yield
+        except (NgptError, OSError):
+            self.save()
+            raise
+
     def save(self) -> None:
-        """Writes checkpoint and weights; whatever interrupts this, the previous ones stay whole."""
+        """Writes checkpoint and weights; whatever interrupts this, the previous ones stay whole.
+
+        A checkpoint that cannot be written there goes elsewhere, and NgptError says where.
+        """
         if self.processes.rank:
             return
         tensors = {f"model/{name}": t for name, t in self.model.state_dict().items()}
@@ -186,7 +202,10 @@ class Trainer:
             state = self.optimizer.state.get(p) or {"exp_avg": torch.zeros_like(p), "exp_avg_sq": torch.zeros_like(p)}
             tensors |= {f"adam1/{name}": state["exp_avg"], f"adam2/{name}": state["exp_avg_sq"]}
         header = {"kind": "checkpoint", "step": self.step, "seconds": self.seconds, "version": __version__}
-        weights.write_tensors(self.checkpoint, tensors, header | {"settings": self.settings.to_dict()}, overwrite=True)
+        header["settings"] = self.settings.to_dict()
+        files.save(
+            self.checkpoint, lambda path, over: weights.write_tensors(path, tensors, header, over), overwrite=True
+        )
         self._save_weights("weights.safetensors")
         write_run(self.out)
 
@@ -255,15 +274,19 @@ class Trainer:
             [first + i * run.batch + processes.rank * size + j for j in range(size)]
             for i in range(run.steps - self.step)
         )
-        workers = self.settings.data.workers
-        yield from DataLoader(
-            self.examples,
-            batch_sampler=indices,  # type: ignore[arg-type]
-            collate_fn=collated,
-            num_workers=workers,
-            persistent_workers=bool(workers),
-            pin_memory=self.device.type == "cuda",
-        )
+        workers = min(self.settings.data.workers, limits.processors())
+        try:
+            yield from DataLoader(
+                self.examples,
+                batch_sampler=indices,  # type: ignore[arg-type]
+                collate_fn=collated,
+                num_workers=workers,
+                persistent_workers=bool(workers),
+                pin_memory=self.device.type == "cuda",
+            )
+        except NgptError as error:
+            # A worker's error comes with the worker's traceback before it.
+            raise NgptError(str(error).rpartition("NgptError: ")[2]) from None
 
     def _give_up(self, batch: dict[str, Tensor], total: float, norm: float) -> None:
         path = self.out / f"bad-batch-{self.step:07d}.safetensors"
@@ -294,7 +317,7 @@ class Trainer:
                 file.write(json.dumps(values) + "\n")
         except OSError as error:
             raise NgptError(
-                f"{path}: cannot be written: {error.strerror}; the same command continues from the last checkpoint"
+                f"{path}: cannot be written: {error.strerror}; the same command continues from here"
             ) from error
         self.say("  ".join(f"{k} {v:.4g}" if isinstance(v, float) else f"{k} {v}" for k, v in values.items()))
         for logger in self._loggers:

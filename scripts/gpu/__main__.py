@@ -5,7 +5,8 @@
     python -m scripts.gpu --recipe rehearsal --work WORK --out OUT                a rehearsal on processors, much
     smaller
 
-Nothing stops it: what is missing, fails, crashes or hangs is in the report, and the rest runs. OUT holds report.md,
+Nothing stops it: what is missing, fails, crashes or hangs is in the report, and the rest runs. It ends with 1 where
+nothing was trained. OUT holds report.md,
 report.json and a parcel (`scripts.gpu.parcel`), from which the next window goes on where WORK is lost.
 """
 
@@ -23,7 +24,7 @@ from ngpt.system.writing import write_json
 from scripts.gpu import parcel
 from scripts.gpu.checks import FAILED, names, one_line
 from scripts.gpu.recipe import Clock, Recipe, Run, read_recipe, split
-from scripts.gpu.report import crops, in_words, write_report
+from scripts.gpu.report import crops, in_words, scenes, steps, write_report
 from scripts.gpu.work import GRACE, Work, workers
 
 # Seconds at a window's end for the report and the parcel; those a training needs to start and to save.
@@ -47,7 +48,7 @@ class Window:
         self.checks()
         rendering = self.start_rendering()
         try:
-            self.wait_for_the_gpu(rendering)
+            self.wait_for_crops(rendering)
             for number, run in enumerate(self.recipe.runs):
                 self.train(run, split(self.clock.left, [r.share for r in self.recipe.runs[number:]]))
         finally:
@@ -120,15 +121,30 @@ class Window:
             for name, options in sides.items()
         }
 
-    def wait_for_the_gpu(self, rendering: dict[str, Work]) -> None:
-        """Until the GPU has rendered for its share; training starts earlier where it cannot."""
-        if "gpu" in rendering:
-            work = rendering["gpu"]
-            ended = work.wait(min(self.recipe.data * self.clock.seconds, self.clock.left))
-            if not ended or not work.status:
-                work.end(grace=2)
-                self.note("crops, gpu", work.seconds, self.rendered())
-                del rendering["gpu"]
+    def wait_for_crops(self, rendering: dict[str, Work]) -> None:
+        """Until the GPU has rendered for its share; training starts earlier where it cannot.
+
+        Without --data also until there are crops, wherever they are rendered, as long as time is left to train.
+        """
+        gpu = rendering.get("gpu")
+        if gpu:
+            gpu.wait(min(self.recipe.data * self.clock.seconds, self.clock.left))
+        last = 2 * LEAST * len(self.recipe.runs)
+        while not self.data and not crops(self.work / "data") and self.clock.left > last:
+            if not any(side.running for side in rendering.values()):
+                break
+            for side in rendering.values():
+                side.wait(0.5)
+        if gpu and (gpu.running or not gpu.status):
+            gpu.end(grace=2)
+            self.note("crops, gpu", gpu.seconds, self.rendered())
+            del rendering["gpu"]
+
+    def validation(self, folders: list[str]) -> list[str]:
+        """The recipe's, as far as such scenes are there; none, so that training sets some aside, where all are such."""
+        there = {scene for folder in folders for scene in scenes(Path(folder))}
+        names = [name for name in self.recipe.validation if any(scene.startswith(name) for scene in there)]
+        return [] if all(scene.startswith(tuple(names)) for scene in there) else names
 
     def train(self, run: Run, seconds: float) -> None:
         """One run goes on for so many seconds; its state is saved in the end."""
@@ -136,13 +152,13 @@ class Window:
         if crops(self.work / "data"):
             folders.append(str(self.work / "data"))
         if not folders:
-            self.note(run.name, 0, "no crops: neither --data nor any that were rendered here")
+            self.note(run.name, 0, "no crops: neither --data nor any that were rendered here in time")
             return
         if seconds < LEAST:
             self.note(run.name, 0, f"{seconds:.0f} s are too few to start in")
             return
         changes = [*run.set, f"data.folders={json.dumps(folders)}"]
-        changes.append(f"data.validation={json.dumps(self.recipe.validation)}")
+        changes.append(f"data.validation={json.dumps(self.validation(folders))}")
         arguments = ["train.py", "--config", run.config, "--out", str(self.work / "runs" / run.name)]
         arguments[0] = str(Path(__file__).parents[2] / arguments[0])
         for change in changes:
@@ -179,7 +195,7 @@ def main(arguments: list[str] | None = None) -> int:
     except NgptError as error:
         print(f"scripts.gpu: {error}", file=sys.stderr)
         return 2
-    status = 0
+    status, before = 0, steps(work)
     signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         window.run()
@@ -192,6 +208,16 @@ def main(arguments: list[str] | None = None) -> int:
         left_out = [f"everything: {one_line(error)}"]
     write_report(work, args.out, left_out)
     print((args.out / "report.md").read_text())
+    if not status and recipe.runs and steps(work) <= before:
+        names = {run.name for run in recipe.runs}
+        told = "; ".join(f"{part['part']}: {part['told']}" for part in window.parts if part["part"] in names)
+        more = 2 * (args.minutes or recipe.minutes)
+        print(
+            f"scripts.gpu: nothing was trained ({told}); give it more time (--minutes {more:g}), or training sets "
+            f"(--data); {args.work}/logs holds what each part said",
+            file=sys.stderr,
+        )
+        return 1
     return status
 
 

@@ -128,7 +128,7 @@ def networks(recipe: Recipe) -> dict[str, Any]:
     torch = _torch(recipe)
     stack = made_stack(64, seed=2)
     told: dict[str, Any] = {}
-    for path in sorted((ROOT / "export" / "weights").glob("*.safetensors")):
+    for path in sorted((ROOT / "export" / "weights").glob("ngpt-*.safetensors")):
         data = repair(stack, run_torch.config_of(path, "cpu").reads_gradients)
         try:
             here, there = (run_torch.run(data, path, device) for device in ("cpu", recipe.device))

@@ -37,6 +37,19 @@ def crops(folder: Path) -> dict[str, int]:
     return found
 
 
+def scenes(folder: Path) -> set[str]:
+    """The names of the scenes whose crops are there."""
+    try:
+        return {entry["scene"] for entry in read_manifest(folder)["shards"] if entry["crops"]}
+    except NgptError:
+        return set()
+
+
+def steps(work: Path) -> int:
+    """Those that all runs have trained, by their checkpoints."""
+    return sum(run.get("checkpoint at step", 0) for run in gather(work)["runs"].values())
+
+
 def in_words(found: dict[str, int]) -> str:
     return ", ".join(f"{count} by {variant}" for variant, count in found.items()) or "none"
 

@@ -201,3 +201,35 @@ def test_bad_files_are_one_line(name, data, message, tmp_path, capfd):
 def test_a_network_that_is_not_there(name, capfd):
     assert main(["info", name]) == 1
     assert capfd.readouterr().err == f"ngpt: error: {name}: not found; check the name\n"
+
+
+def test_results_that_are_there_count_where_they_are_what_is_asked_for(stack, tmp_path, capsys):
+    source, target = tmp_path / "s.exr", tmp_path / "out.exr"
+    words = ["denoise", str(source), "-o", str(target), "--skip-existing"]
+    assert main([*words, "-m", "l1"]) == 0
+    made = target.read_bytes()
+    for same in (["-m", "l1"], [], ["-m", "auto"]):
+        assert main([*words, *same]) == 0
+    assert "1 of 1 stacks were skipped" in capsys.readouterr().err
+    for other, told in (
+        (["-m", "l2"], "method l1, not l2"),
+        (["-m", "l1", "--temporal"], "temporal none, not asked for"),
+    ):
+        assert main([*words, *other]) == 1
+        assert f"{target}: is another result: {told}; " in capsys.readouterr().err
+    # And the stack may have more samples by now.
+    stack.attributes["ngpt:spp"] = 64
+    ngpt.write(source, stack, overwrite=True)
+    assert main([*words, "-m", "l1"]) == 1
+    assert "is another result: spp " in capsys.readouterr().err
+    assert target.read_bytes() == made
+
+
+def test_a_result_whose_name_is_taken_meanwhile_is_kept(stack, tmp_path, capsys, monkeypatch):
+    from ngpt.cli import denoise
+
+    target, reconstruct = tmp_path / "out.exr", denoise.reconstruct
+    monkeypatch.setattr(denoise, "reconstruct", lambda *a, **o: (target.touch(), reconstruct(*a, **o))[1])
+    assert main(["denoise", str(tmp_path / "s.exr"), "-o", str(target), "-m", "l2"]) == 1
+    assert f"what was made is kept in {tmp_path / 'out.kept.exr'}" in capsys.readouterr().err
+    assert target.read_bytes() == b"" and attributes(tmp_path / "out.kept.exr")["ngpt:method"] == "l2"

@@ -49,15 +49,17 @@ def test_it_holds_the_two_packages_and_the_configurations(held):
     files = [path for room in ("ngpt", "data_gen") for path in (ROOT / room).rglob("*") if path.is_file()]
     packages = {path.relative_to(ROOT).as_posix() for path in files if path.parent.name != "__pycache__"}
     configs = {f"ngpt/configs/{path.name}" for path in (ROOT / "configs").iterdir()}
-    assert {name for name in held if "dist-info" not in name} == packages | configs
+    weights = {f"ngpt/weights/{path.name}" for path in (ROOT / "export" / "weights").iterdir()}
+    assert {name for name in held if "dist-info" not in name} == packages | configs | weights
     assert {"ngpt/py.typed", "ngpt/report/report.html", "ngpt/measure/layers.json"} <= packages
     assert "ngpt/configs/tiny.toml" in configs
 
 
-def test_it_holds_networks_in_the_form_that_runs_without_extras(held):
+def test_it_holds_networks_in_the_form_that_runs_without_extras_and_in_the_one_that_training_starts_from(held):
     networks = {name for name in held if name.startswith("ngpt/weights/")}
-    assert len(networks) >= 6 and all(name.endswith(".onnx") for name in networks)
-    assert not [name for name in held if name.endswith(".safetensors")]
+    run = {name for name in networks if name.endswith(".onnx")}
+    trained = {f"ngpt/weights/{path.name}" for path in (ROOT / "export" / "weights").iterdir()}
+    assert len(run) >= 6 and len(trained) >= 4 and networks == run | trained
 
 
 def test_it_is_light_without_extras_and_whole_with_train(metadata):
@@ -91,13 +93,16 @@ def test_what_renders_comes_by_entry_points(wheel, tmp_path):
     assert told.endswith("True\n")
 
 
-def test_its_configurations_are_found_by_name(wheel, tmp_path):
+def test_its_configurations_and_weights_are_found_by_name(wheel, tmp_path):
     with zipfile.ZipFile(wheel) as archive:
         archive.extractall(tmp_path / "site")
     code = "from ngpt.system.configs import DATASET, find_config; print(find_config('data-tiny', DATASET))"
     environment = os.environ | {"PYTHONPATH": str(tmp_path / "site")}
     told = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, env=environment, text=True)
     assert Path(told.strip()) == tmp_path / "site" / "ngpt" / "configs" / "data-tiny.toml"
+    code = "from ngpt.network import weights as w; w.load_weights('ngpt-fast'); print(w.shipped()['ngpt-fast'])"
+    told = subprocess.check_output([sys.executable, "-c", code], cwd=tmp_path, env=environment, text=True)
+    assert Path(told.strip()) == tmp_path / "site" / "ngpt" / "weights" / "ngpt-fast.safetensors"
 
 
 @pytest.mark.slow

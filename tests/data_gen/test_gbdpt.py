@@ -539,24 +539,24 @@ def test_who_survives(renderer):
     import drjit as dr
 
     from data_gen.paths.camera import CameraSamples
-    from data_gen.samplers.gbdpt.roulette import LEAST, RATED, SHARE, Rater, survivors
+    from data_gen.samplers.gbdpt.roulette import LEAST, RATED, SHARE, Worth, survivors
 
     mi, sensor = renderer, load(renderer, "diffuse", (32, 32)).sensors()[0]
     n, places = 32 * 32 * 8, np.random.default_rng(5)
-    worth = places.exponential(1, n * RATED).astype(np.float32)
+    light = places.exponential(1, n * RATED).astype(np.float32)
     pixel = places.integers(0, 32 * 32, n * RATED).astype(np.uint32)
     threshold = places.exponential(4, 32 * 32).astype(np.float32)
     threshold[:64] = 0
-    rater = Rater(None, None, None, mi.Float(worth), mi.UInt32(pixel), dr.opaque(mi.UInt32, n))
+    worth = Worth(mi.Float(light), mi.UInt32(pixel), dr.opaque(mi.UInt32, n))
     lane = np.tile(np.arange(n, dtype=np.uint32), RATED + 1)
     depth = np.repeat(np.arange(1, RATED + 2, dtype=np.uint32), n)
     with np.errstate(divide="ignore"):
-        p = np.clip(SHARE * worth / threshold[pixel], LEAST, 1)
+        p = np.clip(SHARE * light / threshold[pixel], LEAST, 1)
     p = np.concatenate([p, np.ones(n)])  # the vertices behind those that are rated
     found = []
     for seed in range(2):
         camera = CameraSamples(sensor, seed, 8)
-        lanes, depths, times = survivors(camera, rater, mi.UInt32(lane), mi.UInt32(depth), mi.Float(threshold))
+        lanes, depths, times = survivors(camera, worth, mi.UInt32(lane), mi.UInt32(depth), mi.Float(threshold))
         place = (np.array(depths) - 1) * n + np.array(lanes)
         assert np.allclose(np.array(times), 1 / p[place], rtol=1e-5)
         kept = np.zeros(len(p))

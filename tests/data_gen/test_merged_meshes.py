@@ -109,11 +109,16 @@ def test_a_scene_of_nothing_else_has_its_bounds(renderer, tmp_path):
 
 
 def test_the_order_is_that_of_the_file_in_every_process(scene_file):
+    """And so are the numbers that Dr.Jit gives to shapes and materials: with others the kernel is another one."""
     code = (
+        "import drjit as dr\n"
         "from data_gen.backend import use_variant; use_variant('llvm_ad_rgb')\n"
         "from data_gen.scenes.load import load_scene\n"
         f"scene = load_scene({str(scene_file)!r})\n"
-        "print([(s.primitive_count(), s.bbox().min[0]) for s in scene.shapes()])"
+        "import mitsuba as mi\n"
+        "print([(s.primitive_count(), s.bbox().min[0]) for s in scene.shapes()])\n"
+        "print([dr.reinterpret_array(mi.UInt32, mi.ShapePtr(s)) for s in scene.shapes()])\n"
+        "print([dr.reinterpret_array(mi.UInt32, mi.BSDFPtr(s.bsdf())) for s in scene.shapes()])"
     )
     pytest.importorskip("mitsuba")
     runs = [subprocess.run([sys.executable, "-c", code], capture_output=True, text=True) for _ in range(3)]

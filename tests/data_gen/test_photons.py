@@ -117,7 +117,7 @@ def test_maps_of_many_vertices_are_cut(renderer, monkeypatch):
         assert np.abs(p[parent[some]] + (d * t[:, None] - p)[some]).max(initial=0) < 1e-3
 
 
-def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch):
+def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch, recordings):
     """As if they were recorded in each pass."""
     from data_gen.film import GradientFilm
     from data_gen.passes import recording
@@ -135,66 +135,18 @@ def test_kernels_are_recorded_once_and_make_the_same_bits(renderer, monkeypatch)
                 passes(CameraSamples(sensor, 3, 1, i), film)
                 film.end_pass(1)
             others = [load(renderer, other, (4, 4)) for other in others] if i == 0 else []
-        return passes.frozen.functions, film.develop()
+        return film.develop()
 
-    functions, layers = rendered()
+    layers = rendered()
     # A function is recorded again where two arrays happen to be of one size, or of size 1.
-    assert len(functions) > 8 and sum(f.n_recordings for f in functions.values()) <= len(functions) + 2
-    # Other scenes come and go, one with a lamp whose texture cannot be kept.
-    _, with_others = rendered([SCENES["areas"]])
-    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args, fixed=False: f(*args))
-    functions, anew = rendered()
-    assert not functions and layers.keys() == anew.keys()
+    assert len(recordings.of) > 8 and recordings.total() <= len(recordings.of) + 2
+    # Other scenes come and go.
+    with_others = rendered([SCENES["areas"]])
+    monkeypatch.setattr(Frozen, "__call__", lambda self, f, *args: f(*args))
+    anew = rendered()
+    assert layers.keys() == anew.keys()
     for name in layers:
         assert np.array_equal(layers[name], anew[name]) and np.array_equal(layers[name], with_others[name]), name
-
-
-def test_what_is_recorded_once_has_the_width_of_each_call(renderer):
-    """Constants too, such as the emission of a scene without lamps: Dr.Jit would keep the width of the first."""
-    import drjit as dr
-
-    from data_gen.paths.frozen import Frozen
-
-    mi = renderer
-    frozen, time = Frozen(load(mi, "diffuse", (4, 4))), dr.full(mi.Float, 0.5, 20)
-
-    def taken(time, lanes):
-        return dr.gather(mi.Float, time, lanes), lanes + 1
-
-    def constant(time, lanes):
-        return dr.full(mi.Float, 1, dr.width(lanes)), lanes + 1
-
-    for n in (5, 11, 8, 13):
-        lanes = dr.arange(mi.UInt32, n)
-        dr.eval(lanes)
-        for f in (taken, constant):
-            assert [dr.width(x) for x in frozen(f, time, lanes)] == [n, n]
-    assert frozen.functions[taken] != taken and frozen.functions[constant] == constant
-
-
-def test_an_interrupt_while_kernels_are_recorded_is_one(renderer):
-    """Dr.Jit wraps it in a RuntimeError, as it does what keeps a function from being recorded."""
-    import drjit as dr
-
-    from data_gen.passes import recording
-    from data_gen.paths.frozen import Frozen
-
-    mi, calls = renderer, []
-
-    def interrupted(*_):
-        calls.append(1)
-        raise KeyboardInterrupt
-
-    frozen, lanes = Frozen(load(mi, "diffuse", (4, 4))), dr.opaque(mi.UInt32, 3, 4)
-    for f in (interrupted, lambda n: dr.while_loop((n,), lambda n: n > 0, interrupted)):
-        with recording(), pytest.raises(KeyboardInterrupt):
-            frozen(f, lanes)
-        assert len(calls) == 1
-        # The next call is another try.
-        with recording(), pytest.raises(KeyboardInterrupt):
-            frozen(f, lanes)
-        assert len(calls) == 2
-        calls.clear()
 
 
 @pytest.mark.parametrize("kind", [KeyboardInterrupt, Interrupted])

@@ -83,8 +83,14 @@ def test_help_fits_a_screen_and_begins_with_what_users_need(capsys, monkeypatch)
 
 def test_options_of_auto_are_refused_with_samplers_that_have_them():
     check_options("auto", {})
-    with pytest.raises(NgptError, match=r"option 'radius' is a sampler's own; name .*: --sampler ppm, or vcm$"):
+    # What all samplers have that "auto" may take goes to whichever is chosen.
+    check_options("auto", {"points": "independent", "lamps": "uniform"})
+    with pytest.raises(NgptError, match=r"option 'radius' needs a sampler that has it, not 'auto': .*ppm, .*vcm"):
         check_options("auto", {"radius": "2"})
+    with pytest.raises(NgptError, match=r"sampler 'auto' has no option 'point'; did you mean 'points'\?"):
+        check_options("auto", {"point": "sobol"})
+    with pytest.raises(NgptError, match=r"sampler 'auto', option 'points': .*rounds"):
+        check_options("auto", {"points": "halton"})
     check_options("restir", {"history": "4"})
     with pytest.raises(NgptError, match="sampler 'restir', option 'history': '0' is not allowed"):
         check_options("restir", {"history": "0"})

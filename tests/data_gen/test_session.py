@@ -48,6 +48,63 @@ def test_options_samples_that_differ_and_what_ends_a_render(renderer):
         data_gen.render_scene("diffuse", 4, method="wcv")
 
 
+SENSORS = """<scene version="3.0.0"><integrator type="path"/>
+<sensor type="perspective" id="wide"><film type="hdrfilm"><integer name="width" value="8"/>
+<integer name="height" value="6"/></film></sensor>
+<sensor type="perspective" id="close"><float name="fov" value="20"/>
+<film type="hdrfilm"><integer name="width" value="6"/>
+<integer name="height" value="4"/><string name="pixel_format" value="luminance"/></film></sensor>
+<sensor type="batch"><sensor type="perspective"/><sensor type="perspective"/></sensor>
+<emitter type="constant"/><shape type="sphere"><point name="center" x="0" y="0" z="3"/><emitter type="area"/></shape>
+<shape type="shapegroup" id="group"><shape type="cube"/></shape><emitter type="point"/>
+<shape type="instance"><ref id="group"/><transform name="to_world"><translate x="1" z="6"/></transform></shape>
+</scene>"""
+
+
+def test_one_of_several_sensors_by_number_or_id(renderer, tmp_path, capsys):
+    import ngpt
+    from ngpt.cli import main
+
+    file, told = tmp_path / "three.xml", []
+    file.write_text(SENSORS)
+    stack, _ = data_gen.render_scene(file, 2, said=told.append)
+    assert told == ["there are 3 sensors (0 'wide', 1 'close', 2), and none is named: 0 is rendered"]
+    assert stack["primal"].shape == (6, 8, 3) and stack["primal"].mean() > 0
+    close = [data_gen.render_scene(file, 2, sensor=name, said=told.append).stack for name in (1, "1", "close")]
+    assert close[0]["primal"].shape == (4, 6, 3) and all(same(close[0], other) for other in close) and len(told) == 1
+    # What is asked of size goes to that sensor's film, and to frames the same.
+    assert data_gen.render_scene(file, 2, sensor="close", size=(5, 3)).stack["primal"].shape == (3, 5, 3)
+    ((_, frame),) = data_gen.render_frames(str(file), [0], 2, sensor=1)
+    assert frame["primal"].shape == (4, 6, 3)
+    target = str(tmp_path / "s.exr")
+    assert main(["render", str(file), "--sensor", "close", "--spp", "2", "-o", target]) == 0
+    assert same(close[0], ngpt.read(target)) and "none is named" not in capsys.readouterr().err
+    assert len(data_gen.load_scene(str(file)).sensors()) == 3
+    for sensor, message in {
+        "clos": r"there is no sensor 'clos'; did you mean 'close'\? choose one of: 0 'wide', 1 'close', 2$",
+        3: "there is no sensor '3'",
+        -1: "there is no sensor '-1'",
+        2: "camera 'batch': several cameras",
+    }.items():
+        with pytest.raises(NgptError, match=message):
+            data_gen.render_scene(file, 2, sensor=sensor)
+    with pytest.raises(NgptError, match=r"diffuse: there is no sensor 'wide'; choose one of: 0 'sensor'$"):
+        data_gen.render_scene("diffuse", 2, sensor="wide")
+    with pytest.raises(NgptError, match="has its size, parameters and sensor; load it with them"):
+        data_gen.render_scene(data_gen.load_scene(str(file)), 2, sensor=1)
+
+
+def test_info_tells_the_sensors_of_a_scene_and_which_is_rendered(renderer, tmp_path):
+    from data_gen.inspect import inspect_scene
+
+    file = tmp_path / "three.xml"
+    file.write_text(SENSORS)
+    found = inspect_scene(str(file))
+    wide = "0 'wide': perspective, 8x6, the one that is rendered"
+    assert found["sensors"] == [wide, "1 'close': perspective, 6x4", "2: batch, size not given"]
+    assert found["size"] == (8, 6)
+
+
 def test_frames_end_where_they_are_stopped(renderer):
     done = []
     for frame, stack in data_gen.render_frames("diffuse", [0, 2, 4], 2, size=SIZE, stop=lambda: len(done) == 2):

@@ -162,7 +162,7 @@ def test_vcm_converges_where_only_merging_finds_the_light(renderer):
     assert slope < -0.55
 
 
-def test_kernels_of_vcm_are_recorded_once(renderer):
+def test_kernels_of_vcm_are_recorded_once(renderer, recordings):
     """But for widths that happen to be equal; other passes launch them again."""
     from data_gen.film import GradientFilm
     from data_gen.passes import recording
@@ -175,8 +175,7 @@ def test_kernels_of_vcm_are_recorded_once(renderer):
         with recording():
             passes(CameraSamples(scene.sensors()[0], 3, 1, i), film)
             film.end_pass(1)
-    functions = passes.frozen.functions.values()
-    assert len(functions) == 3 and sum(f.n_recordings for f in functions) <= 4
+    assert len(recordings.of) == 3 and recordings.total() <= 4
 
 
 @pytest.mark.parametrize(

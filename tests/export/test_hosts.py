@@ -427,3 +427,29 @@ def test_the_page_on_the_stacks_of_the_demo(page, renderer, scene, tmp_path):
     assert main(["render", scene, "--spp", "16", "--size", "240x160", "-o", str(stack), "--quiet"]) == 0
     page.give(stack)
     agree(page.pixels("clean"), reconstruct(ngpt.read(stack), "ngpt-fast").image.transpose(2, 0, 1)[None])
+
+
+def test_what_export_writes_runs_in_node(tmp_path):
+    """A network of one's own, whole and in tiles. Without its statistics it runs whole, and tiles are refused."""
+    host = caller(node_host(tmp_path))
+    torch = pytest.importorskip("torch")
+    from ngpt.network.model import ModelConfig, Reconstructor
+    from ngpt.network.weights import save_weights
+
+    torch.manual_seed(0)
+    inputs = ("primal", "dx", "dy", "albedo", "normal", "depth")
+    model = Reconstructor(ModelConfig("dense", (4, 4), (1, 1), inputs))
+    save_weights(tmp_path / "mine.safetensors", model, {})
+    mine, output = tmp_path / "mine.onnx", tmp_path / "image.pfm"
+    assert main(["export", "--weights", str(tmp_path / "mine.safetensors"), "-o", str(mine)]) == 0
+    images = []
+    for tile in (0, 16):
+        done = host(mine, VECTOR, output, tile)
+        assert done.returncode == 0, done.stderr
+        images.append(read_pfm(output))
+    agree(*images)
+    mine.with_suffix(".statistics.onnx").unlink()
+    assert host(mine, VECTOR, output).returncode == 0
+    agree(read_pfm(output), images[0])
+    done = host(mine, VECTOR, output, 16)
+    assert done.returncode == 1 and "mine.statistics.onnx" in done.stderr

@@ -340,11 +340,16 @@ def test_the_vector_is_that_of_the_shipped_network(fast):
 
 def test_command(tmp_path, weights, capsys):
     output, path = tmp_path / "m.onnx", weights / "as published.safetensors"
-    command = ["--weights", str(path), "-o", str(output), "--statistics", str(tmp_path / "s.onnx")]
+    command = ["--weights", str(path), "-o", str(output)]
     assert main([*command, "--vector", str(tmp_path / "vector")]) == 0
+    # Hosts look for it there.
+    assert onnxruntime.InferenceSession(tmp_path / "m.statistics.onnx", quiet()).get_outputs()[0].shape == [5]
     listing = json.loads((tmp_path / "vector/layers.json").read_text())
     assert set(listing) == {*ALL, "direct", "image"}
     assert main(command) == 1 and "m.onnx" in capsys.readouterr().err
+    output.unlink()
+    assert main(command) == 1 and "m.statistics.onnx: exists already" in capsys.readouterr().err
+    assert not output.exists()
     assert main(["--weights", str(tmp_path / "none.safetensors"), "-o", str(tmp_path / "n.onnx")]) == 1
     assert "no such file" in capsys.readouterr().err
     assert not (tmp_path / "n.onnx").exists()

@@ -1,7 +1,9 @@
 """OpenEXR files, verbatim: every attribute type, tiles and levels, lossy sources, memory layouts, and bad files."""
 
+import copy
 import multiprocessing
 import os
+import pickle
 from fractions import Fraction
 
 import numpy as np
@@ -76,6 +78,13 @@ def test_attributes_of_every_type_pass_through(tmp_path, name):
     new = read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]
     del old["channels"], new["channels"]
     assert repr(comparable_header(new)) == repr(comparable_header(old))
+
+
+@pytest.mark.parametrize("again", [copy.deepcopy, lambda image: pickle.loads(pickle.dumps(image))])
+def test_what_was_read_is_the_same_when_copied_or_pickled(tmp_path, again):
+    image = read_exr(write_raw(tmp_path / "in.exr", (PIXELS, ATTRIBUTES)))
+    files = [write_exr(tmp_path / name, one) for name, one in (("a.exr", image), ("b.exr", again(image)))]
+    assert files[0].read_bytes() == files[1].read_bytes()
 
 
 def comparable_header(header):

@@ -3,6 +3,7 @@
 import shutil
 import struct
 import subprocess
+from concurrent.futures import ThreadPoolExecutor
 from itertools import pairwise
 from pathlib import Path
 
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from full_stack import full_layers, full_stack, hidden_oidn
+from processes import in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
 from ngpt.cli import main
@@ -99,6 +101,23 @@ def test_oidn_gives_the_pixels_of_pytorch(files, name):
     assert np.abs(by_oidn.image - base).mean() > 1e-3 * base.mean()
 
 
+@needs_forks
+@no_warning_of_forks
+@pytest.mark.parametrize("ending", ["safetensors", "tza"])
+def test_own_weights_in_threads_and_forked_children(files, ending):
+    pytest.importorskip("mitsuba_oidn")
+
+    def work(i):
+        return ngpt.denoise(full_stack(40, 40, seed=i), weights=str(files / f"small.{ending}"))
+
+    expected = [work(i) for i in range(4)]
+    with ThreadPoolExecutor(4) as pool:
+        assert all(np.array_equal(*pair) for pair in zip(pool.map(work, range(4)), expected, strict=True))
+    child = np.frombuffer(in_a_child(work), np.float32).reshape(expected[0].shape)
+    # PyTorch has one thread there, and other sums.
+    agree(child, expected[0])
+
+
 def test_exposure_changes_nothing(files):
     pytest.importorskip("mitsuba_oidn")
     images = [ngpt.denoise(full_stack(40, 40, k), weights=str(files / "small.tza")) / k for k in (2**-10, 1, 2**10)]
@@ -141,7 +160,7 @@ def test_wrong_files_end_in_one_line(files, tmp_path):
         "no .tza file, or a damaged one": good[:5],
         "beyond the end": good[:-8] + struct.pack("<Q", 2**40),
         "does not say which image": foreign,
-        "OIDN cannot run them": tza.packed({"enc_conv0.weight": np.zeros((32, 9, 3, 3))}, "wcv"),
+        "OIDN cannot run on device": tza.packed({"enc_conv0.weight": np.zeros((32, 9, 3, 3))}, "wcv"),
     }
     for message, data in wrong.items():
         (tmp_path / "wrong.tza").write_bytes(data)

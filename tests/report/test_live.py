@@ -3,15 +3,19 @@
 import http.client
 import json
 import socket
+import threading
 import time
+from contextlib import suppress
 
 import numpy as np
 import pytest
 from browser import Session
 
+from ngpt.report import live
 from ngpt.report.live import LivePage
-from ngpt.report.preview import preview
+from ngpt.report.preview import Preview, preview
 from ngpt.stack import GradientStack
+from ngpt.system.text import printable
 
 
 def stack(level, seed=0):
@@ -81,6 +85,41 @@ def test_a_port_in_use_is_no_obstacle(page):
     other.close("ended")
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", other.server.server_port), 5)
+
+
+def test_many_and_slow_connections_take_little_and_keep_nobody_out(page, monkeypatch):
+    """200 clients that send a bit of a request and then nothing more, as long as they like."""
+    address, before = page.server.server_address, threading.active_count()
+    slow = [socket.create_connection(address, 5) for _ in range(200)]
+    try:
+        for connection in slow:
+            with suppress(OSError):  # some are hung up on by now
+                connection.sendall(b"GET / HTTP/1.1\r\nX-A: b\r\n")
+        assert asked(page, "GET", "/")[0] == 200
+        assert threading.active_count() <= before + live.MOST and len(page.server._open) <= live.MOST
+        # Nor does it help to send a little now and then: there is a time for all of a request.
+        monkeypatch.setattr(live, "_LONGEST", 0.2)
+        end = time.monotonic() + 20
+        while page.server._open and time.monotonic() < end:
+            for connection in slow:
+                with suppress(OSError):
+                    connection.sendall(b"X-A: b\r\n")
+            time.sleep(0.05)
+        assert not page.server._open
+    finally:
+        for connection in slow:
+            connection.close()
+
+
+def test_names_turn_no_text_around_and_hide_nothing(page):
+    evil = "gnp.\u202egpj\u2066 \u200f\u061c\u3164"
+    image = np.ones((8, 8, 3), np.float32)
+    page.title = page.command = evil
+    page.show(Preview({evil: image}), evil)
+    text = asked(page, "GET", "/")[2]
+    assert "\\u202egpj\\u2066 \\u200f\\u061c\\u3164" in text and not set(evil[4:]) & set(text) - set("gpj ")
+    page.tell(f"ended: {evil} is written")
+    assert json.loads(asked(page, "GET", "/status")[2])["text"] == f"ended: {printable(evil)} is written"
 
 
 def test_a_browser_sees_newer_images_and_ends_the_render(page, tmp_path):

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.system.files import atomic_output, exclusive
+from ngpt.system.files import atomic_output, exclusive, save
 
 
 def test_appears_only_when_the_block_succeeds(tmp_path):
@@ -86,3 +86,60 @@ def test_what_killed_writers_left_is_swept_away_and_nothing_else(tmp_path):
 def test_a_folder_that_cannot_be_locked_is_named(tmp_path):
     with pytest.raises(NgptError, match="nowhere: cannot be written: No such file"), exclusive(tmp_path / "nowhere"):
         pass
+
+
+@pytest.fixture
+def places(tmp_path, monkeypatch):
+    """A folder to write to, the working directory and the folder for temporary files."""
+    found = [tmp_path / name for name in ("asked", "working", "temporary")]
+    for folder in found:
+        folder.mkdir()
+    monkeypatch.chdir(found[1])
+    monkeypatch.setattr("tempfile.tempdir", str(found[2]))
+    return found
+
+
+def hours_of_work(path, overwrite):
+    with atomic_output(path, overwrite) as temporary:
+        temporary.write_text("hours")
+
+
+def test_what_cannot_be_written_is_kept_elsewhere_and_the_message_says_where(places):
+    asked, working, _ = places
+    save(asked / "a.txt", hours_of_work)
+    assert os.listdir(asked) == ["a.txt"]
+    for name in ("a.kept.txt", "a.kept-2.txt"):  # the name is taken, and nothing is overwritten
+        with pytest.raises(NgptError, match=rf"exists already.*; what was made is kept in {asked / name}$"):
+            save(asked / "a.txt", hours_of_work)
+        assert (asked / name).read_text() == "hours"
+    save(asked / "a.txt", hours_of_work, True)
+    with pytest.raises(NgptError, match=rf"gone does not exist.* kept in {working / 'a.kept.txt'}$"):
+        save(asked / "gone" / "a.txt", hours_of_work, True)
+    # One that others make too, in a folder all of whose files count.
+    save(asked / "a.txt", hours_of_work, alike=True)
+    (asked / "b.txt").mkdir()
+    with pytest.raises(NgptError, match=rf"kept in {working / 'b.kept.txt'}$"):
+        save(asked / "b.txt", hours_of_work, alike=True)
+    assert sorted(os.listdir(asked)) == ["a.kept-2.txt", "a.kept.txt", "a.txt", "b.txt"]
+
+
+def test_a_working_directory_that_is_full_or_gone_leaves_the_folder_for_temporary_files(places):
+    asked, working, temporary = places
+    free = [temporary]
+
+    def on_full_disks(path, overwrite):
+        with atomic_output(path, overwrite) as unfinished:
+            if path.parent not in free:
+                unfinished.write_text("ho")
+                raise OSError(28, "No space left on device")
+            unfinished.write_text("hours")
+
+    with pytest.raises(NgptError, match=rf"a.txt: .*No space left.*; what was made is kept in {temporary / 'a.kept'}"):
+        save(asked / "a.txt", on_full_disks)
+    assert [os.listdir(folder) for folder in places] == [[], [], ["a.kept.txt"]]
+    free.clear()
+    with pytest.raises(NgptError, match=r"a.txt: .*No space left.*; nor can it be written elsewhere, so it is lost$"):
+        save(asked / "a.txt", on_full_disks)
+    working.rmdir()
+    with pytest.raises(NgptError, match=rf"kept in {temporary / 'b.kept.txt'}$"):
+        save(asked / "gone" / "b.txt", hours_of_work)

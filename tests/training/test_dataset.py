@@ -177,15 +177,19 @@ def test_problems_are_named(folder, rng):
     assert "c-000.safetensors: is not in the manifest" in found
 
 
-def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, rng):
+def test_of_two_writers_of_a_shard_the_first_stays(tmp_path, rng, monkeypatch):
     """The records differ by the times in them, and the manifest may have the first one's checksum."""
     path, crop = tmp_path / "a.safetensors", crop_data(rng)
     write_shard(path, [crop], {"seconds": 1})
     first = path.read_bytes()
     write_shard(path, [crop], {"seconds": 2})
     assert path.read_bytes() == first and os.listdir(tmp_path) == ["a.safetensors"]
+    # What an hour made is kept in the working directory then.
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
     with pytest.raises(NgptError, match="does not exist"):
         write_shard(tmp_path / "nowhere" / "a.safetensors", [crop], {})
+    assert Shard(tmp_path / "here" / "a.kept.safetensors").record == {}
 
 
 def test_a_name_longer_than_names_may_be_is_a_missing_file(folder):

@@ -11,10 +11,11 @@ from crops import SyntheticCrop  # noqa: E402
 
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.training.augment import Augmentation  # noqa: E402
-from ngpt.training.examples import Examples, collated, split  # noqa: E402
+from ngpt.training.examples import Examples, collated  # noqa: E402
 from ngpt.training.halves import halves, judged, spread  # noqa: E402
 from ngpt.training.loss import make_loss  # noqa: E402
 from ngpt.training.settings import from_dict  # noqa: E402
+from ngpt.training.split import split  # noqa: E402
 from ngpt.training.trainer import Trainer  # noqa: E402
 
 
@@ -184,7 +185,7 @@ def test_what_cannot_be_learnt_from_is_refused():
 
 def test_scenes_kept_apart_keep_their_pairs():
     crops = [SyntheticCrop("room", 0), PairedCrop("room", 1), PairedCrop("made", 2)]
-    training, held_out = split(crops, ("room",))
+    training, held_out, _ = split(crops, ("room",))
     assert training == crops[2:] and held_out == crops[:1]
 
 

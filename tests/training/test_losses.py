@@ -312,8 +312,7 @@ class Payload:
 
 
 def pose_as_torchvision(monkeypatch, path):
-    digits = hashlib.sha256(path.read_bytes()).hexdigest()[:8]
-    monkeypatch.setattr(backbones.SqueezeNet, "FILE", f"squeezenet1_1-{digits}.pth")
+    monkeypatch.setattr(backbones.SqueezeNet, "SHA256", hashlib.sha256(path.read_bytes()).hexdigest())
 
 
 def test_torchvisions_own_file_is_read(tmp_path, monkeypatch):
@@ -324,6 +323,17 @@ def test_torchvisions_own_file_is_read(tmp_path, monkeypatch):
     network = backbones.load(backbones.SqueezeNet, str(path))
     assert all(torch.equal(tensor, state[name]) for name, tensor in network.state_dict().items())
     make_loss({"kind": "elpips-squeeze", **files, "backbone": str(path)})
+
+
+def test_the_whole_checksum_counts_and_its_name_begins_with_it(tmp_path, monkeypatch):
+    path = tmp_path / "any.pth"
+    torch.save(backbones.SqueezeNet().state_dict(), path)
+    for kind in (backbones.SqueezeNet, backbones.Vgg16):
+        assert len(kind.SHA256) == 64 and kind.FILE.endswith(f"-{kind.SHA256[:8]}.pth")
+    pose_as_torchvision(monkeypatch, path)
+    monkeypatch.setattr(backbones.SqueezeNet, "SHA256", backbones.SqueezeNet.SHA256[:8] + 56 * "0")
+    with pytest.raises(NgptError, match="checksum is not"):
+        backbones.load(backbones.SqueezeNet, str(path))
 
 
 def test_no_code_is_run_from_weight_files(tmp_path, capsys, monkeypatch):

@@ -167,6 +167,33 @@ def test_a_wall_clock_budget_stops_it(tmp_path):
     assert not run.run() and run.step == 1 and run.checkpoint.exists()
 
 
+def test_records_that_cannot_be_written_cost_no_step(tmp_path, monkeypatch):
+    """A full disk: neither log nor checkpoint has room in the folder, and another place has."""
+    out, other = tmp_path / "run", tmp_path / "other"
+    for folder in (out, other):
+        folder.mkdir()
+    monkeypatch.chdir(other)
+    run, write = trainer(out), weights.write_tensors
+
+    def full(path, *args):
+        if path.parent == out:
+            raise NgptError(f"{path}: cannot be written: No space left on device")
+        write(path, *args)
+
+    def log(values):
+        raise NgptError("log.jsonl: cannot be written: No space left on device")
+
+    monkeypatch.setattr(run, "_log", log)
+    monkeypatch.setattr(weights, "write_tensors", full)
+    with pytest.raises(NgptError, match=rf"checkpoint.safetensors: .*kept in {other / 'checkpoint.kept.safetensors'}$"):
+        run.run()
+    assert run.step == run.settings.run.log
+    (other / "checkpoint.kept.safetensors").rename(out / "checkpoint.safetensors")
+    again = trainer(out)
+    again.resume()
+    assert again.step == run.step
+
+
 def test_a_loss_that_is_not_finite_stops_it_and_keeps_the_batch(tmp_path):
     run = trainer(tmp_path)
     run.run()
@@ -271,15 +298,6 @@ def test_a_mixture_is_its_parts_one_after_the_other():
     assert [crop.scene for crop in mixture] == ["scene0", "scene3", "scene4"]
     growing.append(CROPS[1])
     assert len(mixture) == 4 and mixture[1].scene == "scene1" and mixture[3].scene == "scene4"
-
-
-def test_scenes_are_held_out_whole():
-    training, held_out = examples.split(CROPS, ("scene1", "scene5"))
-    assert [crop.scene for crop in held_out] == ["scene1", "scene5"] and len(training) == 4
-    assert examples.split(CROPS, ()) == (CROPS, [])
-    with pytest.raises(NgptError, match="no scene has a name that begins with 'nosuch'; there are scene0, scene1"):
-        examples.split(CROPS, ("scene1", "nosuch"))
-    assert examples.split([], ("scene1",)) == ([], [])  # all crops are rendered while it trains
 
 
 def test_folders_of_stacks_are_crops(tmp_path):

@@ -21,6 +21,7 @@ alone, by s = 0 and s = 1: that bounds what is kept of a light path, and paths m
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
@@ -31,6 +32,7 @@ from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.eye import Sight
 from data_gen.paths.features import features
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.world import World
@@ -96,21 +98,28 @@ class BDPT(GradientIntegrator):
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         refuse(sensor or scene.sensors()[0], self.name)
         plan = self.plan(World(scene, LightEnds(scene, self.name)))
-        return lambda camera, film: self.sample_pass(plan, camera, film)
+        return partial(self.sample_pass, Frozen(scene, plan), plan)
 
-    def sample_pass(self, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
+    def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one path from the camera and one from a light for each camera sample."""
+        splats = film.splats("primal") if plan.joins else None
+        values, sums = frozen(self.samples, plan, camera, sums=splats and splats.zeros)
+        if splats:
+            splats.take(sums)
+        film.put_all(values)
+
+    def samples(self, plan: Plan, camera: CameraSamples, sums: tuple = ()) -> tuple[dict, tuple]:
+        """Layers, and the ``sums`` of splats with those of paths from lights, if there are any."""
         sight, lit = Sight.of(camera), None
         if plan.joins:
-            lit, random, _ = light_path(plan, sight, Splatter(film.splats("primal"), sight.ray, sight.importance))
+            splatter = Splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)
+            lit, random, _ = light_path(plan, sight, splatter)
             sight = replace(sight, random=random)
         L, Le = camera_path(plan, sight, lit)
         Le = self.emission_in_pixel(plan.scene, camera, Le)
         values = {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         values |= features(plan.scene, camera.sensor, camera.random.clone(), sight.ray)
-        # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values)
-        film.put_all(values)
+        return values, sums
 
     def hidden_from_camera(self, scene, si, camera: mi.DirectionSample3f, active) -> mi.Bool:
         """Whether something is between ``si`` and the camera's near plane; lamps are not, if they are hidden."""

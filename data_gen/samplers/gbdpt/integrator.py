@@ -27,6 +27,8 @@ Rendering", section 4.2; Sun et al. 2017, "Gradient-Domain Vertex Connection and
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -36,8 +38,9 @@ from data_gen.film import SHIFTS, GradientFilm
 from data_gen.film.splats import Splats
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples, in_packets
-from data_gen.paths.eye import Sight
+from data_gen.paths.eye import Eye, Sight
 from data_gen.paths.features import features
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.light_ends import LightEnds
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials
@@ -51,7 +54,7 @@ from data_gen.samplers.gbdpt.chain_shift import no_chain, straight
 from data_gen.samplers.gbdpt.light_again import Unseen, marked
 from data_gen.samplers.gbdpt.light_shift import splat_differences
 from data_gen.samplers.gbdpt.pairs import difference, difference_of_one
-from data_gen.samplers.gbdpt.roulette import Rater, survivors, thresholds
+from data_gen.samplers.gbdpt.roulette import Rater, Worth, survivors, thresholds
 
 
 class GBDPT(BDPT):
@@ -71,30 +74,36 @@ class GBDPT(BDPT):
         refuse(sensor or scene.sensors()[0], self.name)
         materials = Materials(scene, self.options["roughness_threshold"])
         plan = self.plan(World(scene, LightEnds(scene, self.name), materials), pair=difference)
-        return lambda camera, film: self.gradient_pass(plan, camera, film)
+        return partial(self.gradient_pass, Frozen(scene, plan), plan)
 
-    def gradient_pass(self, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
+    def gradient_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one path from the camera and one from a light, and all their shifts, for each camera sample."""
+        splats = {name: film.splats(name) for name in ("primal", *SHIFTS)} if plan.joins else {}
+        n, sums = dr.width(camera.pixel), None
+        if plan.joins:
+            sums = lambda: (splats["primal"].zeros(), Worth.nothing(n, plan.longest))  # noqa: E731
+        values, Δ, inside, marks, bent, sums = frozen(self.samples, plan, camera, sums=sums)
+        if plan.joins:
+            splats["primal"].take(sums[0])
+            threshold = thresholds(camera, values["primal"] - values["direct"], splats["primal"])
+            shift_splats(frozen, plan, camera, splats, sums[1], marks, threshold)
+        if not plan.materials.all_connectable:
+            shift_bent(frozen, plan, camera, bent, Δ)
+        film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
+
+    def samples(self, plan: Plan, camera: CameraSamples, sums: Any = None) -> tuple:
+        """Layers, Δ in the order of SHIFTS and where it is on the film, what is marked, which paths are bent, and the
+        ``sums`` of splats and the ``Worth`` of paths from lights, with those of this pass."""
         ray, importance, _ = camera.rays()
         inside = [camera.rays(shift)[2] for shift in SHIFTS.values()]
-        splats = {name: film.splats(name) for name in ("primal", *SHIFTS)} if plan.joins else {}
         rater = None
-        if plan.joins:
-            rater = Rater.of(splats["primal"], ray, importance, dr.width(camera.pixel), plan.longest)
+        if sums is not None:
+            rater = Rater(Splats.on(Eye.of(camera).pixels, 3, sums[0]), ray, importance, sums[1])
         L, Le, Δ, marks, bent = both_paths(plan, camera, rater)
         Le = self.emission_in_pixel(plan.scene, camera, Le)
         values = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         values |= features(plan.scene, camera.sensor, camera.random.clone(), ray)
-        # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside, marks, bent)
-        if rater is not None:
-            threshold = thresholds(camera, values["primal"] - values["direct"], splats["primal"])
-            shift_splats(plan, camera, splats, rater, marks, threshold)
-        if not plan.materials.all_connectable:
-            shift_bent(plan, camera, bent, Δ)
-        film.put_all(values)
-        for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
-            film.put(name, value, active)
+        return values, Δ, inside, marks, bent, sums
 
 
 def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone: mi.Bool | None = None) -> tuple:
@@ -113,23 +122,32 @@ def both_paths(plan: Plan, camera: CameraSamples, visitor: Visitor | None, alone
     return L, Le, [to_rgb(one, sight.ray.wavelengths) for one in Δ], state, course.bent
 
 
-def shift_bent(plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
+def shift_bent(frozen: Frozen, plan: Plan, camera: CameraSamples, bent: mi.Bool, Δ: list[mi.Color3f]) -> None:
     """Adds to Δ the differences of ``bent`` camera paths, which are traced anew: see ``chain_shift``."""
     # Copies: kernels tell arrays by how their memory is aligned, and NumPy's is so or so.
     lanes, exists = (dr.opaque(mi.UInt32(part)) for part in in_packets(np.array(dr.compress(bent)), camera))
     if not dr.width(lanes):
         return
     alone = exists != 0
-    plan = replace(plan, pair=difference_of_one)
-    _, _, few, _, _ = both_paths(plan, camera.at(lanes), Unseen(), alone)
-    dr.eval(few)
+    few = frozen(bent_differences, replace(plan, pair=difference_of_one), camera.at(lanes), alone)
     for total, added in zip(Δ, few, strict=True):
         for channel, value in zip(total, added, strict=True):
             dr.scatter_add(channel, value, lanes, alone)
 
 
+def bent_differences(plan: Plan, camera: CameraSamples, alone: mi.Bool) -> list[mi.Color3f]:
+    """Δ in the order of SHIFTS of the camera paths that are ``alone``, those that are bent."""
+    return both_paths(plan, camera, Unseen(), alone)[2]
+
+
 def shift_splats(
-    plan: Plan, camera: CameraSamples, splats: dict[str, Splats], rater: Rater, marks: mi.UInt64, threshold: mi.Float
+    frozen: Frozen,
+    plan: Plan,
+    camera: CameraSamples,
+    splats: dict[str, Splats],
+    worth: Worth,
+    marks: mi.UInt64,
+    threshold: mi.Float,
 ) -> None:
     """Splats the differences of light paths that end at ``marked`` vertices, of those that survive ``roulette``, which
     goes by the ``threshold`` of each pixel.
@@ -139,15 +157,34 @@ def shift_splats(
     lanes, depths = marked(marks, plan.longest)
     if not dr.width(lanes):
         return
-    lanes, depths, times = survivors(camera, rater, lanes, depths, threshold)
-    if not dr.width(lanes):
-        return
-    bent = splat_differences(plan, Sight.of(camera.at(lanes)), depths, splats, times=times)
-    dr.eval(bent)
-    if plan.materials.all_connectable or not dr.width(few := dr.compress(bent)):
-        return
-    lanes, depths, times = (dr.gather(type(value), value, few) for value in (lanes, depths, times))
-    dr.eval(splat_differences(plan, Sight.of(camera.at(lanes)), depths, splats, True, times))
+    lanes, depths, times = survivors(camera, worth, lanes, depths, threshold)
+    for bent in (False, True):
+        if not dr.width(lanes):
+            return
+        sums, is_bent = frozen(
+            splatted_differences,
+            plan,
+            camera.at(lanes),
+            depths,
+            times,
+            bent,
+            sums=lambda: {name: splats[name].zeros() for name in SHIFTS},
+        )
+        for name, added in sums.items():
+            splats[name].take(added)
+        if plan.materials.all_connectable:
+            return
+        few = dr.compress(is_bent)
+        lanes, depths, times = (dr.gather(type(value), value, few) for value in (lanes, depths, times))
+
+
+def splatted_differences(
+    plan: Plan, camera: CameraSamples, depths: mi.UInt32, times: mi.Float, bent: bool, sums: dict[str, tuple]
+) -> tuple[dict[str, tuple], mi.Bool]:
+    """The ``sums`` with differences of these light paths, and which lanes have bent ones, see ``light_shift``."""
+    sight = Sight.of(camera)
+    splats = {name: Splats.on(sight.eye.pixels, 3, one) for name, one in sums.items()}
+    return sums, splat_differences(plan, sight, depths, splats, bent, times)
 
 
 def make(scene: mi.Scene, **options) -> SamplePass:

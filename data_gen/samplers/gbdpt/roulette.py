@@ -36,36 +36,44 @@ RATED = 9
 
 
 @dataclass
-class Rater(Marker):
-    """A marker that keeps what light each vertex splats, and on which pixel."""
+class Worth:
+    """What light each vertex of light paths splats, and on which pixel."""
 
-    worth: mi.Float  # by depth, of each depth by lane
+    light: mi.Float  # by depth, of each depth by lane
     pixel: mi.UInt32
     lanes: mi.UInt32  # how many there are
 
     @classmethod
-    def of(cls, splats: Splats, ray: mi.Ray3f, importance: mi.Spectrum, lanes: int, longest: int) -> Rater:
-        """That of so many ``lanes``, of light paths of at most ``longest`` edges."""
+    def nothing(cls, lanes: int, longest: int) -> Worth:
+        """That of so many ``lanes``, of light paths of at most ``longest`` edges, before they are traced."""
         places = lanes * min(RATED, longest - 1)
-        worth, pixel = dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places)
-        return cls(splats, ray, importance, worth, pixel, dr.opaque(mi.UInt32, lanes))
-
-    def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
-        lane = dr.arange(mi.UInt32, dr.width(self.ray))
-        kept = (dr.max(seen.C) > 0) & (seen.y.depth <= RATED)
-        place = self.place(lane, seen.y.depth)
-        dr.scatter(self.worth, dr.max(self.light(seen)), place, kept)
-        dr.scatter(self.pixel, seen.pixel, place, kept)
-        return super().sees(state, seen)
+        worth = cls(dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places), mi.UInt32(lanes))
+        dr.make_opaque(worth)
+        return worth
 
     def place(self, lane: mi.UInt32, depth: mi.UInt32) -> mi.UInt32:
         return (depth - 1) * self.lanes + lane
 
-    def rated(self, lane: mi.UInt32, depth: mi.UInt32) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
-        """The worth and the pixel of these vertices, and whether they were kept."""
+    def of(self, lane: mi.UInt32, depth: mi.UInt32) -> tuple[mi.Float, mi.UInt32, mi.Bool]:
+        """The light and the pixel of these vertices, and whether they were kept."""
         kept = depth <= RATED
         place = self.place(lane, depth)
-        return dr.gather(mi.Float, self.worth, place, kept), dr.gather(mi.UInt32, self.pixel, place, kept), kept
+        return dr.gather(mi.Float, self.light, place, kept), dr.gather(mi.UInt32, self.pixel, place, kept), kept
+
+
+@dataclass
+class Rater(Marker):
+    """A marker that keeps the ``worth`` of each vertex."""
+
+    worth: Worth
+
+    def sees(self, state: mi.UInt64, seen: Seen) -> mi.UInt64:
+        lane = dr.arange(mi.UInt32, dr.width(self.ray))
+        kept = (dr.max(seen.C) > 0) & (seen.y.depth <= RATED)
+        place = self.worth.place(lane, seen.y.depth)
+        dr.scatter(self.worth.light, dr.max(self.light(seen)), place, kept)
+        dr.scatter(self.worth.pixel, seen.pixel, place, kept)
+        return super().sees(state, seen)
 
 
 def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.Float:
@@ -78,11 +86,11 @@ def thresholds(camera: CameraSamples, light: mi.Color3f, splats: Splats) -> mi.F
 
 
 def survivors(
-    camera: CameraSamples, rater: Rater, lane: mi.UInt32, depth: mi.UInt32, threshold: mi.Float
+    camera: CameraSamples, worth: Worth, lane: mi.UInt32, depth: mi.UInt32, threshold: mi.Float
 ) -> tuple[mi.UInt32, mi.UInt32, mi.Float]:
     """Of the vertices at ``depth`` of the light paths of ``lane`` those that are shifted, and 1 / p of each."""
-    worth, pixel, kept = rater.rated(lane, depth)
-    share = SHARE * worth / dr.gather(mi.Float, threshold, pixel)
+    light, pixel, kept = worth.of(lane, depth)
+    share = SHARE * light / dr.gather(mi.Float, threshold, pixel)
     p = dr.select(kept & (share < 1), dr.fmax(share, LEAST), 1)
     # Numbers that no path has drawn
     u = mi.sample_tea_float32(camera.random.at(lane).next_key(), depth)

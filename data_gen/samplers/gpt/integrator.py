@@ -40,14 +40,16 @@ sections 3 and 4.1]
 from __future__ import annotations
 
 from functools import partial
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
 
 from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.manifold_shift import add_followed
@@ -101,7 +103,7 @@ class GPT(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         plan = self.plan(scene)
-        return lambda camera, film: self.sample_pass(scene, plan, camera, film)
+        return partial(self.sample_pass, Frozen(scene, plan), plan)
 
     def plan(self, scene) -> Plan:
         """What the kernel contains for a scene. Raises NgptError for polarised variants."""
@@ -114,10 +116,20 @@ class GPT(GradientIntegrator):
         more = {"caustic": self.caustic, "volumes": volumes, "places": self.places}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
-    def sample_pass(self, scene, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
+    def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
         """Takes one base path and its four offset paths for each camera sample."""
+        values, Δ, inside, rest = frozen(self.samples, plan, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
+        if self.reuse:
+            values["primal"] = reused(camera, rest, Δ, inside) + values["direct"]
+        if plan.manifold:
+            first_hit = partial(self.first_hit, plan.space.scene)
+            Δ = add_followed(plan, first_hit, camera, list(SHIFTS.values()), rest, Δ)
+        film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
+
+    def samples(self, plan: Plan, camera: CameraSamples) -> tuple[dict, list, list, Any]:
+        """Layers, Δ in the order of SHIFTS, where it is on the film, and what options need: A of Δ, or a chain."""
         # ------------------------- Paths -----------------------------
-        ray, importance, _ = camera.rays()
+        scene, (ray, importance, _) = plan.space.scene, camera.rays()
         within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
@@ -128,23 +140,14 @@ class GPT(GradientIntegrator):
 
         # ------------------------ Samples ----------------------------
         inside = [inside for _, _, inside in shifted]
-        if self.reuse:
-            L = reused(camera, [to_rgb(y.A, ray.wavelengths) for y in paths.offsets], Δ, inside)
         values = {"primal": L + Le, "direct": Le}
         if plan.caustic:
             values["caustic"] = L_caustic
         values |= features(scene, camera.sensor, camera.random.clone(), ray)
         if self.diagnostics:
             values["shift_failures"] = count([y.failed for y in paths.offsets]) / dr.fmax(count(inside), 1)
-        # One kernel for all of it: each value read on its own would trace the paths again.
-        dr.eval(values, Δ, inside, paths.chain)
-        if plan.manifold:
-            first_hit = partial(self.first_hit, scene)
-            Δ = add_followed(plan, first_hit, camera, list(SHIFTS.values()), paths.chain, Δ)
-        for name, value in values.items():
-            film.put(name, value)
-        for name, value, active in zip(SHIFTS, Δ, inside, strict=True):
-            film.put(name, value, active)
+        A = [to_rgb(y.A, ray.wavelengths) for y in paths.offsets] if self.reuse else None
+        return values, Δ, inside, paths.chain if plan.manifold else A
 
 
 def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f:
@@ -153,7 +156,6 @@ def reused(camera: CameraSamples, A: list, Δ: list, inside: list) -> mi.Color3f
     A pair is sampled from here, with the base path's part ``A``, and from the neighbour, with the offset path's part
     A + Δ of the same sample there. [Kettunen et al. 2015, section 5]
     """
-    dr.eval(A, Δ, inside)
     names, lane = list(SHIFTS), dr.arange(mi.Int32, dr.width(inside[0]))
     L = mi.Color3f(0)
     for a, (x, y), active in zip(A, SHIFTS.values(), inside, strict=True):

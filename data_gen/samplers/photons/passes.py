@@ -65,7 +65,7 @@ class Begun:
         ray, importance, _ = camera.rays()
         random = camera.random.clone()
         dr.eval(ray, importance)
-        layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray, fixed=True)
+        layers = passes.frozen(features, passes.world.scene, camera.sensor, camera.random, ray)
         return cls(Start(ray, importance, random), layers)
 
 

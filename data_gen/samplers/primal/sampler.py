@@ -7,14 +7,14 @@ from functools import partial
 
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features as feature_layers
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import radiance
+from data_gen.samplers.common import radiance, recorded
 from data_gen.samplers.gpt.integrator import stand_in
+from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
@@ -26,12 +26,12 @@ def make(scene: mi.Scene, features: bool, places: Places | None = None) -> Sampl
     """The sampler ``primal``; without ``features`` it holds the primal alone. Lamps may be chosen by ``places``."""
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
-    L = radiance_by_place(scene, places) if places and followed else radiance(scene, integrator)
-    return partial(sample_pass, scene, integrator, L, features)
+    plan, L = radiance_by_place(scene, places) if places and followed else (None, radiance(scene, integrator))
+    return recorded(scene, partial(samples, scene, integrator, L, features), plan)
 
 
-def radiance_by_place(scene: mi.Scene, places: Places) -> Callable[..., mi.Spectrum]:
-    """``radiance()`` by the base paths of ``gpt``: Mitsuba's integrators choose a lamp alike everywhere."""
+def radiance_by_place(scene: mi.Scene, places: Places) -> tuple[Plan, Callable[..., mi.Spectrum]]:
+    """``radiance()`` by the base paths of ``gpt``, whose plan comes first: others choose a lamp alike everywhere."""
     view = stand_in(scene, places, caustic=False)
     plan = view.plan(scene)
 
@@ -40,22 +40,23 @@ def radiance_by_place(scene: mi.Scene, places: Places) -> Callable[..., mi.Spect
         paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], within)
         return paths.L + paths.Le
 
-    return L
+    return plan, L
 
 
-def sample_pass(scene, integrator, radiance, features: bool, camera: CameraSamples, film: GradientFilm) -> None:
-    """One sample of ``radiance``, and of features, for each camera sample.
+def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
+    """Layers: one sample of ``radiance``, and of features, for each camera sample.
 
     Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)
     L = importance * radiance(camera.random.clone(), ray, medium, all_lanes)
+    layers = {}
     if features:
         seen = partial(emission_seen, scene, integrator, medium, active=all_lanes)
         at_place = importance * seen(ray)
         Le = emission_in_pixel(scene, camera, at_place, seen)
         L = L + Le - at_place
-        film.put("direct", to_rgb(Le, ray.wavelengths))
-        film.put_all(feature_layers(scene, camera.sensor, camera.random.clone(), ray))
-    film.put("primal", to_rgb(L, ray.wavelengths))
+        layers["direct"] = to_rgb(Le, ray.wavelengths)
+        layers |= feature_layers(scene, camera.sensor, camera.random.clone(), ray)
+    return layers | {"primal": to_rgb(L, ray.wavelengths)}

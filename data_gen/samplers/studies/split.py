@@ -20,7 +20,6 @@ from functools import partial
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
@@ -28,6 +27,7 @@ from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.lobes import Lobes
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.walk import Limits, roulette
+from data_gen.samplers.common import recorded
 from data_gen.samplers.teaching.gpt_simple import base_step
 from data_gen.scenes.load import reference_integrator
 from ngpt.errors import NgptError
@@ -38,11 +38,12 @@ def make(scene: mi.Scene) -> SamplePass:
     limits = Limits.of(reference_integrator(scene))
     if limits.hide_emitters:
         raise NgptError("sampler 'split' cannot render this scene: its integrator hides emitters; use --sampler primal")
-    return partial(sample_pass, scene, limits, Lobes(scene))
+    lobes = Lobes(scene)
+    return recorded(scene, partial(samples, scene, limits, lobes), lobes)
 
 
-def sample_pass(scene, limits: Limits, lobes: Lobes, camera: CameraSamples, film: GradientFilm) -> None:
-    """One path, and a sample of features, for each camera sample."""
+def samples(scene, limits: Limits, lobes: Lobes, camera: CameraSamples) -> dict:
+    """Layers: one path, and a sample of features, for each camera sample."""
     ray, importance, _ = camera.rays()
     parts = trace(scene, limits, lobes, camera.random.clone(), ray, importance)
     diffuse, specular = (to_rgb(part, ray.wavelengths) for part in parts)
@@ -50,8 +51,8 @@ def sample_pass(scene, limits: Limits, lobes: Lobes, camera: CameraSamples, film
     if limits.shows:
         seen = partial(emission_seen, scene, limits, None, active=mi.Bool(True))
         direct = to_rgb(emission_in_pixel(scene, camera, importance * seen(ray), seen), ray.wavelengths)
-    film.put_all({"primal": direct + diffuse + specular, "direct": direct, "diffuse": diffuse, "specular": specular})
-    film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
+    layers = {"primal": direct + diffuse + specular, "direct": direct, "diffuse": diffuse, "specular": specular}
+    return layers | features(scene, camera.sensor, camera.random.clone(), ray)
 
 
 @dr.syntax

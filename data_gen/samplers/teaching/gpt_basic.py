@@ -16,16 +16,19 @@ q to p, are sampled and weighted 1/2 each.
 
 from __future__ import annotations
 
+from functools import partial
+
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS, GradientFilm
+from data_gen.film import SHIFTS
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
 from data_gen.paths.lights import emission_seen
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import GradientIntegrator, radiance
+from data_gen.samplers.common import GradientIntegrator, radiance, recorded
+from data_gen.scenes.integrators import check_integrator, followed
 from data_gen.scenes.load import reference_integrator
 
 
@@ -43,8 +46,10 @@ class GPTBasic(GradientIntegrator):
 
     def __init__(self, props: mi.Properties):
         super().__init__(props)
-        nested = [value for _, value in props.items() if isinstance(value, mi.SamplingIntegrator)]
-        self.integrator = nested[0] if nested else mi.load_dict({"type": "path"})
+        nested = [value for _, value in props.items() if isinstance(value, mi.Integrator)]
+        integrator = nested[0] if nested else mi.load_dict({"type": "path"})
+        check_integrator(integrator)
+        self.integrator = followed(integrator)
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone: see the nested integrator."""
@@ -52,19 +57,18 @@ class GPTBasic(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         estimate = radiance(scene, self.integrator)
-        return lambda camera, film: self.sample_pass(scene, estimate, camera, film)
+        return recorded(scene, partial(self.samples, scene, estimate), shifts=SHIFTS.values())
 
-    def sample_pass(self, scene, estimate, camera: CameraSamples, film: GradientFilm) -> None:
-        """Takes one base path for each camera sample and shifts it to the four neighbours of its pixel."""
+    def samples(self, scene, estimate, camera: CameraSamples) -> dict:
+        """One base path for each camera sample, shifted to the four neighbours of its pixel."""
         L, Le, _ = self.radiance(scene, estimate, camera, (0, 0))
-        film.put("primal", L + Le)
-        film.put("direct", Le)
+        layers = {"primal": L + Le, "direct": Le}
         usable = dr.isfinite(dr.sum(L))
         for name, shift in SHIFTS.items():
             L_shifted, _, inside = self.radiance(scene, estimate, camera, shift)
-            film.put(name, L_shifted - L, inside & usable)
+            layers[name] = (L_shifted - L, inside & usable)
         ray, _, _ = camera.rays()
-        film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
+        return layers | features(scene, camera.sensor, camera.random.clone(), ray)
 
     def radiance(self, scene, estimate, camera: CameraSamples, shift) -> tuple[mi.Color3f, mi.Color3f, mi.Bool]:
         """L(u, p + shift) without, and with only, the emission seen directly; and whether p + shift is on the film.

@@ -28,11 +28,12 @@ sections 3.3, 3.5 and 4.1]
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS, GradientFilm
+from data_gen.film import SHIFTS
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features
@@ -41,7 +42,7 @@ from data_gen.paths.shift import gradient_weight, mis_weight, reconnection_jacob
 from data_gen.paths.spectrum import to_rgb
 from data_gen.paths.vertex import Materials, consistent, evaluate, seen_from
 from data_gen.paths.walk import Limits, roulette
-from data_gen.samplers.common import GradientIntegrator, like_path
+from data_gen.samplers.common import GradientIntegrator, like_path, recorded
 from data_gen.samplers.shared import CONNECTABLE
 from ngpt.errors import NgptError
 
@@ -65,18 +66,17 @@ class GPTSimple(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         refuse(scene, self.limits)
-        return lambda camera, film: self.sample_pass(scene, camera, film)
+        return recorded(scene, partial(self.samples, scene), shifts=SHIFTS.values())
 
-    def sample_pass(self, scene, camera: CameraSamples, film: GradientFilm) -> None:
-        """Takes one base path and its four offset paths for each camera sample."""
+    def samples(self, scene, camera: CameraSamples) -> dict:
+        """One base path and its four offset paths for each camera sample."""
         ray, importance, _ = camera.rays()
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         L, Le, Δ = trace(scene, self.limits, camera.random.clone(), ray, importance, shifted)
-        film.put("primal", to_rgb(L + Le, ray.wavelengths))
-        film.put("direct", to_rgb(Le, ray.wavelengths))
+        layers = {"primal": to_rgb(L + Le, ray.wavelengths), "direct": to_rgb(Le, ray.wavelengths)}
         for name, value, (_, _, inside) in zip(SHIFTS, Δ, shifted, strict=True):
-            film.put(name, to_rgb(value, ray.wavelengths), inside)
-        film.put_all(features(scene, camera.sensor, camera.random.clone(), ray))
+            layers[name] = (to_rgb(value, ray.wavelengths), inside)
+        return layers | features(scene, camera.sensor, camera.random.clone(), ray)
 
 
 def trace(scene, limits: Limits, random, ray, importance, shifted):

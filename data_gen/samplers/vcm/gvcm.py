@@ -60,11 +60,11 @@ class GVCM(VCM):
         world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         dr.eval(sight.ray, sight.importance, shifted)
-        values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
+        values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray)
         if self.plan(world).joins:
             photons, sight, marks = self.light_pass(passes, sight, camera, film.splats("primal"))
             self.shift_splats(passes, camera, film, marks, photons.η)
-        L, Le, Δ = frozen(self.shifted_camera_pass, world, sight, shifted, photons, fixed=True)
+        L, Le, Δ = frozen(self.shifted_camera_pass, world, sight, shifted, photons)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         Δ = [to_rgb(one, sight.ray.wavelengths) for one in Δ]
         dr.eval(values, Δ)

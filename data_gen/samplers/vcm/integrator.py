@@ -109,10 +109,10 @@ class VCM(BDPT):
         """One light path and one camera path for each camera sample, of which a pixel has one."""
         world, frozen, sight, photons = passes.world, passes.frozen, Sight.of(camera), None
         dr.eval(sight.ray, sight.importance)
-        values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray, fixed=True)
+        values = frozen(features, world.scene, camera.sensor, camera.random.clone(), sight.ray)
         if self.plan(world).joins:
             photons, sight, _ = self.light_pass(passes, sight, camera, film.splats("primal"))
-        L, Le = frozen(self.camera_pass, world, sight, photons, fixed=True)
+        L, Le = frozen(self.camera_pass, world, sight, photons)
         values |= {"primal": to_rgb(L + Le, sight.ray.wavelengths), "direct": to_rgb(Le, sight.ray.wavelengths)}
         dr.eval(values)
         film.put_all(values)
@@ -126,9 +126,7 @@ class VCM(BDPT):
         ``sight`` with random numbers to go on by, and the splatter's state."""
         n, radius = dr.width(sight.ray), self.radius * passes.width * shrunk(camera.first)
         η, empty = dr.opaque(mi.Float, eta(radius, n)), Map.empty(n, self.vertices)
-        kept, numbers, state, sums = passes.frozen(
-            self.light_paths, passes.world, sight, η, empty, fixed=True, sums=splats.zeros
-        )
+        kept, numbers, state, sums = passes.frozen(self.light_paths, passes.world, sight, η, empty, sums=splats.zeros)
         dr.eval(kept, numbers, state, sums)
         splats.take(sums)
         photons = Photons(kept, radius, n, number_of(camera.seed, camera.first))

@@ -1,5 +1,5 @@
 #!/bin/bash
-#SBATCH --cpus-per-task=8 --mem=8G --time=04:00:00 --requeue
+#SBATCH --cpus-per-task=8 --mem=8G --time=04:00:00 --signal=B:TERM@120 --requeue
 # Frames of a shot, a share of them for each job of an array:
 #     sbatch --array=0-15 slurm-shot.sh SCENE OUT 0:240
 set -eu

@@ -5,7 +5,10 @@
  */
 
 export class Model {
-  /** `ort` is the module of ONNX Runtime; `model` and `statistics` are the files' contents, Uint8Array. */
+  /**
+   * `ort` is the module of ONNX Runtime; `model` and `statistics` are the files' contents, Uint8Array. Without
+   * `statistics` there are no tiles.
+   */
   static async open(ort, model, statistics, options = {}) {
     const made = new Model();
     made.ort = ort;
@@ -20,7 +23,7 @@ export class Model {
     made.overlap = Number(value("ngpt.overlap"));
     const create = bytes => ort.InferenceSession.create(bytes, {logSeverityLevel: 3, ...options});
     made.image = await create(demanding(model, "statistics"));
-    made.statistics = await create(statistics);
+    made.statistics = statistics && await create(statistics);
     return made;
   }
 
@@ -38,6 +41,7 @@ export class Model {
       if (length !== expected) throw new Error(`${name} has ${length} numbers; ${width}x${height} needs ${expected}`);
     }
     if (!tile) return this.#session(this.image, layers, width, height, new Float32Array(5));
+    if (!this.statistics) throw new Error("tiles need the network's .statistics.onnx, which `ngpt export` writes");
     const size = Math.max(this.alignment, tile - tile % this.alignment);
     // All tiles share the statistics of the whole image, so that no seam shows.
     const statistics = await this.#session(this.statistics, layers, width, height);

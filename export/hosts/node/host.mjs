@@ -23,7 +23,9 @@ async function main([path, folder, output, tile = "0", runs = "1"]) {
   process.env.ORT_DISABLE_TELEMETRY ??= "1";
   // In node_modules beside this file, or where NODE_PATH says.
   const ort = createRequire(import.meta.url)("onnxruntime-node");
-  const model = await Model.open(ort, readFileSync(path), readFileSync(path.replace(SUFFIX, ".statistics.onnx")));
+  // Only tiles need the statistics of the whole image.
+  const statistics = Number(tile) ? readFileSync(path.replace(SUFFIX, ".statistics.onnx")) : undefined;
+  const model = await Model.open(ort, readFileSync(path), statistics);
   const shapes = JSON.parse(readFileSync(join(folder, "layers.json"), "utf8"));
   const held = {};
   for (const name of Object.keys(shapes)) {

@@ -10,7 +10,7 @@ import struct
 import zlib
 from collections.abc import Callable
 from pathlib import Path
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
 import numpy as np
 import OpenEXR
@@ -19,7 +19,7 @@ from ngpt.errors import NgptError
 from ngpt.io.foreign import jpeg, pfm, png, radiance, tiff
 from ngpt.io.foreign.form import Damage, Form, Unread
 from ngpt.io.header import PartHeader, check_size, read_headers
-from ngpt.io.openexr import ExrImage, ExrPart, read_exr
+from ngpt.io.openexr import ExrImage, ExrPart, read_exr, read_header
 from ngpt.system.reading import regular_file
 
 _LOG = logging.getLogger(__name__)
@@ -55,6 +55,14 @@ def file_headers(file: BinaryIO, path: str) -> list[PartHeader]:
     """What ``ngpt.io.header.read_headers`` tells of OpenEXR, of an open file of any of the formats."""
     reader = _reader(file)
     return [_header(_form(path, file, reader))] if reader else read_headers(file, path)
+
+
+def first_attributes(path: Path) -> dict[str, Any]:
+    """The attributes of a file's first part, none in other formats than OpenEXR; raises NgptError."""
+    with regular_file(path) as file:
+        if _reader(file):
+            return {}
+    return read_header(path)[0]
 
 
 def tell_conversion(path: Path) -> None:

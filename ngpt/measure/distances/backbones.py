@@ -5,6 +5,7 @@ image itself, and every ReLU's output (for SqueezeNet, of every fire module), co
 """
 
 import hashlib
+import io
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -14,9 +15,13 @@ from torch import Tensor, nn
 from torch.nn.functional import avg_pool2d, max_pool2d
 
 from ngpt.errors import NgptError
+from ngpt.system.reading import read_bytes
 
 # What pretrained networks were fed: (x - shift) / scale of x in [-1, 1].
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
+
+# Bytes; VGG16 has half as many.
+_LARGEST = 2**30
 
 # A function that drops inputs of a convolution, the same for both images of a comparison; the identity if none.
 Dropout = Callable[[Tensor], Tensor]
@@ -44,6 +49,7 @@ class SqueezeNet(nn.Module):
 
     CHANNELS = (3, 64, 128, 128, 256, 256, 384, 384, 512, 512)
     FILE = "squeezenet1_1-b8a52dc0.pth"
+    SHA256 = "b8a52dc049b60e4b6ab68ad0df457362afab8b6304b2febdc1650a5dab4d7e7b"
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,6 +75,7 @@ class Vgg16(nn.Module):
 
     CHANNELS = (3, 64, 64, 128, 128, 256, 256, 256, 512, 512, 512, 512, 512, 512)
     FILE = "vgg16-397923af.pth"
+    SHA256 = "397923af8e79cdbb6a7127f12361acd7a2f83e06b05044ddf496e83de57a5bf0"
     _CONVOLUTIONS = (0, 2, 5, 7, 10, 12, 14, 17, 19, 21, 24, 26, 28)
 
     def __init__(self) -> None:
@@ -92,10 +99,21 @@ def _standardised(image: Tensor) -> Tensor:
     return (image - shift) / scale
 
 
+def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tensor]:
+    """What torchvision's file holds; it is read once, so that what is loaded is what was checked."""
+    content = read_bytes(file, _LARGEST)
+    if hashlib.sha256(content).hexdigest() != kind.SHA256:
+        raise NgptError(
+            f"{file}: its checksum is not {kind.SHA256[:8]}..., that of {kind.FILE}; download it again, or convert "
+            "other weights to .safetensors"
+        )
+    return torch.load(io.BytesIO(content), map_location="cpu", weights_only=True)
+
+
 def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if it has torchvision's checksum,
+    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if its SHA-256 is that of the file,
     whatever its name, and then by the reader of PyTorch that takes tensors and no code. Raises NgptError where there is
     no such file, it is another, or it has other tensors.
     """
@@ -105,17 +123,8 @@ def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
             f"{file}: no such file; get {kind.FILE} from torchvision (download.pytorch.org/models) and put it "
             'there, or name it in the configuration as loss.backbone; loss.kind = "structural" needs no weights'
         )
-    digits = kind.FILE.rpartition("-")[2].removesuffix(".pth")
     try:
-        if file.suffix == ".safetensors":
-            tensors = load_file(file)
-        elif hashlib.sha256(file.read_bytes()).hexdigest().startswith(digits):
-            tensors = torch.load(file, map_location="cpu", weights_only=True)
-        else:
-            raise NgptError(
-                f"{file}: its checksum is not {digits}..., that of {kind.FILE}; download it again, or convert other "
-                "weights to .safetensors"
-            )
+        tensors = load_file(file) if file.suffix == ".safetensors" else _checked(kind, file)
     except NgptError:
         raise
     except Exception as error:  # whatever a damaged archive makes of it

@@ -74,7 +74,7 @@ class CameraPaths:
         n, stream = dr.width(rays[0][0].o), type(random)
         start = Level([], dr.arange(mi.UInt32, n), dr.opaque(mi.UInt32, 1, n), dr.opaque(mi.Float, 1, n), random.state)
         dr.eval(start)
-        level, number = frozen(self.begun, start, stream(start.numbers), rays, fixed=True), 1
+        level, number = frozen(self.begun, start, stream(start.numbers), rays), 1
         while True:
             dr.eval(level)
             yield level
@@ -121,7 +121,7 @@ class CameraPaths:
         """Le that is seen directly, of the first level."""
         if self.limits.max_depth < 1:
             return mi.Spectrum(0)
-        return frozen(Path.emission, level.paths[0], self.world.scene, fixed=True)
+        return frozen(Path.emission, level.paths[0], self.world.scene)
 
     def emitted(self, level: Level) -> list:
         """Emission that base paths meet at a later level, and its four Δ."""

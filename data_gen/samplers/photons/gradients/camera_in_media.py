@@ -106,7 +106,7 @@ class PathsByPieces(CameraPaths):
         return self.of_lanes(level, pieces, random.at(lanes), lanes)
 
     def direct(self, level: Level, start: Start, frozen: Callable) -> mi.Spectrum:
-        return frozen(self.seen_directly, level.paths[0], fixed=True)
+        return frozen(self.seen_directly, level.paths[0])
 
     def seen_directly(self, base: Piece) -> mi.Spectrum:
         """Lamps as seen through media."""

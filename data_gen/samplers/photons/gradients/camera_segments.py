@@ -91,7 +91,7 @@ class PathsBySegments(CameraPaths):
         return Flight(segment.ray, segment.hit, β, path.alive, path.sky, place.medium, place.scatters)
 
     def direct(self, level: Level, start: Start, frozen: Callable) -> mi.Spectrum:
-        return frozen(self.seen_directly, mi.Ray3f(start.ray), start.importance, fixed=True)
+        return frozen(self.seen_directly, mi.Ray3f(start.ray), start.importance)
 
     def seen_directly(self, ray: mi.Ray3f, importance) -> mi.Spectrum:
         """Lamps as seen through media."""

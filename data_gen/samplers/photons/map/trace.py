@@ -64,7 +64,7 @@ def trace(
     vertex, as parent. ``frozen`` calls the functions that make kernels; with ``edges`` maps have those, too. Returns
     the light's end of all paths, and the maps.
     """
-    start, channel, medium, numbers = frozen(_start, world, random, fixed=True)
+    start, channel, medium, numbers = frozen(_start, world, random)
     dr.eval(start, channel, medium, numbers)
     n, power = dr.width(start.ray.d), dr.max(start.β)
     most, rr = dr.opaque(mi.UInt32, min(max(max_depth, 0), UNLIMITED)), dr.opaque(mi.UInt32, rr_depth)

@@ -116,11 +116,11 @@ def image_pass(passes: Passes, begun: Begun, near, light, film: GradientFilm) ->
     """
     near, values, wavelengths = iter(near), begun.features, begun.start.ray.wavelengths
     # Emission that camera paths meet is counted with the first map, or without any.
-    L, Le = passes.frozen(light, passes.world, begun.start, next(near, None), True, fixed=True)
+    L, Le = passes.frozen(light, passes.world, begun.start, next(near, None), True)
     values |= {"primal": to_rgb(L + Le, wavelengths), "direct": to_rgb(Le, wavelengths)}
     dr.eval(values)
     for more in near:
-        L, _ = passes.frozen(light, passes.world, begun.start, more, False, fixed=True)
+        L, _ = passes.frozen(light, passes.world, begun.start, more, False)
         values["primal"] += to_rgb(L, wavelengths)
         dr.eval(values["primal"])
     film.put_all(values)

@@ -1,0 +1,231 @@
+"""Renders that were begun: whether a file has all that is asked for, and what is left to render of it.
+
+What is left gets a seed of its own, made of the one that is asked for and the number of parts that are there. So its
+samples are none of those in the file, and independent of them: means and variances of both are merged exactly as those
+of stacks with different seeds are (``ngpt.merging``). Whatever ends a part says nothing of its samples.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from data_gen.samplers import FRAME_SAMPLERS, find
+from ngpt.errors import NgptError
+from ngpt.io.exr import pass_through, read, write
+from ngpt.io.openexr import read_header
+from ngpt.io.whole import finished
+from ngpt.merging import DIAGNOSTICS, UNFINISHED, merge
+from ngpt.stack import GradientStack
+from ngpt.system.files import save
+from ngpt.windows import Window
+
+# Attributes: which scene a stack is of, and for how many seconds it was to be rendered
+SCENE, TIME = "ngpt:scene", "ngpt:time"
+# Points that the number of samples decides between are no other way to render.
+_EITHER = {"points=rounds", "points=sobol"}
+# Of a time, what is too little to go on for
+_NOTHING = 0.02
+# Samples per pixel that are too few to be shared out: what is left is rendered evenly then.
+SHARED = 32
+
+
+def frame_seed(seed: int, frame: int, use: int = 0) -> int:
+    """The seed of a frame: one of its own, whatever other frames are rendered; and of each use of it."""
+    # Entropy must not be negative, frames may be.
+    entropy = [seed, frame % 2**64]
+    return int(np.random.SeedSequence([*entropy, use] if use else entropy).generate_state(1, np.uint64)[0])
+
+
+def part_seed(seed: int, part: int) -> int:
+    """The seed of a part of a render; part 0 has the one that was asked for."""
+    return int(np.random.SeedSequence([seed, part, 0, 1]).generate_state(1, np.uint64)[0]) if part else seed
+
+
+def scene_name(scene: str, parameters: Mapping[str, str], *files: str | None) -> str:
+    """What a header says of a scene: its name, and a checksum of its file, of its parameters and of further ``files``.
+
+    Meshes and textures do not count. Raises NgptError for files that cannot be read.
+    """
+    digest = hashlib.sha256(repr(sorted(parameters.items())).encode())
+    for file in (scene, *files):
+        if file is not None and Path(file).is_file():
+            try:
+                digest.update(Path(file).read_bytes())
+            except OSError as error:
+                raise NgptError(f"{file}: cannot be read: {error.strerror or error}") from error
+    return f"{Path(scene).name} {digest.hexdigest()[:16]}"
+
+
+class Unfinished(NgptError):
+    """What failed amid a render, and the ``stack`` of the samples that were done by then."""
+
+    def __init__(self, message: str, stack: GradientStack):
+        super().__init__(message)
+        self.stack = stack
+
+
+@dataclass(frozen=True)
+class Rest:
+    """What is left of a render, of which so many ``parts`` are there."""
+
+    parts: int
+    spp: int | None
+    seconds: float | None
+    error: float | None
+    sampler: str
+    adaptive: str = ""  # the method that samples are shared out for
+
+    def method(self, asked: str | None) -> str | None:
+        """What samples are shared out for; None where they are not."""
+        return self.adaptive or (asked if self.error is not None else None)
+
+    def options(self, seed: int) -> dict[str, Any]:
+        """Of ``render_scene`` and ``render_frames``, what is not as it was asked for with this ``seed``."""
+        given = {"spp": self.spp, "seconds": self.seconds, "sampler": self.sampler}
+        return given | {"seed": part_seed(seed, self.parts)}
+
+
+@dataclass(frozen=True)
+class Asked:
+    """What is asked for; ``spp``, ``seconds`` and ``error`` end a render, whichever is reached first."""
+
+    scene: str
+    seed: int
+    sampler: str = "auto"
+    options: Mapping[str, Any] = field(default_factory=dict)
+    size: tuple[int, int] | None = None
+    spp: int | None = None
+    seconds: float | None = None
+    error: float | None = None
+    adaptive: str = ""  # the method that samples are shared out for
+    frame: int | None = None
+
+    def left(self, path: Path) -> Rest | None:
+        """What is left to render of the stack in a file, None where nothing is.
+
+        Raises NgptError where it is that of another render: scene, frame, seed, size, sampler or its options.
+        """
+        attributes, _ = read_header(path)
+        # With a crop window, the film that was asked for is the display window.
+        size = Window.of_box(attributes["displayWindow"]).size
+        seeds = str(attributes.get("ngpt:seed", "")).split()
+        sampler = str(attributes.get("ngpt:sampler", ""))
+        self._check(path, attributes, size, seeds, sampler)
+        done, took = (_number(attributes, name) for name in ("ngpt:spp", "ngpt:seconds"))
+        if self.spp is not None and done >= self.spp:
+            return None
+        given = took if UNFINISHED in attributes else max(took, _number(attributes, TIME))
+        if self.seconds is not None and given >= (1 - _NOTHING) * self.seconds:
+            return None
+        reached = _number(attributes, "ngpt:error") or math.inf
+        if self.error is not None and reached <= (1 + 1e-6) * self.error:  # headers have 32 bits
+            return None
+        if sampler in FRAME_SAMPLERS:
+            raise NgptError(
+                f"{path}: has {done:g} of {self.spp} samples per pixel, and sampler '{sampler}' cannot go on with a "
+                "frame; remove it, or pass --force"
+            )
+        spp = None if self.spp is None else self.spp - int(done)
+        even = spp is not None and spp < SHARED
+        return Rest(
+            len(seeds),
+            spp,
+            None if self.seconds is None else self.seconds - given,
+            None if self.error is None or even else 1 / math.sqrt(self.error**-2 - reached**-2),
+            sampler,
+            "" if even else str(attributes.get("ngpt:adaptive", self.adaptive)),
+        )
+
+    def done(self, path: Path) -> bool:
+        """Whether the file is there, whole, and has all that is asked for."""
+        with suppress(NgptError):
+            return finished(path) and self.left(path) is None
+        return False
+
+    def name(self, stack: GradientStack) -> None:
+        """Has the stack's header say what it is of, and for how long it was to be rendered."""
+        stack.attributes[SCENE] = self.scene
+        if self.seconds is not None:
+            stack.attributes[TIME] = self.seconds
+
+    def _check(self, path: Path, attributes: Mapping, size: tuple[int, int], seeds: list[str], sampler: str) -> None:
+        ours = [part_seed(self.seed, part) for part in range(max(len(seeds), 1))]
+        if self.frame is not None and self.sampler not in FRAME_SAMPLERS:
+            ours = [frame_seed(seed, self.frame) for seed in ours]
+        options = _options(str(attributes.get("ngpt:samplerOptions", "")))
+        entry = FRAME_SAMPLERS.get(self.sampler) or (None if self.sampler == "auto" else find(self.sampler))
+        wanted = _options(entry.unusual(entry.settings(self.options))) if entry else set()
+        for what, theirs, asked in (
+            ("scene", attributes.get(SCENE, self.scene), self.scene),
+            ("frame", attributes.get("ngpt:frame"), self.frame),
+            ("size", "{}x{}".format(*size), "{}x{}".format(*(self.size or size))),
+            ("seed", " ".join(seeds), " ".join(map(str, ours))),
+            ("sampler", sampler, sampler if self.sampler == "auto" else self.sampler),
+            ("options", options, wanted if entry else options),
+        ):
+            if theirs != asked:
+                raise NgptError(
+                    f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}; give another name, or "
+                    "--force in place of --skip-existing to replace it"
+                )
+
+
+def begun_stack(path: Path, diagnostics: bool) -> GradientStack:
+    """What a file has of a render; raises NgptError where the rest of it would have other channels."""
+    stack = read(path)
+    if diagnostics != any(name.startswith(DIAGNOSTICS) for name in pass_through(stack)):
+        has, remedy = ("none", "leave --diagnostics out") if diagnostics else ("some", "pass --diagnostics")
+        raise NgptError(f"{path}: has {has} of the channels that --diagnostics writes; {remedy}, or give another name")
+    return stack
+
+
+def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
+    """The stack of both parts; its header says of how it was ended what that of the ``rest`` says."""
+    whole = merge([begun, rest])
+    whole.attributes |= {name: rest.attributes[name] for name in (UNFINISHED, TIME) if name in rest.attributes}
+    # Errors fall with the root of the samples.
+    errors = [n for stack in (begun, rest) if (n := _number(stack.attributes, "ngpt:error"))]
+    if errors:
+        whole.attributes["ngpt:error"] = 1 / math.sqrt(sum(n**-2 for n in errors))
+    if "ngpt:adaptive" in rest.attributes:
+        whole.attributes["ngpt:adaptive"] = rest.attributes["ngpt:adaptive"]
+    return whole
+
+
+def write_part(path: Path, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None) -> GradientStack:
+    """Writes a stack, in place of the one that was ``begun`` and together with it; returns what is written.
+
+    Nothing that was rendered is lost: what cannot be written there goes elsewhere (``ngpt.system.files.save``).
+    """
+    if begun is not None:
+        try:
+            stack, overwrite = joined(begun, stack), True
+        except NgptError as error:
+            other = path.with_stem(f"{path.stem}.rest")
+            save(other, lambda path, overwrite: write(path, stack, overwrite=overwrite))
+            raise NgptError(f"{error}; what was rendered now is in {other}") from error
+    save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite), overwrite)
+    return stack
+
+
+def _text(value: Any) -> str:
+    value = ", ".join(sorted(value)) or "none" if isinstance(value, set) else value
+    return "unknown" if value in ("", None) else str(value)
+
+
+def _options(text: str) -> set[str]:
+    return {option for option in text.split(", ") if option} - _EITHER
+
+
+def _number(attributes: Mapping[str, Any], name: str) -> float:
+    """An attribute that is a number, else 0."""
+    value = attributes.get(name)
+    return float(value) if isinstance(value, int | float | np.number) and math.isfinite(value) else 0.0

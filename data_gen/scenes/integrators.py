@@ -1,0 +1,140 @@
+"""Mitsuba's integrators: what each is called, and which other one renders the same image where ours follow only that.
+
+Integrators for derivatives (``prb`` and its like) are written in Python. Their images are those of ``path`` and
+``volpath``, which our samplers follow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+import drjit as dr
+import mitsuba as mi
+
+from ngpt.errors import NgptError, stop_if_interrupted
+
+# By the names of their classes, since a loaded integrator does not know its plugin
+_PLUGINS = {
+    "PathIntegrator": "path",
+    "VolumetricPathIntegrator": "volpath",
+    "VolpathMisIntegratorImpl": "volpathmis",
+    "DirectIntegrator": "direct",
+    "DepthIntegrator": "depth",
+    "AOVIntegrator": "aov",
+    "MomentIntegrator": "moment",
+    "StokesIntegrator": "stokes",
+    "ParticleTracerIntegrator": "ptracer",
+    "PRBIntegrator": "prb",
+    "BasicPRBIntegrator": "prb_basic",
+    "PathProjectiveIntegrator": "prb_projective",
+    "DirectProjectiveIntegrator": "direct_projective",
+    "PRBVolpathIntegrator": "prbvolpath",
+    "BasicVolumetricPrimitiveRadianceFieldIntegrator": "volprim_rf_basic",
+}
+# What renders the same image; the second where emitters hide from the camera, which Mitsuba's projective ones do
+# otherwise
+_SAME = {
+    "prb": ("path", "path"),
+    "prb_basic": ("path", "path"),
+    "prb_projective": ("path", ""),
+    "direct_projective": ("path", ""),
+    "prbvolpath": ("volpath", "volpath"),
+}
+# Those that trace no paths from the camera
+_FROM_LAMPS = ("ptracer",)
+# Those that add channels, which a stack has no use for, to the colour of another
+AROUND = ("aov", "moment", "stokes")
+
+
+def plugin_name(integrator: mi.Integrator) -> str:
+    """The plugin name of an integrator, or the name of its class where it is not one of Mitsuba's."""
+    name = integrator.class_name()
+    if name not in _PLUGINS:  # What is written in Python gives the name of Mitsuba's class that it derives from.
+        name = type(integrator).__name__
+    return _PLUGINS.get(name, name)
+
+
+def same_image(plugin: str, hides: bool) -> str:
+    """The plugin that renders the image of ``plugin`` and is one to follow, or ``plugin`` itself.
+
+    ``hides``: emitters hide from the camera.
+    """
+    return _SAME.get(plugin, ("", ""))[hides] or plugin
+
+
+def followed(integrator: mi.Integrator) -> mi.Integrator:
+    """The integrator whose image is rendered in place of this one: one of the same image with the same depths, the one
+    within an ``aov``, ``moment`` or ``stokes``, or itself."""
+    name = plugin_name(integrator)
+    if name in AROUND and len(nested := _nested(integrator)) == 1:
+        return followed(nested[0])
+    hides = bool(getattr(integrator, "hide_emitters", False))
+    same = same_image(name, hides)
+    if same == name:
+        return integrator
+    depth = integrator.max_depth
+    depths = {"max_depth": -1 if depth >= 0x7FFFFFFF else depth, "rr_depth": integrator.rr_depth}
+    return mi.load_dict({"type": same, "hide_emitters": hides, **depths})
+
+
+def _nested(integrator: mi.Integrator) -> list[mi.Integrator]:
+    found: list[mi.Integrator] = []
+
+    class Inside(mi.TraversalCallback):
+        def put(self, name, value, *_):
+            if isinstance(value, mi.Integrator):
+                found.append(value)
+
+    integrator.traverse(Inside())
+    return found
+
+
+def lack(plugin: str, nested: int, from_camera: bool = True) -> str:
+    """Why an integrator around so many others renders no image for a stack, "" if it does.
+
+    ``from_camera``: it is one of those that trace paths from the camera, unless its name says otherwise.
+    """
+    if not from_camera or plugin in _FROM_LAMPS:
+        return (
+            f"integrator '{plugin}' does not trace paths from the camera, so it has no gradients; "
+            "give the scene a 'path' or 'volpath' integrator"
+        )
+    if plugin in AROUND and not nested:
+        return f"integrator '{plugin}' has no other in it, so it renders no colour; put a 'path' or 'volpath' into it"
+    return ""
+
+
+def check_integrator(integrator: mi.Integrator) -> None:
+    """Raises NgptError for an integrator that does not tell radiance along a camera ray."""
+    from_camera = isinstance(integrator, mi.SamplingIntegrator)
+    if reason := lack(plugin_name(integrator), len(_nested(integrator)), from_camera):
+        raise NgptError(reason)
+
+
+def own_estimate(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
+    """(sampler, ray, medium, active) -> what the integrator itself estimates along camera rays.
+
+    That raises NgptError where the integrator fails.
+    """
+    call = partial(integrator.sample, scene)
+    if isinstance(integrator, mi.CppADIntegrator):
+        # As ``mi.ad.integrators.common.ADIntegrator.render`` calls them
+        constant = {"mode": dr.ADMode.Primal, "scene": scene, "δL": None, "δaovs": None, "state_in": None}
+
+        def call(sampler, ray, medium, active):
+            with dr.suspend_grad():
+                return integrator.sample(sampler=sampler, ray=ray, depth=mi.UInt32(0), active=active, **constant)
+
+    def estimate(sampler, ray, medium, active) -> mi.Spectrum:
+        try:
+            return call(sampler, ray, medium, active)[0]
+        except Exception as error:
+            stop_if_interrupted(error)
+            why = " ".join(str(error).split())
+            raise NgptError(
+                f"integrator '{plugin_name(integrator)}' fails to estimate radiance ({type(error).__name__}: {why}); "
+                "give the scene a 'path' or 'volpath' integrator"
+            ) from error
+
+    return estimate

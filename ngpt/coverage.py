@@ -1,0 +1,57 @@
+"""Pixels that are empty: alpha is 0 there and the input has no light there, so a result has none either.
+
+Denoisers spread light over the edges of objects. On a transparent film every bright background would show it. Light is
+premultiplied by alpha, so light at alpha 0 is legal: fire and glare add to what is behind them. It stays, and so do the
+dark pixels among it.
+
+Light that a method spread into empty pixels may be missed beside them: where hair covers a tenth of each pixel, few
+samples find nothing in most pixels, all that they found lies in the others, and a method evens that out. To drop it
+would turn hair dark. So it goes back to the covered pixels around, in proportion to their alpha, as far as the input
+has more light there than is left.
+"""
+
+import numpy as np
+from scipy.ndimage import gaussian_filter, maximum_filter
+
+from ngpt.stack import GradientStack
+
+# Pixels around light at alpha 0 in which darkness may be chance, as the side of a square.
+_CHANCE = 5
+# Standard deviation, in pixels, of the window in which light goes back.
+_WINDOW = 2.0
+
+
+def empty_pixels(stack: GradientStack) -> np.ndarray:
+    """(H, W) booleans; none where most of the light is at alpha 0: such an alpha says nothing of what is there."""
+    if "alpha" not in stack:
+        return np.zeros((stack.height, stack.width), bool)
+    uncovered = stack["alpha"][..., 0] == 0
+    light = np.nan_to_num(np.abs(stack["primal"]).sum(axis=-1, dtype=np.float64), posinf=0.0)
+    dark = ~stack["primal"].any(axis=-1)
+    empty = uncovered & dark
+    if not empty.any() or 2 * light[uncovered].sum() > light.sum():
+        return np.zeros_like(empty)
+    return empty & ~maximum_filter(uncovered & ~dark, _CHANCE)
+
+
+def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
+    """A reconstruction (H, W, 3) of the stack's primal, with no light in its empty pixels; float32."""
+    empty = empty_pixels(stack)
+    if not image[empty].any():
+        return image
+    spread = np.where(empty[..., None], image, 0).astype(np.float64)
+    left = image - spread
+    owed, there = _around(np.nan_to_num(stack["primal"], posinf=0.0, neginf=0.0) - left), _around(spread)
+    spread *= np.clip(_over(owed, there), 0, 1)
+    alpha = np.clip(np.nan_to_num(stack["alpha"].astype(np.float64)), 0, 1)
+    return (left + alpha * _around(_over(spread, _around(alpha)))).astype(np.float32)
+
+
+def _around(values: np.ndarray) -> np.ndarray:
+    """(H, W, C), the sum over a Gaussian window around each pixel."""
+    return gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)
+
+
+def _over(values: np.ndarray, divisor: np.ndarray) -> np.ndarray:
+    """The quotient, 0 where the divisor is 0."""
+    return np.where(divisor != 0, values / np.where(divisor != 0, divisor, 1), 0)

@@ -1,0 +1,96 @@
+"""OIDN's devices and filters, which all threads of a process share: one thread uses them at a time.
+
+Two threads that set images of one filter would get each other's pixels. They lose no time by waiting, since OIDN works
+on all cores. To make a filter takes longer than to run it on a small image, so filters are kept.
+"""
+
+from collections.abc import Mapping
+from threading import Lock
+from typing import Any
+
+import numpy as np
+
+from ngpt.errors import NgptError
+from ngpt.system.forks import hold_while_forking
+
+# By the names of OIDN's devices in Python.
+DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
+# Filters that are kept: an image and its features, with two qualities, take five.
+_MOST = 8
+
+_lock = Lock()
+_devices: dict[str, Any] = {}
+_filters: dict[tuple, Any] = {}
+
+
+def filtered(
+    images: Mapping[str, np.ndarray], device: str = "auto", weights: bytes | None = None, **settings: Any
+) -> np.ndarray:
+    """The result of OIDN's filter "RT", (H, W, 3) float32.
+
+    ``images``    "color", "albedo" and "normal", those there are: (H, W, 3) float32, C-contiguous, of one size
+    ``device``    one of ``DEVICES``
+    ``weights``   in the place of OIDN's own, as a .tza file holds them
+    ``settings``  of the filter, by their names in ``mitsuba_oidn``; a quality by its name in ``mitsuba_oidn.Quality``
+
+    Raises NgptError with what OIDN says where it cannot.
+    """
+    import mitsuba_oidn
+
+    result = np.empty_like(next(iter(images.values())))
+    key = (device, weights, tuple(images), result.shape, tuple(settings.items()))
+    try:
+        with _lock:
+            # Out of those that are kept until it has worked: one that failed is not used again.
+            made = _filters.pop(key, None) or _made(device, weights, settings)
+            _run(_devices[device], made, images, result)
+            # Networks of the user's own are many, and as large as an image.
+            if weights is None:
+                _filters[key] = made
+            while len(_filters) > _MOST:
+                del _filters[next(iter(_filters))]
+    except (mitsuba_oidn.Error, RuntimeError, TypeError, ValueError) as error:
+        raise NgptError(f"OIDN cannot run on device '{device}': {' '.join(str(error).split())}") from error
+    return result
+
+
+def _made(device: str, weights: bytes | None, settings: Mapping[str, Any]) -> Any:
+    import mitsuba_oidn
+
+    if device not in _devices:
+        _devices[device] = mitsuba_oidn.Device(getattr(mitsuba_oidn.DeviceType, DEVICES[device]))
+    made = _devices[device].new_filter("RT")
+    if weights is not None:
+        made.set_data("weights", weights)
+    for name, value in settings.items():
+        setattr(made, name, getattr(mitsuba_oidn.Quality, value) if name == "quality" else value)
+    return made
+
+
+def _run(device: Any, made: Any, images: Mapping[str, np.ndarray], result: np.ndarray) -> None:
+    """Arrays are used where they lie if the device can, and by buffers otherwise; the filter keeps none of them."""
+    height, width = result.shape[:2]
+    buffers = {}
+    for name, image in {**images, "output": result}.items():
+        if device.can_share(image):
+            made.set_image(name, image)
+            continue
+        import mitsuba_oidn
+
+        buffers[name] = device.new_buffer(image.nbytes)
+        if name != "output":
+            buffers[name].write(image)
+        made.set_image(name, buffers[name], format=mitsuba_oidn.Format.Float3, width=width, height=height)
+    made.execute()
+    if "output" in buffers:
+        buffers["output"].read(result)
+    for name in (*images, "output"):
+        made.unset_image(name)
+
+
+def _drop() -> None:
+    _filters.clear()
+    _devices.clear()
+
+
+hold_while_forking(_lock, _drop)

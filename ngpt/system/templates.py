@@ -1,0 +1,85 @@
+"""Configurations to start from: all that could be set, each with its meaning and its default, as comments.
+
+What a parameter means stands once, in the docstring of its dataclass: ``name``  meaning.
+"""
+
+import re
+import textwrap
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, fields
+from inspect import cleandoc
+from typing import Any
+
+# The head of a table, [name], or of one of several, [[name]]
+_HEAD = r"^\[+([\w-]+)[\w.-]*\]+ *(?:#.*)?$"
+
+
+def entries(kind: type) -> list[tuple[tuple[str, ...], str]]:
+    """The parameters that share an entry of the docstring, and what it says: ``one``, ``two``  meaning."""
+    found: list[tuple[tuple[str, ...], str]] = []
+    inside = False
+    for line in cleandoc(kind.__doc__ or "").splitlines():
+        if entry := re.match(r"((?:``\w+``, )*``\w+``)(?:  +(.*))?$", line):
+            found.append((tuple(re.findall(r"``(\w+)``", entry[1])), entry[2] or ""))
+        elif line.startswith(" ") and inside:
+            names, meaning = found[-1]
+            found[-1] = names, f"{meaning} {line.strip()}".strip()
+        inside = bool(entry) or (inside and line.startswith(" "))
+    return found
+
+
+def template(text: str, tables: Mapping[str, type], others: Mapping[str, Mapping[str, tuple[str, Any]]] = {}) -> str:
+    """A configuration, with a comment for every parameter that it leaves at its default: what it means, and what that
+    is. What is set by it stays as it is.
+
+    ``tables``  dataclasses of the tables, by name; "" is the top
+    ``others``  further parameters of a table by name: meaning and default
+    """
+    given = tomllib.loads(text)
+    heads = [match.start() for match in re.finditer(_HEAD, text, re.M)]
+    sections = [text[start:end] for start, end in zip([0, *heads], [*heads, len(text)], strict=True)]
+    present = [match[1] if (match := re.match(_HEAD, section, re.M)) else "" for section in sections]
+    for table in tables:
+        if table not in present:
+            sections.append(f"[{table}]\n")
+            present.append(table)
+    lines = []
+    for table, section in zip(present, sections, strict=True):
+        rest = ""
+        if table in tables:
+            values = given.get(table, {}) if table else given
+            rest = _commented(tables[table], {*values, *tables}, others.get(table, {}))
+        lines.append(f"{section.rstrip()}\n{rest}\n")
+    return "\n".join(line.rstrip("\n") + "\n" for line in lines)
+
+
+def _commented(kind: type, given: set[str], others: Mapping[str, tuple[str, Any]]) -> str:
+    """Lines for the parameters of a dataclass, and ``others``, that are not ``given``."""
+    told = entries(kind)
+    explained = {name for names, _ in told for name in names}
+    known = [field for field in fields(kind) if not field.metadata.get("internal")]
+    told += [((field.name,), "") for field in known if field.name not in explained]
+    told += [((name,), meaning) for name, (meaning, _) in others.items()]
+    defaults = {field.name: _default(field) for field in known}
+    defaults |= {name: default for name, (_, default) in others.items()}
+    lines = []
+    for names, meaning in told:
+        if left := [name for name in names if name not in given]:
+            words = meaning.replace("``", "").partition("\n")[0]
+            lines += textwrap.wrap(words, 116, initial_indent="# ", subsequent_indent="#   ")
+            lines += [f"# {name} = {toml(defaults[name])}" for name in left]
+    return "\n".join(lines)
+
+
+def _default(field: Any) -> Any:
+    return field.default if field.default_factory is MISSING else field.default_factory()
+
+
+def toml(value: Any) -> str:
+    """A value as TOML has it."""
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, tuple):
+        return f"[{', '.join(map(toml, value))}]"
+    return f'"{value}"' if isinstance(value, str) else repr(value)

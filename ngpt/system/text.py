@@ -1,0 +1,57 @@
+"""Text of elsewhere, fit to be shown: names in files may hold what controls a terminal, or hides and turns text."""
+
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from html import escape
+
+from ngpt.errors import NgptError
+
+# Letters that show nothing, of those that Python counts as printable: fillers, joiners and selectors of variants.
+# [Unicode 15, property Default_Ignorable_Code_Point]
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\ufff0-\ufff8\U000e0000-\U000e0fff]"
+)
+
+
+# Files that stand for what has no file, by path: what it is called in all that is said.
+_names: dict[str, str] = {}
+
+
+@contextmanager
+def called(path: str, name: str) -> Iterator[None]:
+    """Within the block messages and results say ``name`` for the file ``path``, and so do errors that leave it."""
+    _names[path] = name
+    try:
+        yield
+    except NgptError as error:
+        raise type(error)(by_names(str(error))) from error
+    finally:
+        del _names[path]
+
+
+def by_names(text: str) -> str:
+    """The text with the names of files that are ``called`` by others."""
+    for path, name in _names.items():
+        text = text.replace(path, name)
+    return text
+
+
+def printable(text: str) -> str:
+    """One line of text in which every letter is seen, and in its place.
+
+    Control characters, line breaks, marks of direction (U+202E turns what follows around) and letters that show nothing
+    become what Python writes for them, ``\\x1b`` and ``\\u202e``. Files go by what they are ``called``.
+    """
+    text = by_names(text)
+    if text.isprintable() and not _INVISIBLE.search(text):
+        return text
+    return "".join(
+        letter if letter.isprintable() and not _INVISIBLE.match(letter) else letter.encode("unicode_escape").decode()
+        for letter in text
+    )
+
+
+def markup(text: str) -> str:
+    """The same as part of a page, text or the value of an attribute."""
+    return escape(printable(text))

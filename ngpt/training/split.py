@@ -1,0 +1,79 @@
+"""Which crops a network is trained on, and which it is measured by: whole scenes on either side."""
+
+import hashlib
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from ngpt.errors import NgptError
+
+# Names that a message lists before it says "..."
+_LISTED = 8
+
+
+class Split(NamedTuple):
+    """``training`` and ``held_out`` crops, and one line that says which were set aside ("" where nothing is split)."""
+
+    training: list[Any]
+    held_out: list[Any]
+    told: str
+
+
+def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float = 0.0) -> Split:
+    """Sets whole scenes aside for validation: those whose names begin with one of ``validation``.
+
+    Where that names none, it is a ``share`` of the scenes, at least one. A hash of the names chooses them, so that the
+    same set is always split the same way. Of a single scene it is a share of the crops; a single crop is trained on.
+
+    Pairs of scenes that are set aside are in neither part: they have no reference to measure by.
+
+    Raises NgptError for a name that no scene begins with: such a run would be judged by nothing, or by less than asked.
+    """
+    scenes = sorted({crop.scene for crop in crops})
+    if not scenes:
+        return Split([], [], "")
+    for name in validation:
+        if not any(scene.startswith(name) for scene in scenes):
+            raise NgptError(
+                f"data.validation: no scene has a name that begins with '{name}'; there are {_listed(scenes)}. "
+                "--set data.validation='[]' sets a share of the scenes aside"
+            )
+    if not validation and not share:
+        return Split(list(crops), [], "validation: nothing is set aside (data.validation_share = 0)")
+    measurable = [crop for crop in crops if not crop.paired]
+    known = sorted({crop.scene for crop in measurable})
+    if not validation and len(known) == 1:
+        return _of_one_scene(list(crops), measurable, share)
+    if not known and not validation:
+        return Split(list(crops), [], "validation: nothing is set aside, since pairs have no reference")
+    apart = {scene for scene in scenes if scene.startswith(validation)} if validation else _chosen(known, share)
+    training = [crop for crop in crops if crop.scene not in apart]
+    held_out = [crop for crop in measurable if crop.scene in apart]
+    told = (
+        f"validation: {len(apart)} of {len(scenes)} scenes set aside, {len(held_out)} crops: {_listed(sorted(apart))}"
+    )
+    return Split(training, held_out, told)
+
+
+def _of_one_scene(crops: list[Any], measurable: list[Any], share: float) -> Split:
+    """Crops of one scene show the same things, so their errors are lower than those of another scene would be."""
+    scene, number = measurable[0].scene, len(measurable)
+    count = min(_count(number, share), number - 1)
+    if not count:
+        return Split(crops, [], f"validation: nothing is set aside, since only one crop has a reference ('{scene}')")
+    held_out = [measurable[i * number // count] for i in range(count)]
+    told = f"validation: {count} of {number} crops set aside, of '{scene}' as are the others: there is no second scene"
+    return Split([crop for crop in crops if crop not in held_out], held_out, told)
+
+
+def _chosen(scenes: list[str], share: float) -> set[str]:
+    """A share of the scenes. Those chosen first stay chosen when a set grows, unless a newcomer precedes them."""
+    ordered = sorted(scenes, key=lambda name: hashlib.sha256(name.encode()).hexdigest())
+    return set(ordered[: min(_count(len(scenes), share), len(scenes) - 1)])
+
+
+def _count(number: int, share: float) -> int:
+    return max(1, round(share * number))
+
+
+def _listed(names: list[str]) -> str:
+    return ", ".join(names[:_LISTED]) + (", ..." if len(names) > _LISTED else "")

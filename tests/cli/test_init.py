@@ -1,0 +1,96 @@
+"""--init of train, dataset and evaluate: a configuration of one's own, with all that could be set."""
+
+import re
+import tomllib
+from dataclasses import fields, replace
+from pathlib import Path
+
+import pytest
+
+from ngpt.cli import main
+from ngpt.system import configs
+from ngpt.system.templates import template
+
+pytest.importorskip("torch")
+
+from data_gen.dataset.config import Config as DataConfig
+from data_gen.dataset.config import read_config as read_data
+from ngpt.evaluation.config import Config as EvaluationConfig
+from ngpt.evaluation.config import read_config as read_evaluation
+from ngpt.training.loss import make_loss
+from ngpt.training.parameters import TABLES
+from ngpt.training.settings import read_settings
+
+KINDS = {"train": configs.TRAINING, "dataset": configs.DATASET, "evaluate": configs.EVALUATION}
+READERS = {"train": read_settings, "dataset": read_data, "evaluate": read_evaluation}
+ALL = [(verb, name) for verb, kind in KINDS.items() for name in configs.names(kind)]
+
+
+def keys(verb: str) -> set[str]:
+    """All that can be set: "table.key"."""
+    if verb == "train":
+        return {
+            f"{table}.{field.name}"
+            for table, kind in TABLES.items()
+            for field in fields(kind)
+            if table or field.name not in TABLES
+        }
+    kind = DataConfig if verb == "dataset" else EvaluationConfig
+    return {f".{field.name}" for field in fields(kind) if field.name != "sampler_options"}
+
+
+def found(verb: str, text: str) -> set[str]:
+    """The keys that a file sets or offers."""
+    result, table = set(), ""
+    for line in text.splitlines():
+        if head := re.match(r"\[+([\w-]+)", line):
+            table = head[1]
+            result.add(f".{table}")
+        elif key := re.match(r"(?:# )?(\w+) = ", line):
+            result.add(f"{table}.{key[1]}")
+    return result
+
+
+@pytest.mark.parametrize(("verb", "name"), ALL)
+def test_it_is_the_configuration_and_offers_all_that_could_be_set(verb, name, tmp_path, capsys):
+    """Read back it gives the same settings, and again with everything that it offers."""
+    path, offered = tmp_path / "mine.toml", tmp_path / "offered.toml"
+    assert main([verb, "--config", name, "--init", str(path)]) == 0
+    assert f"ngpt {verb} --config {path} --out DIR" in capsys.readouterr().err
+    read, text = READERS[verb], path.read_text()
+    given = read(configs.find_config(name, KINDS[verb]))
+    assert read(path) == given
+    assert keys(verb) <= found(verb, text)
+    offered.write_text(re.sub(r"^# (\w+ = .*)$", r"\1", text, flags=re.M))
+    assert offered.read_text() != text
+    everything = read(offered)
+    if verb == "train":
+        assert make_loss(everything.loss).settings == make_loss(given.loss).settings
+        everything, given = replace(everything, loss={}), replace(given, loss={})
+    assert everything == given
+
+
+@pytest.mark.parametrize("verb", KINDS)
+def test_without_a_configuration_it_begins_with_one_that_is_shipped(verb, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    assert main([verb, "--init", "mine.toml"]) == 0
+    assert READERS[verb]("mine.toml") == READERS[verb](configs.find_config(configs.STARTS[KINDS[verb]], KINDS[verb]))
+    capsys.readouterr()
+    assert main([verb, "--init", "mine.toml"]) == 1 and "exists already" in capsys.readouterr().err
+    assert main([verb, "--out", "x"]) == 2 and "--config is missing: a TOML file, or" in capsys.readouterr().err
+    assert main([verb, "--config", "mine.toml"]) == 2 and "--out is missing" in capsys.readouterr().err
+    assert [path.name for path in Path().iterdir()] == ["mine.toml"]
+
+
+def test_what_no_docstring_explains_is_offered_too():
+    """Such as a weight that somebody adds to the loss."""
+    from dataclasses import make_dataclass
+
+    kind = make_dataclass("Kind", [("told", int, 1), ("untold", tuple, (2.5, "x"))])
+    kind.__doc__ = "Something.\n\n``told``  is told\n"
+    text = template("# Mine.\n[a]\n# b\nx = [\n  [1],\n]\n[[b]]\nz = 1\n", {"": kind, "a": kind})
+    assert tomllib.loads(text) == {"a": {"x": [[1]]}, "b": [{"z": 1}]}
+    offered = tomllib.loads(re.sub(r"^# (\w+ = .*)$", r"\1", text, flags=re.M))
+    default = {"told": 1, "untold": [2.5, "x"]}
+    assert offered == default | {"a": {"x": [[1]]} | default, "b": [{"z": 1}]}
+    assert text.count("# is told\n# told = 1\n# untold = ") == 2

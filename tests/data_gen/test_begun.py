@@ -1,0 +1,236 @@
+"""What is there of a render counts as far as it goes: the same command goes on with it, and takes no other for it."""
+
+import math
+
+import numpy as np
+import pytest
+
+import ngpt
+from data_gen import begun
+from data_gen.begun import Asked, Rest, frame_seed, part_seed, scene_name
+from data_gen.cli import render
+from data_gen.session import render_scene
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.stack import GradientStack
+
+SIZE = ["--size", "16x12"]
+
+
+def there(path, **attributes):
+    """A file of a render of 16x12 pixels by `gpt`."""
+    names = {"spp": 336, "seed": "3", "sampler": "gpt", "seconds": 14.0, "scene": "box 1"} | attributes
+    stack = GradientStack({"primal": np.ones((12, 16, 3), np.float32)})
+    stack.attributes.update({f"ngpt:{name}": value for name, value in names.items()})
+    return ngpt.write(path, stack, overwrite=True)
+
+
+def test_a_file_is_finished_where_it_has_what_is_asked_for(tmp_path):
+    path = there(tmp_path / "a.exr")
+    assert Asked("box 1", 3, spp=336).left(path) is None
+    assert Asked("box 1", 3, spp=100_000, size=(16, 12), sampler="gpt").left(path) == Rest(1, 99_664, None, None, "gpt")
+    # A time that is over, though a few seconds of it were left; one that was broken off; and a longer one.
+    there(path, time=15.0)
+    assert Asked("box 1", 3, seconds=15.0).left(path) is None
+    assert Asked("box 1", 3, seconds=20.0).left(path).seconds == 5.0
+    there(path, time=15.0, unfinished="interrupted")
+    assert Asked("box 1", 3, seconds=15.0).left(path).seconds == pytest.approx(1.0)
+    assert Asked("box 1", 3, spp=300, seconds=15.0).left(path) is None
+    # An error: of two parts with 0.1 and e together it is 0.06.
+    there(path, error=0.1, adaptive="wcv")
+    assert Asked("box 1", 3, error=0.1).left(path) is None
+    rest = Asked("box 1", 3, error=0.06).left(path)
+    assert rest.adaptive == "wcv" and 1 / math.hypot(1 / rest.error, 10) == pytest.approx(0.06)
+    assert Asked("box 1", 3, spp=340, error=0.06).left(path) == Rest(1, 4, None, None, "gpt")
+    # An adaptive render that was broken off before a sample was shared out
+    there(path, unfinished="interrupted")
+    assert Asked("box 1", 3, spp=400, adaptive="auto").left(path).adaptive == "auto"
+    there(path, seed=f"3 {part_seed(3, 1)}", samplerOptions="points=rounds")
+    assert Asked("box 1", 3, spp=400).left(path).options(3)["seed"] == part_seed(3, 2)
+
+
+def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
+    path = there(tmp_path / "a.exr", samplerOptions="lamps=uniform")
+    for what, asked in {
+        "scene box 1, not box 2": Asked("box 2", 3, spp=9),
+        "size 16x12, not 16x16": Asked("box 1", 3, size=(16, 16), spp=9),
+        "seed 3, not 4": Asked("box 1", 4, spp=9),
+        "sampler gpt, not primal": Asked("box 1", 3, "primal", spp=9),
+        "options lamps=uniform, not none": Asked("box 1", 3, "gpt", spp=9),
+        "frame unknown, not 7": Asked("box 1", 3, frame=7, spp=9),
+    }.items():
+        with pytest.raises(NgptError, match=rf"a.exr: is another render: {what};"):
+            asked.left(path)
+    ngpt.write(path, np.ones((2, 2, 3), np.float32), overwrite=True)
+    with pytest.raises(NgptError, match="seed unknown, not 3"):
+        Asked("box 1", 3, spp=1).left(path)
+
+
+def test_parts_and_frames_have_seeds_of_their_own(tmp_path):
+    seeds = [part_seed(seed, part) for seed in range(4) for part in range(5)]
+    frames = [frame_seed(seed, frame, use) for seed in range(4) for frame in range(5) for use in (0, 1)]
+    assert len({*seeds, *frames}) == len(seeds) + len(frames) and seeds[5] == 1
+    scene = tmp_path / "box.xml"
+    scene.write_text("<scene/>")
+    names = [scene_name(str(scene), {}), scene_name(str(scene), {"a": "1"})]
+    scene.write_text("<scene> </scene>")
+    names.append(scene_name(str(scene), {}))
+    assert len(set(names)) == 3 and all(name.startswith("box.xml ") for name in names)
+
+
+def test_the_same_command_goes_on_and_then_is_done(renderer, tmp_path, capsys):
+    target, words = tmp_path / "it.exr", ["render", "diffuse", *SIZE, "--seed", "3", "--sampler", "gpt"]
+    from data_gen.adaptive import LEAST
+
+    assert begun.SHARED == LEAST
+    assert main([*words, "--spp", "16", "-o", str(target)]) == 0
+    first = ngpt.read(target)
+    on = [*words, "--spp", "48", "--skip-existing", "-o", str(target)]
+    assert main(on) == 0
+    assert "has 16 samples per pixel; going on with it" in capsys.readouterr().err
+    whole = ngpt.read(target)
+    assert whole.attributes["ngpt:spp"] == 48 and whole.attributes["ngpt:seed"] == f"3 {part_seed(3, 1)}"
+    # The samples that were there, and others: to the bit what merging them gives.
+    rest = tmp_path / "rest.exr"
+    assert main([*words[:-4], "--seed", str(part_seed(3, 1)), "--sampler", "gpt", "--spp", "32", "-o", str(rest)]) == 0
+    merged = ngpt.merge([first, ngpt.read(rest)])
+    assert all(np.array_equal(whole[name], merged[name], equal_nan=True) for name in merged.names)
+    data = target.read_bytes()
+    capsys.readouterr()
+    assert main(on) == 0 and "skipped: the stack is there" in capsys.readouterr().err
+    assert main([*on, "--seed", "4"]) == 1 and "seed 3 " in capsys.readouterr().err
+    assert main([*on, "-D", "a=1"]) == 1 and "another render: scene" in capsys.readouterr().err
+    assert target.read_bytes() == data
+
+
+@pytest.mark.parametrize("more", [["--adaptive"], ["--error", "0.001"]])
+def test_samples_that_are_shared_out_go_on_so(renderer, tmp_path, more):
+    target = tmp_path / "it.exr"
+    words = ["render", "diffuse", *SIZE, "--sampler", "gpt", *more, "--skip-existing", "-o", str(target)]
+    assert main([*words, "--spp", "32"]) == 0
+    assert main([*words, "--spp", "80"]) == 0
+    found = ngpt.read(target)
+    assert found.attributes["ngpt:spp"] == 80 and len(found.attributes["ngpt:seed"].split()) == 2
+    assert found.attributes["ngpt:adaptive"] and "samples" in found
+
+
+def test_frames_go_on_too(renderer, tmp_path, capsys):
+    words = ["render", "diffuse", "--frames", "0:3", *SIZE, "--sampler", "gpt", "-o", str(tmp_path / "shot")]
+    assert main([*words, "--spp", "4"]) == 0
+    (tmp_path / "shot/diffuse.0001.exr").unlink()
+    assert main([*words, "--spp", "12", "--skip-existing"]) == 0
+    stacks = [ngpt.read(tmp_path / f"shot/diffuse.{frame:04d}.exr") for frame in range(3)]
+    assert [stack.attributes["ngpt:spp"] for stack in stacks] == [12, 12, 12]
+    assert [len(stack.attributes["ngpt:seed"].split()) for stack in stacks] == [2, 1, 2]
+    assert all("motion" in stack and stack.attributes["ngpt:frame"] == i for i, stack in enumerate(stacks))
+    capsys.readouterr()
+    assert main([*words, "--spp", "12", "--skip-existing"]) == 0
+    assert "3 of 3 frames were skipped" in capsys.readouterr().err
+    assert main([*words, "--spp", "12", "--seed", "1", "--skip-existing"]) == 1
+    assert "diffuse.0000.exr: is another render: seed" in capsys.readouterr().err
+
+
+def test_a_frame_that_is_broken_off_is_kept_and_gone_on_with(renderer, tmp_path, monkeypatch):
+    from data_gen import passes
+    from data_gen.shot_files import write_frames
+
+    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 12 * 16)  # several passes
+    files = {frame: tmp_path / f"{frame}.exr" for frame in range(2)}
+    asked = {"size": (16, 12), "sampler": "gpt", "spp": 64, "skip_existing": True}
+    written = write_frames("diffuse", files, stop=lambda: True, **asked)
+    assert written.interrupted == 0 and written.frames[0]["spp"] == 16 and not files[1].exists()
+    assert ngpt.read(files[0]).attributes["ngpt:unfinished"] == "interrupted"
+    written = write_frames("diffuse", files, **asked)
+    assert written.interrupted is None and written.skipped == 0
+    for file in files.values():
+        attributes = ngpt.read(file).attributes
+        assert attributes["ngpt:spp"] == 64 and "ngpt:unfinished" not in attributes
+
+
+def failing(monkeypatch, passes_before):
+    """Has the sampler `gpt` fail after so many passes."""
+    from data_gen import passes
+    from data_gen.film import GradientFilm
+
+    monkeypatch.setattr(passes, "FIRST_LANES", 16 * 12 * 16)
+    end, ended = GradientFilm.end_pass, []
+
+    def end_pass(film, *args):
+        if film._pass and len(ended) == passes_before:
+            raise RuntimeError("the device is gone")
+        ended.append(1) if film._pass else None
+        end(film, *args)
+
+    monkeypatch.setattr(GradientFilm, "end_pass", end_pass)
+
+
+def test_a_pass_that_fails_takes_none_before_it_along(renderer, tmp_path, monkeypatch, capsys):
+    target = tmp_path / "it.exr"
+    words = ["render", "diffuse", *SIZE, "--sampler", "gpt", "--spp", "64", "-o", str(target)]
+    with monkeypatch.context() as patched:
+        failing(patched, 1)
+        assert main(words) == 1
+    assert f"the device is gone; {target} has the 16 samples per pixel done before" in capsys.readouterr().err
+    kept = ngpt.read(target)
+    assert kept.attributes["ngpt:spp"] == 16 and kept.attributes["ngpt:unfinished"] == "failed"
+    assert main([*words[:-4], "--spp", "16", "-o", str(tmp_path / "same.exr")]) == 0
+    same = ngpt.read(tmp_path / "same.exr")
+    assert np.allclose(kept["primal"], same["primal"], rtol=0.5, atol=0.1)
+    assert main([*words, "--skip-existing"]) == 0 and ngpt.read(target).attributes["ngpt:spp"] == 64
+    # One that fails at first leaves nothing.
+    with monkeypatch.context() as patched:
+        failing(patched, 0)
+        with pytest.raises(RuntimeError):
+            main([*words[:-1], str(tmp_path / "none.exr")])
+    assert not (tmp_path / "none.exr").exists()
+
+
+def test_what_was_rendered_is_kept_where_it_cannot_be_written(renderer, tmp_path, monkeypatch, capsys):
+    target = tmp_path / "asked" / "it.exr"
+    target.parent.mkdir()
+    monkeypatch.chdir(tmp_path)
+
+    def moved(*args, **given):
+        target.parent.rename(tmp_path / "moved")
+        return render_scene(*args, **given)
+
+    monkeypatch.setattr(render, "render_scene", moved)
+    words = ["render", "diffuse", *SIZE, "--sampler", "primal", "--spp", "4", "-o", str(target)]
+    assert main(words) == 1
+    assert f"what was made is kept in {tmp_path / 'it.kept.exr'}" in capsys.readouterr().err
+    assert ngpt.read(tmp_path / "it.kept.exr").attributes["ngpt:spp"] == 4
+
+
+def test_light_that_overflows_ends_no_render_that_somebody_looks_at(renderer, tmp_path, capsys):
+    from data_gen.cli import onlook
+
+    scene = tmp_path / "nan.xml"
+    scene.write_text(
+        '<scene version="3.0.0"><integrator type="path"/><sensor type="perspective"><film type="hdrfilm">'
+        '<integer name="width" value="24"/><integer name="height" value="16"/></film></sensor>'
+        '<emitter type="constant"><rgb name="radiance" value="3e38 3e38 3e38"/></emitter></scene>'
+    )
+    target = tmp_path / "it.exr"
+    words = ["render", str(scene), "--sampler", "gpt", "--spp", "32", "-o", str(target)]
+
+    class Page:
+        watched, enough, ended = True, False, False
+
+        def tell(self, line):
+            pass
+
+        def show(self, preview, caption):
+            raise MemoryError
+
+        def close(self, line):
+            raise OSError("gone")
+
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(onlook, "onlookers", lambda *args: onlook.Onlookers(Page(), None, args[4].say, "spp"))
+        assert main([*words, "--live"]) == 0
+    told = [line for line in capsys.readouterr().err.splitlines() if "the render goes on" in line]
+    assert len(told) == 1 and told[0].startswith("no image for who looks on: ") and target.exists()
+    target.unlink()
+    assert main([*words, "--adaptive"]) == 1
+    assert f"; {target} has the 16 samples per pixel done before" in capsys.readouterr().err
+    assert ngpt.read(target).attributes["ngpt:spp"] == 16

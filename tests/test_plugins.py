@@ -1,0 +1,273 @@
+"""Methods, samplers, losses and metrics of other packages, by entry points: the packages are those of the pages."""
+
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+from full_stack import full_stack
+
+import ngpt
+from data_gen.samplers import SAMPLERS
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.measure.metrics import METRICS
+from ngpt.methods import METHODS
+
+ROOT = Path(__file__).parents[1]
+PAGES = {
+    "method": "docs/methods/add-a-method.md",
+    "sampler": "docs/samplers/add-a-sampler.md",
+    "loss": "docs/train/add-a-loss.md",
+}
+
+
+def install(folder: Path, name: str, groups: dict[str, dict[str, str]]) -> None:
+    """What an installation of a package leaves beside its code, in a folder of sys.path."""
+    info = folder / f"{name.replace('-', '_')}-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: 1.0\n")
+    lines = [
+        line
+        for group, found in groups.items()
+        for line in [f"[{group}]", *(f"{point} = {target}" for point, target in found.items())]
+    ]
+    (info / "entry_points.txt").write_text("\n".join(lines) + "\n")
+
+
+def install_page(folder: Path, page: str) -> None:
+    """The packages of a page: blocks of code that begin with the name of a file; pyproject.toml ends one."""
+    for code in re.findall(r"```(?:python|toml)\n(# .*?)```", (ROOT / page).read_text(), re.S):
+        file = code.partition("\n")[0].removeprefix("# ")
+        if file == "pyproject.toml":
+            project = tomllib.loads(code)["project"]
+            install(folder, project["name"], project["entry-points"])
+        elif file.startswith("ngpt_"):
+            (folder / file).parent.mkdir(exist_ok=True)
+            (folder / file).write_text(code)
+
+
+@pytest.fixture
+def site(tmp_path, monkeypatch):
+    """A folder of packages; what is imported from there is forgotten in the end."""
+    folder = tmp_path / "site"
+    folder.mkdir()
+    monkeypatch.syspath_prepend(folder)
+    modules = set(sys.modules)
+    registries = [METHODS, METRICS, SAMPLERS]
+    if "torch" in sys.modules:
+        from ngpt.training.loss import TERMS
+
+        registries.append(TERMS)
+    yield folder
+    for registry in registries:
+        for name in registry._imported:
+            del registry[name]
+        registry._imported.clear()
+    for name in set(sys.modules) - modules:
+        if str(folder) in str(getattr(sys.modules[name], "__file__", "")):
+            del sys.modules[name]
+
+
+@pytest.fixture
+def stack_file(tmp_path):
+    ngpt.write(tmp_path / "stack.exr", full_stack(18, 26))
+    return str(tmp_path / "stack.exr")
+
+
+def test_the_method_of_the_page(site, stack_file, tmp_path, capsys):
+    install_page(site, PAGES["method"])
+    image = str(tmp_path / "image.exr")
+    assert main(["denoise", stack_file, "-o", image, "--method", "median", "-O", "size=5"]) == 0
+    assert ": median, " in capsys.readouterr().err
+    stack = ngpt.read(stack_file)
+    assert not (ngpt.denoise(stack, "median") == ngpt.denoise(stack, "primal")).all()
+    assert main(["info", "median"]) == 0 and "pixels of its side" in capsys.readouterr().out
+    for lists in ([], [stack_file]):
+        assert main(["info", *lists]) == 0 and "median" in capsys.readouterr().out
+    assert main(["denoise", stack_file, "-o", image, "-m", "median", "-O", "size=x", "--force"]) == 2
+    assert "method 'median', option 'size': 'x' is not allowed" in capsys.readouterr().err
+
+
+def test_the_metric_of_the_page(site, stack_file, capsys):
+    install_page(site, PAGES["method"])
+    assert main(["diff", stack_file, stack_file]) == 0
+    assert re.search(r"^bias +0$", capsys.readouterr().out, re.M)
+
+
+def test_the_page_of_methods_says_what_to_write_into_ngpt():
+    """Its third block of Python, with what the module has."""
+    from types import ModuleType
+
+    from ngpt.methods import Method
+    from ngpt.options import Option
+
+    first, third, _ = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["method"]).read_text(), re.S)
+    module = ModuleType("ngpt.denoisers.median")
+    exec(first, module.__dict__)
+    made = {"Method": Method, "Option": Option}
+    sys.modules[module.__name__] = module
+    try:
+        exec(third, made)
+    finally:
+        del sys.modules[module.__name__]
+    assert made["_OURS"]["median"] == module.METHOD or made["_OURS"]["median"].run is module.median
+    assert "_OURS = {" in (ROOT / "ngpt" / "methods.py").read_text()
+
+
+def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
+    """It is random replay, to the last bit."""
+    install_page(site, PAGES["sampler"])
+    for sampler in ("replay", "gpt-basic"):
+        call = ["render", "diffuse", "--sampler", sampler, "--spp", "2", "--size", "12x8"]
+        assert main([*call, "-o", str(tmp_path / f"{sampler}.exr")]) == 0, capsys.readouterr().err
+    ours, theirs = (ngpt.read(tmp_path / f"{name}.exr") for name in ("replay", "gpt-basic"))
+    assert ours.names == theirs.names and all((ours[n] == theirs[n]).all() for n in ("primal", "dx", "dy"))
+    assert main(["info", "replay"]) == 0 and "gradients by random replay" in capsys.readouterr().out
+    from data_gen.code import code
+
+    before = code("replay")
+    (site / "ngpt_replay" / "replay.py").write_text("changed = 1\n")
+    assert code("replay") != before
+
+
+def test_the_page_of_samplers_says_what_to_write_into_ngpt(monkeypatch):
+    from data_gen import samplers
+
+    *_, entry = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["sampler"]).read_text(), re.S)
+    monkeypatch.delitem(samplers.SAMPLERS, "replay", raising=False)
+    exec(entry, {})
+    assert samplers.SAMPLERS.pop("replay").module == "data_gen.samplers.teaching.replay"
+
+
+@pytest.mark.parametrize("changes", [["loss.squared=0.5"], ["loss.kind=squared", "loss.relative=0", "loss.gradient=0"]])
+def test_the_loss_of_the_page(site, tmp_path, capsys, changes, one_thread):
+    install_page(site, PAGES["loss"])
+    for i in range(2):
+        view = tmp_path / "views" / f"view{i}"
+        view.mkdir(parents=True)
+        ngpt.write(view / "few.exr", full_stack(32, 32, seed=i))
+        ngpt.write(view / "reference.exr", full_stack(32, 32, seed=2 + i)["primal"])
+    changes = [f"data.folders={[str(tmp_path / 'views')]}", "data.crop=32", "run.steps=2", "run.batch=1", *changes]
+    given = [word for change in changes for word in ("--set", change)]
+    assert main(["train", "--config", "tiny", "--out", str(tmp_path / "run"), *given]) == 0, capsys.readouterr().err
+    output = capsys.readouterr().out
+    assert "loss squared" in output and ("loss relative" in output) == (len(changes) == 5)
+    assert main(["train", "--config", "tiny", "--init", str(tmp_path / "mine.toml")]) == 0
+    assert "another package's term: Mean of (p - t)^2 / (t^2 + 1).\n# squared = 0.0\n" in (
+        (tmp_path / "mine.toml").read_text()
+    )
+
+
+@pytest.mark.parametrize(
+    ("changes", "complaint"),
+    [
+        ({"squared": "much"}, "squared = 'much': must be a number, the weight of that term"),
+        ({"squared": -1.0}, "squared = -1.0: must be finite and not negative"),
+        ({"squarred": 1.0}, "unknown key 'squarred'"),
+        ({"kind": "squarred"}, "kind = 'squarred': choose one of"),
+        ({"vector": 1.0}, r"vector: returned a tensor of shape \(2,\); return its mean, a scalar"),
+    ],
+)
+def test_wrong_weights_of_a_loss_are_refused(site, changes, complaint):
+    torch = pytest.importorskip("torch")
+    from ngpt.training.loss import make_loss
+
+    install_page(site, PAGES["loss"])
+    (site / "vector.py").write_text("def vector(p, t):\n    return (p - t).mean(dim=(1, 2, 3))\n")
+    install(site, "vectors", {"ngpt.losses": {"vector": "vector:vector"}})
+    with pytest.raises(NgptError, match=complaint):
+        make_loss({"kind": "l1"} | changes)(torch.ones(2, 3, 16, 16), torch.ones(2, 3, 16, 16), torch.Generator())
+
+
+def test_the_losses_of_the_page_are_called_as_it_says():
+    pytest.importorskip("torch")
+    *_, example = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["loss"]).read_text(), re.S)
+    made: dict = {}
+    exec(example, made)
+    assert made["prediction"].grad is not None and {"perceptual", "relative"} <= made["parts"].keys()
+
+
+FAULTS = {
+    "nowhere": ("nowhere.module:X", ""),  # its package is not there any more
+    "broken": ("broken:METHOD", "raise RuntimeError('no\\nGPU')"),
+    "absent": ("absent:OTHER", ""),
+    "wrong": ("wrong:METHOD", "METHOD = 3"),
+}
+
+
+def test_a_package_that_is_broken_costs_one_line_and_nothing_else(site, stack_file, tmp_path, capsys):
+    for name, (target, code) in FAULTS.items():
+        if name != "nowhere":
+            (site / f"{name}.py").write_text(code)
+        install(site, name, {"ngpt.methods": {name: target}})
+    install_page(site, PAGES["method"])
+    assert main(["info"]) == 0
+    output = capsys.readouterr()
+    assert "median" in output.out and "wcv" in output.out
+    lines = output.err.splitlines()
+    assert sorted(line.partition(" of the package")[0] for line in lines) == [
+        f"ngpt: ngpt.methods: '{name}'" for name in ("absent", "broken", "wrong")
+    ]
+    assert "cannot be imported: RuntimeError: no" in output.err
+    for name in ("absent", "broken", "wrong"):
+        image = str(tmp_path / "image.exr")
+        assert main(["denoise", stack_file, "-o", image, "-m", name]) == 1
+        (line,) = capsys.readouterr().err.splitlines()
+        assert line.startswith(f"ngpt: error: ngpt.methods: '{name}' of the package '{name}'")
+    with pytest.raises(SystemExit, match="2"):
+        main(["denoise", stack_file, "-o", image, "-m", "nowhere"])
+    capsys.readouterr()
+    assert main(["denoise", stack_file, "-o", image, "-m", "wcv"]) == 0
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_broken_verbs_cost_one_line(site, capsys):
+    (site / "brokenverbs.py").write_text("import nosuchmodule")
+    install(site, "broken-verbs", {"ngpt.verbs": {"more": "brokenverbs:VERBS"}})
+    with pytest.raises(SystemExit, match="0"):
+        main(["--help"])
+    output = capsys.readouterr()
+    assert "denoise" in output.out
+    (line,) = output.err.splitlines()
+    assert line.startswith("ngpt: ngpt.verbs: 'more' of the package 'broken-verbs' cannot be imported: ModuleNotFound")
+
+
+def test_names_of_ours_are_refused(site, capsys):
+    (site / "own.py").write_text(
+        "from ngpt.methods import METHODS\nfrom ngpt.measure.metrics import METRICS\n"
+        "METHOD, METRIC = METHODS['l1'], METRICS['MSE']\n"
+    )
+    groups = {"ngpt.methods": {"wcv": "own:METHOD", "auto": "own:METHOD"}, "ngpt.metrics": {"relMSE": "own:METRIC"}}
+    groups |= {"ngpt.samplers": {"gpt": "own:METHOD", "restir": "own:METHOD"}}
+    install(site, "own", groups)
+    before = dict(METHODS), dict(METRICS), dict(SAMPLERS)
+    for registry in (METHODS, METRICS, SAMPLERS):
+        assert registry.load() == []
+    assert (dict(METHODS), dict(METRICS), dict(SAMPLERS)) == before
+    told = capsys.readouterr().err
+    for name in ("wcv", "auto", "relMSE", "gpt", "restir"):
+        assert f"'{name}' of the package 'own' is left out: ngpt has a" in told
+    assert "Traceback" not in told and len(told.splitlines()) == 5
+
+
+def test_two_packages_with_one_name_are_named(site, stack_file):
+    install_page(site, PAGES["method"])
+    install(site, "rival", {"ngpt.methods": {"median": "ngpt_median:METHOD"}})
+    with pytest.raises(NgptError, match=r"method 'median': the packages '.*' and '.*' both bring one"):
+        ngpt.denoise(ngpt.read(stack_file), "median")
+
+
+def test_a_method_of_ours_is_found_without_a_look_at_other_packages(site, stack_file, tmp_path):
+    install_page(site, PAGES["method"])
+    code = (
+        "import sys\nimport ngpt.system.parts\nngpt.system.parts.points = None\nfrom ngpt.cli import main\n"
+        f"assert main(['denoise', {stack_file!r}, '-o', {str(tmp_path / 'image.exr')!r}, '-m', 'wcv']) == 0\n"
+        "heavy = {'ngpt_median', 'torch', 'mitsuba', 'data_gen'} & set(sys.modules)\n"
+        "assert not heavy, heavy\n"
+    )
+    path = f"{site}:{ROOT}"
+    done = subprocess.run([sys.executable, "-c", code], env={"PYTHONPATH": path}, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
