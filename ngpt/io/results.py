@@ -44,8 +44,11 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
         stack.require("primal", why=f"writing {path}")
         image, resolution, main = ExrImage([ExrPart("", new_header(stack), {})]), {}, 0
     else:
-        parts = (base or stack.source.image).parts
-        image = ExrImage([replace(part, channels=dict(part.channels)) for part in parts])
+        own = stack.source.image.parts
+        image = ExrImage([replace(part, channels=dict(part.channels)) for part in (base.parts if base else own)])
+        # What was done to this view beside its layers, such as to its light groups, the file by now lacks.
+        for part, source, (_, channels) in zip(image.parts, own, stack.source.view.parts, strict=False):
+            part.channels.update({name: source.channels[name] for name in channels.values() if base})
         resolution = dict(stack.source.resolution)
         main = resolution["primal"].part
         size = next(iter(image.parts[main].channels.values())).shape

@@ -122,3 +122,18 @@ def test_without_being_asked_for_groups_pass_through(lights, tmp_path):
     path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
     assert main(["denoise", str(path), "-o", str(out), "-m", "nfor"]) == 0
     assert np.array_equal(lightgroups.layers_of_light(ngpt.read(out))["ViewLayer.Combined_Key"], noisy["Key"])
+
+
+def test_groups_of_every_view_are_denoised(lights, tmp_path):
+    _, noisy = lights
+    layers = {"": sum(noisy.values())} | {f"RGBA_{name}": light for name, light in noisy.items()}
+    both = layers | {f"right.{name}" if name else "right": np.flip(light, 1) for name, light in layers.items()}
+    path = written(tmp_path / "stereo.exr", both, {"multiView": ["left", "right"]})
+    out = tmp_path / "out.exr"
+    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor", "--groups"]) == 0
+    for view in ("left", "right"):
+        parts = lightgroups.layers_of_light(ngpt.read(out, view=view))
+        groups = [parts[name] for name in parts if "RGBA_" in name]
+        result = ngpt.read_image(out, view=view)
+        assert len(groups) == 2, parts.keys()
+        assert np.abs(sum(groups) - result).max() <= 1e-5 * result.max(), view
