@@ -179,7 +179,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         overwrite=args.force,
         transform=args.transform,
         exposure=args.exposure,
-        # Of a folder, whose disk may be full, the next call makes again what is missing.
+        # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
         keep=len(pairs) == 1,
     )
     frames: Any
@@ -257,7 +257,7 @@ def read_frame(
 
 
 def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
-    """Raises NgptError where a result is not that of this stack by what is asked for."""
+    """Raises NgptError where a result was made of another stack, or with other settings than are asked for."""
     result, stack = first_attributes(target), first_attributes(source)
     asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
     asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
@@ -289,7 +289,7 @@ def compute_frame(
     reference: Reference | None,
     temporal: dict[str, Temporal] | None,
 ) -> Frame:
-    """The frame with its result, and those of its other views; ``temporal`` is the history of each view."""
+    """The frame with its result, and its other views with their results; ``temporal`` is the history of each view."""
     stack = frame.stack
     if stack is None:
         return frame
