@@ -71,7 +71,7 @@ def _covariances(begin: int, end: int, net: int) -> np.ndarray:
 
 
 def _in_block(begin: int, end: int, start: int, size: int) -> np.ndarray:
-    """The same sum over pairs of samples that lie in the aligned block of ``size`` samples from ``start`` on."""
+    """Sums the covariances of those pairs that lie in the aligned block of ``size`` samples from ``start`` on."""
     begin, end = max(begin, start), min(end, start + size)
     if begin >= end:
         return np.zeros(len(RATES))
