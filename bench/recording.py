@@ -3,8 +3,8 @@
     python -m bench.recording --before COMMIT [--scenes diffuse path/scene.xml ...] [--samplers gpt primal ...]
 
     pass      processor seconds of a pass of 16x16 pixels, one sample each, with kernels compiled before: nearly all of
-              it is Python that records them. Of the first pass of a render, and the median of the later ones
-    render    the same of whole renders of --size at --spp, and C, those of `gpt` over those of `primal`
+              it is Python that records them. The first pass of a render, and the median of the later ones
+    render    processor seconds of whole renders of --size at --spp, and C, `gpt`'s seconds over `primal`'s
 
 Both trees take turns. On a busy machine only processor time means anything.
 """

@@ -31,7 +31,7 @@ from ngpt.windows import Window
 SCENE, TIME = "ngpt:scene", "ngpt:time"
 # Points that the number of samples decides between are no other way to render.
 _EITHER = {"points=rounds", "points=sobol"}
-# Of a time, what is too little to go on for
+# The fraction of the time asked for that is too little to go on for
 _NOTHING = 0.02
 # Samples per pixel that are too few to be shared out: what is left is rendered evenly then.
 SHARED = 32
@@ -74,7 +74,7 @@ class Unfinished(NgptError):
 
 @dataclass(frozen=True)
 class Rest:
-    """What is left of a render, of which so many ``parts`` are there."""
+    """What is left of a render that already has so many ``parts``."""
 
     parts: int
     spp: int | None
@@ -88,7 +88,7 @@ class Rest:
         return self.adaptive or (asked if self.error is not None else None)
 
     def options(self, seed: int) -> dict[str, Any]:
-        """Of ``render_scene`` and ``render_frames``, what is not as it was asked for with this ``seed``."""
+        """Options of ``render_scene`` and ``render_frames`` for the rest of a render asked for with ``seed``."""
         given = {"spp": self.spp, "seconds": self.seconds, "sampler": self.sampler}
         return given | {"seed": part_seed(seed, self.parts)}
 
@@ -111,7 +111,7 @@ class Asked:
     def left(self, path: Path) -> Rest | None:
         """What is left to render of the stack in a file, None where nothing is.
 
-        Raises NgptError where it is that of another render: scene, frame, seed, size, sampler or its options.
+        Raises NgptError where the stack is another render: scene, frame, seed, size, sampler or its options differ.
         """
         attributes, _ = read_header(path)
         # With a crop window, the film that was asked for is the display window.
@@ -188,7 +188,7 @@ def begun_stack(path: Path, diagnostics: bool) -> GradientStack:
 
 
 def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
-    """The stack of both parts; its header says of how it was ended what that of the ``rest`` says."""
+    """Merges both parts; the attributes that say how the render ended come from ``rest``."""
     whole = merge([begun, rest])
     whole.attributes |= {name: rest.attributes[name] for name in (UNFINISHED, TIME) if name in rest.attributes}
     # Errors fall with the root of the samples.

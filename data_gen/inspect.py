@@ -27,7 +27,7 @@ _LENSES = ("dielectric", "roughdielectric")
 def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
     """Counts a scene's plugins by kind and says how it would be sampled.
 
-    ``name`` and ``parameters`` are those of ``load_scene``. Returns {"plugins": {kind: {plugin: count}},
+    ``name`` and ``parameters`` are as in ``load_scene``. Returns {"plugins": {kind: {plugin: count}},
     "sensors": a line for each, "size": (width, height) or None where the scene leaves it to Mitsuba, "media": names,
     "lens": whether there is depth of field, "shutter": seconds it is open, "sampler": name, "plan": lines of text}.
     """

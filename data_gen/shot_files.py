@@ -60,7 +60,7 @@ def write_frames(
         check_output(files[frame], overwrite or skip_existing, may_skip=True)
     written = Written()
     asked = {frame: asked_of(scene, frame, **options) for frame in ours}
-    # Before the others, and those together of which as much is left: the scene stays in memory.
+    # Begun frames come first, grouped by what is left of them: the scene stays in memory.
     begun: dict[Rest, list[int]] = {}
     for frame in ours:
         if skip_existing and finished(files[frame]) and (rest := asked[frame].left(files[frame])):
@@ -129,7 +129,7 @@ def asked_of(
     variant: str | None = None,
     **options: Any,
 ) -> Asked:
-    """What ``render_frames`` is asked for a frame: its arguments are those of that."""
+    """What ``render_frames``, which has the same arguments, is asked for a frame."""
     remembers = FRAME_SAMPLERS.get(sampler)
     if spp is None and (seconds is None or remembers):
         spp = remembers.spp if remembers else DEFAULT_SPP

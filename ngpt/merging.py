@@ -57,8 +57,8 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     are known of tiles that overlap by a pixel.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:unfinished`` is left out, and all other attributes are
-    those of the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or sampler, or
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:unfinished`` is left out, and all other attributes
+    come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or sampler, or
     are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place, missing
     ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded``
     that are no numbers, results of a reconstruction, and channels of unknown meaning.

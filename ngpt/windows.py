@@ -28,7 +28,7 @@ class Window:
 
     @classmethod
     def of_box(cls, box: Any) -> Window:
-        """Of the first and the last pixel, as OpenEXR has it: ((left, top), (right, bottom))."""
+        """The window from its first to its last pixel, as OpenEXR has it: ((left, top), (right, bottom))."""
         (left, top), (right, bottom) = ((int(n) for n in corner) for corner in box)
         return cls(left, top, right - left + 1, bottom - top + 1)
 
@@ -65,7 +65,7 @@ class Window:
         return Window(left, top, right - left, bottom - top)
 
     def within(self, other: Window) -> tuple[slice, slice]:
-        """Rows and columns of these pixels in an image of those of ``other``, which holds them all."""
+        """Rows and columns of these pixels in an image of the window ``other``, which holds them all."""
         x, y = self.left - other.left, self.top - other.top
         return slice(y, y + self.height), slice(x, x + self.width)
 
@@ -82,7 +82,7 @@ class Place:
 
     @classmethod
     def whole(cls, width: int, height: int) -> Place:
-        """Of an image of which nothing but its size is known."""
+        """The place of an image when only its size is known."""
         return cls(window := Window(0, 0, width, height), window)
 
     @property
@@ -98,9 +98,9 @@ class Place:
     def seen_from(self, other: Place) -> Window | None:
         """The pixels in the coordinates of ``other``; None where the two are pictures of different sizes.
 
-        An image of which nothing but its size is known lies where one of that size does: many programs lose the place
-        of what they cut. Other pictures lie side by side, but for two of different sizes with one corner: those are
-        pictures of different resolution.
+        If only the size of an image is known, it lies where the other one of that size does: many programs lose the
+        place of what they cut. Other pictures lie side by side, except two of different sizes with one corner: their
+        resolutions differ.
         """
         if self.display != other.display:
             if self.data.size == other.data.size and not (self.known and other.known):
@@ -130,7 +130,7 @@ class Overlap:
         return f"compared are the pixels that all images have: {self.common}"
 
     def of(self, images: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """Of each image (H, W, C) the common pixels."""
+        """The common pixels of each image (H, W, C)."""
         return [image[self.common.within(window)] for image, window in zip(images, self.windows, strict=True)]
 
 
@@ -150,7 +150,7 @@ def overlap(names: Sequence[str], places: Sequence[Place]) -> Overlap:
 
 
 def put(image: np.ndarray, window: Window, canvas: Window, outside: float = 0.0) -> np.ndarray:
-    """An image (H, W, C) of the pixels of ``window``, cut to those of ``canvas``, and filled up to them.
+    """An image (H, W, C) of the pixels of ``window``, cut to ``canvas`` and filled up to it with ``outside``.
 
     Raises NgptError for a canvas that is out of all proportion, as a header may ask for with a few bytes.
     """

@@ -111,7 +111,7 @@ def test_slurm(farm):
     assert all(call.frames == list(range(240)) for call in farm.calls())
 
 
-# Renders until it is told to stop, and the second time to the end.
+# Renders until it gets SIGTERM, and the second time to the end.
 STOPPED = """#!/bin/bash
 echo "$@" >> "$FARM_LOG"
 [ -e "$FARM_LOG.stopped" ] && exit 0

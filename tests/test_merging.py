@@ -348,7 +348,7 @@ def test_tiles_with_seeds_of_their_own_are_merged_like_others(rng):
         assert np.allclose(at_once[name], in_turn[name], rtol=1e-5, atol=1e-7, equal_nan=True), name
     for tile in tiles:
         tile.attributes["ngpt:seed"] = "3"
-    assert merge(tiles).attributes["ngpt:seed"] == "3"  # of one seed, and not the same samples
+    assert merge(tiles).attributes["ngpt:seed"] == "3"  # they share a seed, but no samples
     part = part_of(whole, 5, 0, 7, 9)
     assert merge([part, other, tiles[0]]).place == whole.place
 
@@ -408,7 +408,7 @@ def test_merged_tiles_have_no_seams(rng, method):
         for axis, seam in ((1, 23), (0, 15)):
             assert np.abs(np.diff(image - truth, axis=axis).mean(axis=(1 - axis, 2)))[seam] < 0.035
         assert np.square(image - truth).mean() < (1.1 if overlap else 1.5) * np.square(expected - truth).mean()
-        assert known_noise(merged).all()  # that of differences which are left out does not matter
+        assert known_noise(merged).all()  # the noise of differences that are left out does not matter
 
 
 def test_tiles_from_files_keep_what_else_they_carry(rng, tmp_path):

@@ -1,4 +1,4 @@
-"""Methods, samplers, losses and metrics of other packages, by entry points: the packages are those of the pages."""
+"""Methods, samplers, losses and metrics of other packages, by entry points: the pages show these packages."""
 
 import re
 import subprocess

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 # More are not advised.
 LARGEST_SPP = 1 << 20
-# The pilot is that of a render of so many seconds at least: with less, a busy machine compiles no kernels.
+# The pilot plans for a render of at least so many seconds: in less time a busy machine compiles no kernels.
 LEAST_WHOLE = 60.0
 
 
@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 @dataclass(frozen=True)
 class Row:
-    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` are those of both.
+    """A sampler and a method, with samples even or shared out (``adaptive``); ``seconds`` is the time of both.
 
     ``low`` and ``high`` are where eight of ten such errors turned out to lie.
     """

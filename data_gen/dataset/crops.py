@@ -116,8 +116,8 @@ def uneven_inputs(config: Config, name: str, crop: int, counts: list[int]) -> li
 
 
 def render_input(config: Config, scene, spp: int, seed: int, uneven: bool, made: Any = None) -> GradientStack:
-    """One input. All inputs of a set that has uneven ones have the layer ``samples``. ``made`` is that of
-    ``render_stack``."""
+    """One input. All inputs of a set that has uneven ones have the layer ``samples``. ``made`` is
+    passed to ``render_stack``."""
     from data_gen.adaptive import Adaptive
     from data_gen.render import render_stack
 
@@ -181,7 +181,7 @@ def make_crop(config: Config, around, name: str, crop: int) -> list[tuple[CropDa
 def make_inputs(config: Config, scene, made: Any, kept: Kept, place: int, seed: int) -> list[tuple[CropData, dict]]:
     """The crop at that place of kept references and its record: the view of then, inputs with noise by ``seed``.
 
-    ``made`` is that of ``render_stack``.
+    ``made`` is passed to ``render_stack``.
     """
     from data_gen.dataset.cameras import View
 
@@ -213,7 +213,7 @@ def _crop(
     clock: float,
     made: Any,
 ) -> tuple[CropData, dict]:
-    """The crop of which ``first`` is the first input, begun at ``clock``, and its record; ``made`` is that of
+    """The crop whose first input is ``first``, and its record; it was begun at ``clock``. ``made`` is passed to
     ``render_stack``."""
     from data_gen.render import render_stack
 

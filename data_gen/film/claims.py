@@ -31,8 +31,8 @@ _PRIOR = 4.0
 def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
     """By how much the sample ``variance`` of the mean is to be multiplied, (H, W, 1).
 
-    ``contrast`` is that of the samples, as above; both (H, W, C). Pixels where one of them is NaN say nothing.
-    ``samples`` (H, W) is the number of samples of each pixel, and ``net`` that of the first round of points.
+    ``contrast``, as defined above, and ``variance`` are (H, W, C). Pixels where one of them is NaN say nothing.
+    ``samples`` (H, W) is the number of samples of each pixel, and ``net`` the number of points in the first round.
     """
     squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
     good = np.isfinite(squares) & np.isfinite(variances)

@@ -330,7 +330,7 @@ class GradientFilm:
 
     @property
     def _numbers(self) -> np.ndarray:
-        """Of each pixel, how many values variances are over, (pixels): its samples, or its batches."""
+        """How many values the variance of each pixel is taken over, (pixels): samples, or batches."""
         return np.full(self.pixels, self.blocks) if self.batches else self.samples_each
 
     @property

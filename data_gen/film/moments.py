@@ -21,7 +21,7 @@ class Moments:
     lost: mi.UInt32  # samples left out because they were not finite
     mean: list
     m2: list  # weighted sum of squared deviations from the mean; empty where nobody asks for a variance
-    # Of earlier samples, see ``Earlier``; empty where nobody asks for it
+    # A list of one ``Earlier``; empty where nobody asks for it
     earlier: list
 
 

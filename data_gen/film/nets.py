@@ -32,7 +32,7 @@ class Law(NamedTuple):
     Both are over the variance that the spread of the samples claims, which takes them for independent.
     """
 
-    seen: np.ndarray  # of the contrast of data_gen.film.claims; falls from law to law
+    seen: np.ndarray  # the expected square of the contrast of data_gen.film.claims; falls from law to law
     truth: np.ndarray
 
 
@@ -47,7 +47,7 @@ def split(n: int) -> int:
 
 @cache
 def law(n: int, net: int) -> Law:
-    """The law of ``n`` > 1 samples, the first round of which is a net of ``net``, a power of two."""
+    """The law of ``n`` > 1 samples whose first round is a net of ``net`` points, a power of two."""
     first = split(n)
     second = n - first
     within, behind, total = _covariances(0, first, net), _covariances(first, n, net), _covariances(0, n, net)
@@ -71,7 +71,7 @@ def _covariances(begin: int, end: int, net: int) -> np.ndarray:
 
 
 def _in_block(begin: int, end: int, start: int, size: int) -> np.ndarray:
-    """The same of those among them that are in the aligned block of ``size`` samples from ``start`` on."""
+    """Sums the covariances of those pairs that lie in the aligned block of ``size`` samples from ``start`` on."""
     begin, end = max(begin, start), min(end, start + size)
     if begin >= end:
         return np.zeros(len(RATES))

@@ -106,8 +106,8 @@ def render_shot(
     """(frame, its stack) of each of ``frames`` that ``skip``, asked when its turn has come, does not leave out.
 
     Stacks have the layer ``motion`` to the frame before in ``frames``; of the first, to the one that a shot of the same
-    step would have before it, all NaN where there is none. It is motion in the picture, of which crop windows may show
-    another part in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
+    step would have before it, all NaN where there is none. It is motion in the whole picture, and crop windows may
+    show another part of it in each frame. Attributes: ``ngpt:frame``, ``ngpt:previousFrame``. A
     frame's seed is its own, so a frame is the same bits whatever others are rendered. ``options`` are those of
     ``render_stack``. Raises NgptError as that does, and for cameras without a projection.
 
@@ -173,7 +173,7 @@ def render_shot(
 
 
 def _placed(stack: GradientStack, frame: int, previous: int, motion: np.ndarray) -> GradientStack:
-    """A stack as one of the shot's frames; ``motion`` is that of the picture."""
+    """A stack as one of the shot's frames; ``motion`` is measured in the whole picture."""
     stack.attributes.update({"ngpt:frame": frame, "ngpt:previousFrame": previous})
     return stack.replace(motion=motion)
 

@@ -131,9 +131,9 @@ class CameraSamples:
         return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))
 
     def look(self, *shifts: tuple[int, int] | str) -> Self:
-        """These samples, of which a function that is recorded once may ask the rays by such ``shifts``.
+        """These samples, for a function that is recorded once and asks for their rays by these ``shifts``.
 
-        It cannot ask most cameras, whose arrays Dr.Jit 1.5 does not find. So they are asked before.
+        The function cannot ask most cameras, since Dr.Jit 1.5 does not find their arrays. So they are asked before.
         """
         if bytes_of_rays(self.sensor):
             rays = [self.rays(shift) for shift in shifts]

@@ -66,7 +66,7 @@ class Frozen:
             return result
 
 
-# Functions of which the warning has been given
+# Functions that a warning has been given for
 _SAID: set[str] = set()
 
 

@@ -1,7 +1,7 @@
 """Mitsuba's integrators: what each is called, and which other one renders the same image where ours follow only that.
 
-Integrators for derivatives (``prb`` and its like) are written in Python. Their images are those of ``path`` and
-``volpath``, which our samplers follow.
+Integrators for derivatives (``prb`` and its like) are written in Python. They render the same images as ``path``
+and ``volpath``, which our samplers follow.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ _SAME = {
     "direct_projective": ("path", ""),
     "prbvolpath": ("volpath", "volpath"),
 }
-# Those that trace no paths from the camera
+# Integrators that trace no paths from the camera
 _FROM_LAMPS = ("ptracer",)
-# Those that add channels, which a stack has no use for, to the colour of another
+# Integrators that add channels to the colour of another one; a stack has no use for these channels
 AROUND = ("aov", "moment", "stokes")
 
 

@@ -53,7 +53,7 @@ def reconstruct_with_error(
     It takes twice the time. ``halves`` are two stacks of independent halves of the samples, such as those that
     ``stack`` was merged from: half as many values are then more than five standard errors off, in four times the time.
 
-    The error is NaN in pixels of which a variance is not finite, for nothing is known of their noise. The same stacks
+    The error is NaN in pixels where a variance is not finite, since their noise is unknown. The same stacks
     give the same bits. Raises NgptError where the stack has no variances or a half is of another size, and as
     ``reconstruct`` does.
     """
@@ -69,7 +69,7 @@ def reconstruct_with_error(
                     "give two stacks of the same view, such as those that it was merged from"
                 )
         one, other = (reconstruct(half, result.method, **options) for half in halves)
-        # Twice the variance each, and so four times that of the mean in their difference.
+        # Each half has twice the variance, so their difference has four times the variance of their mean.
         error = np.sqrt((error**2 + (change(one.image, other.image, known) / 2) ** 2) / 2)
         seconds += one.seconds + other.seconds
     return replace(result, error=(factor * error).astype(np.float32), seconds=seconds)

@@ -55,7 +55,7 @@ VERBS = {
 
 
 def all_verbs() -> dict[str, Verb]:
-    """Ours, and those of other packages, which render, by their headings.
+    """Our verbs and the verbs that other packages bring, ordered by their headings.
 
     A package names its own, a dictionary like ``VERBS``, by an entry point of the group "ngpt.verbs".
     """
@@ -81,7 +81,7 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Top(_Parser):
-    """Of ``ngpt`` itself: help has the verbs under headings."""
+    """The parser of ``ngpt`` itself: its help lists the verbs under headings."""
 
     def format_help(self) -> str:
         formatter, verbs = self._get_formatter(), all_verbs()

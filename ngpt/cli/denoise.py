@@ -32,7 +32,7 @@ from ngpt.cli.picture import add_look, check_picture
 from ngpt.cli.reference import Reference
 from ngpt.cli.streams import STREAM, as_files
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import read_views
+from ngpt.io.exr import read, read_views
 from ngpt.io.foreign.files import first_attributes
 from ngpt.io.frames import RESULT_SUFFIX, is_shot, remarks
 from ngpt.io.whole import finished
@@ -42,6 +42,7 @@ from ngpt.network.run_onnx import MEMORY
 from ngpt.options import as_text, settings, unusual
 from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
+from ngpt.stack import GradientStack
 from ngpt.system.console import Console
 from ngpt.system.pipeline import overlapped
 
@@ -94,6 +95,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="write a layer 'error' too: the standard error of each pixel; twice the time",
     )
+    parser.add_argument(
+        "--halves",
+        nargs=2,
+        metavar=("A", "B"),
+        help="as --error, which also goes by what differs between two stacks of half the samples each, such as those "
+        "that STACK was merged from: they show blotches; four times the time",
+    )
     names = ", ".join(f"{pattern} ({renderer})" for renderer, pattern in lightgroups.PATTERNS.items())
     parser.add_argument(
         "--groups", action="store_true", help=f"denoise light groups too, so that they add up to the result: {names}"
@@ -144,6 +152,10 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         raise WrongUse(
             f"--{next(iter(files))} belongs to one stack, and {len(pairs)} are given; denoise them one by one"
         )
+    if args.halves:
+        args.error = True
+        if len(pairs) > 1:
+            raise WrongUse(f"--halves are of one stack, and {len(pairs)} are given; denoise them one by one")
     if args.temporal:
         for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
             if given:
@@ -167,7 +179,7 @@ def denoise(args: argparse.Namespace, console: Console) -> int:
         overwrite=args.force,
         transform=args.transform,
         exposure=args.exposure,
-        # Of a folder, whose disk may be full, the next call makes again what is missing.
+        # One of several frames is not kept elsewhere if the disk is full: the next call makes it again.
         keep=len(pairs) == 1,
     )
     frames: Any
@@ -245,7 +257,7 @@ def read_frame(
 
 
 def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
-    """Raises NgptError where a result is not that of this stack by what is asked for."""
+    """Raises NgptError where a result was made of another stack, or with other settings than are asked for."""
     result, stack = first_attributes(target), first_attributes(source)
     asked: dict[str, Any] = {name: stack.get(name) for name in ("ngpt:spp", "ngpt:seed") if name in stack}
     asked["ngpt:temporal"] = result.get("ngpt:temporal", "asked for") if args.temporal else None
@@ -262,6 +274,14 @@ def _check_result(source: Path, target: Path, args: argparse.Namespace) -> None:
             )
 
 
+def _halves(frame: Frame, args: argparse.Namespace) -> tuple[GradientStack, GradientStack] | None:
+    """The two stacks of ``--halves``, of the view of this frame."""
+    if not args.halves:
+        return None
+    one, other = (read(path, dict(args.layer), args.untrusted, view=frame.view or None) for path in args.halves)
+    return one, other
+
+
 def compute_frame(
     frame: Frame,
     args: argparse.Namespace,
@@ -269,13 +289,16 @@ def compute_frame(
     reference: Reference | None,
     temporal: dict[str, Temporal] | None,
 ) -> Frame:
-    """The frame with its result, and those of its other views; ``temporal`` is the history of each view."""
+    """The frame with its result, and its other views with their results; ``temporal`` is the history of each view."""
     stack = frame.stack
     if stack is None:
         return frame
     others = tuple(compute_frame(other, args, options, None, temporal) for other in frame.others)
     groups = lightgroups.find(stack, args.group) if args.groups or args.group else {}
-    result = (reconstruct_with_error if args.error else reconstruct)(stack, args.method, **options)
+    if args.error:
+        result = reconstruct_with_error(stack, args.method, halves=_halves(frame, args), **options)
+    else:
+        result = reconstruct(stack, args.method, **options)
     over_time, reason = {}, ""
     if temporal is not None:
         begun, history = time.perf_counter(), temporal[frame.view]

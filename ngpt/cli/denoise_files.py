@@ -24,7 +24,7 @@ from ngpt.version import __version__
 
 
 class Frame(NamedTuple):
-    """A stack on its way from its file to that of its result; with ``there`` its result was there already.
+    """A stack, its file and the file for its result; ``there`` says that the result was there already.
 
     ``cut`` says that a file is in its place that is not whole.
     ``over_time`` is what other frames were to the result, as header attributes; ``reason`` why they were nothing.

@@ -12,7 +12,7 @@ from ngpt.windows import Place, overlap
 
 
 class Errors(NamedTuple):
-    """What ``compare`` says, and of which pixels where that is not the whole of both images."""
+    """What ``compare`` returns, and the pixels it compared as text, "" where these are all of both images."""
 
     metrics: dict[str, float]
     part: str
@@ -30,7 +30,7 @@ class Reference(NamedTuple):
         return cls(path, *read_picture(path, isolated))
 
     def errors(self, image: np.ndarray, stack: GradientStack) -> Errors:
-        """Of an image (H, W, 3) that was made of a stack. Raises NgptError where the two have no pixel in common."""
+        """The errors of an image (H, W, 3) made from ``stack``. Raises NgptError without pixels in common."""
         both = overlap([stack.path, self.path], [stack.place, self.place])
         light = converted(image, to_rec709(stack.attributes))
         return Errors(compare(*both.of([light, self.pixels])), str(both.common) if both.line else "")

@@ -150,7 +150,7 @@ def run_shots(args: argparse.Namespace, names: list[str], target: Path, console:
     scenes: list[Scene] = []
     motions: list[np.ndarray | None] = []
     partly = 0
-    # Of each folder the frames as they are measured: NaN where the display window has no pixel of theirs.
+    # The frames of each folder as they are measured: NaN where a frame has no pixel of the display window.
     known: list[list[np.ndarray]] = [[] for _ in folders]
     with console.progress("report", "frames") as progress:
         for done, frame in enumerate(frames):
@@ -235,7 +235,7 @@ def motion_of(paths: list[str], place: Place) -> np.ndarray | None:
 
 
 def shot_files_of(folder: str) -> list[Path]:
-    """The frames of a shot; raises NgptError for files, of which a shot has several."""
+    """The frames of a shot; raises NgptError for a single file."""
     if not is_shot(folder):
         raise NgptError(f"{folder}: is no folder, and others are; give folders of frames, or images alone")
     return shot_files(folder)

@@ -118,7 +118,7 @@ def _one_view(image: ExrImage, wanted: str | None, path: str) -> View:
 def _resolved(
     view: View, layers: Mapping[str, str] | None, attributes: Iterable[Mapping[str, Any]], path: str
 ) -> Resolution:
-    """Where the layers of a view are; ``attributes`` are those of the parts."""
+    """Where the layers of a view are; ``attributes`` are the headers of the parts."""
     headers, wanted = list(attributes), {name: view.without(text) for name, text in (layers or {}).items()}
     origin = next((str(header["ngpt:pass"]) for header in headers if "ngpt:pass" in header), "")
     # In a result the input is elsewhere by now.
@@ -222,7 +222,7 @@ def read_picture(path: str | os.PathLike, isolated: bool = False, view: str | No
     if view is None and all(name in part.channels for name in RGB):
         return Picture(converted(gather(part, RGB), to_rec709(part.header)), place_of(part))
     stack = _stack(image, chosen, None, isolated, None, str(path))
-    # That of a result is beside its input.
+    # The picture of a result is beside its input.
     for place in (stack.source.resolution["primal"].part, chosen.first):
         part, root = image.parts[place], tuple(chosen.channel(place, name) for name in RGB)
         if all(name in part.channels for name in root):

@@ -59,6 +59,6 @@ def number_of(path: Path, wanted: str) -> int:
 
 
 def _digits(field: re.Match) -> int:
-    """The least number of digits, 0 where none is told."""
+    """The least number of digits, 0 where none is given."""
     printf, hashes, houdini, ours = field.groups()
     return len(hashes) if hashes else int(printf or houdini or ours or 0)

@@ -1,4 +1,4 @@
-"""Files of frames: those of a folder or a pattern, in the order of their numbers, for all that read or show shots."""
+"""Files of frames in a folder or by a pattern, in the order of their numbers, for all that read or show shots."""
 
 import glob
 import os
@@ -39,7 +39,7 @@ def is_shot(name: str) -> bool:
 def shot_files(name: str) -> list[Path]:
     """The frames of a folder (its .exr files) or a pattern, in order, without hidden files such as macOS's ``._*``.
 
-    Patterns are those of shells, and names of frames (``ngpt.io.framenames``). Folders and files of that very name win,
+    Patterns are shell patterns or names of frames (``ngpt.io.framenames``). Folders and files of that very name win,
     also within a pattern: ``dir[1]/*.exr``. Results that lie beside what they were made of (``*_denoised``) are left
     out. Raises NgptError where there are none.
     """
@@ -62,7 +62,7 @@ def without_results(files: Sequence[Path]) -> list[Path]:
 
 
 def frame_name(path: Path) -> str:
-    """What the files of one frame have in common: the name without its ending and without that of a result."""
+    """What the files of one frame have in common: the name without its ending and without a result's suffix."""
     return path.stem.removesuffix(RESULT_SUFFIX)
 
 

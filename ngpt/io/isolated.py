@@ -29,7 +29,7 @@ _REFUSED = 3
 
 
 def read_exr_isolated(path: str | os.PathLike) -> ExrImage:
-    """What ``read_file`` returns, but for the header of mipmaps, of which tiles with one level are left.
+    """What ``read_file`` returns, except that headers of mipmaps become headers of tiles with one level.
 
     Raises NgptError where ``read_file`` does, and where the decoder crashes, runs out of memory or takes too long.
     """

@@ -16,7 +16,7 @@ _ROWS = 16  # that are gathered at a time
 
 @dataclass(frozen=True)
 class StackSource:
-    """The file a stack was read from, where in it the layers are, and by which names those of its view go."""
+    """The file a stack was read from, where the layers are in it, and the view, which names its layers."""
 
     image: ExrImage
     resolution: Resolution

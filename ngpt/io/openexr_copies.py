@@ -1,4 +1,4 @@
-"""OpenEXR's own kinds of values in headers, told to pickle and copy: stacks that were read from files hold them."""
+"""Lets pickle and copy handle OpenEXR's own kinds of header values: stacks that were read from files hold them."""
 
 import copyreg
 from typing import Any

@@ -79,7 +79,7 @@ def resolve(
 
     A channel without a dot belongs to the root, and in a file of several parts to the layer named like its part; there
     other layers can also be called ``part.layer``. Where a name fits several layers, the one whose name begins like
-    that of the primal wins (``Near.Combined``, ``Near.Depth``), then the one it fits whole, then the one in the part
+    the primal's name wins (``Near.Combined``, ``Near.Depth``), then the one it fits whole, then the one in the part
     that holds the primal. Layers that begin like another image that could be the primal belong to that one. Where no
     name is known, the only layer of colour is the primal.
 
@@ -206,7 +206,7 @@ def _group(parts: Parts) -> list[_Group]:
             if several and part and layer != part and not layer.startswith(f"{part}."):
                 layer = f"{part}.{layer}" if dot else part
             held = groups.setdefault((index, layer), {})
-            # Of two channels of one layer, R and beauty.R in the part beauty, the one that names it wins.
+            # Where a layer has a channel twice, R and beauty.R in the part beauty, the one that names the layer wins.
             held[suffix] = own if dot else held.get(suffix, own)
             if not dot:
                 groups.setdefault((index, f"{layer}.{suffix}" if layer else suffix), {})[""] = own
@@ -305,7 +305,7 @@ def _lone(groups: list[_Group]) -> Found | None:
 
 
 def _home(groups: list[_Group], primal: Found, origin: str) -> _Home:
-    """Where the primal is; rivals are told by the names of primals, and by that of this one."""
+    """Where the primal is. Its rivals are layers that are named as primals usually are, or as this one is."""
     name = origin or primal.name
     prefix, _, tail = name.rpartition(".")
     tails = {alias.name for alias in ALIASES if alias.layer == "primal"} - {"primal"} | {tail}

@@ -19,7 +19,7 @@ from ngpt.system.threads import map_parts
 STRUCTURE = {"channels", "chunkCount", "compression", "dataWindow", "displayWindow", "lineOrder", "name"} | {
     "pixelAspectRatio", "screenWindowCenter", "screenWindowWidth", "tiles", "type"
 }  # fmt: skip
-# Attributes that say what made a result; those of the stack are others, and stay.
+# Attributes that say what made a result; the stack's own attributes are others, and stay.
 MADE_BY = (
     "ngpt:method",
     "ngpt:weights",
@@ -85,13 +85,13 @@ def image_of(stack: GradientStack, path: str, base: ExrImage | None = None) -> t
 
 
 def new_header(stack: GradientStack) -> dict[str, Any]:
-    """Of the part that a stack is written to which comes from no file."""
+    """The header of the part for a stack that comes from no file."""
     windows = {"dataWindow": stack.place.data.box, "displayWindow": stack.place.display.box}
     return {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage} | windows
 
 
 def leave_out_old_error(stack: GradientStack, image: ExrImage) -> None:
-    """Removes the layer ``error`` that came with the file of a stack: it is that of an earlier result."""
+    """Removes the layer ``error`` that came with the file of a stack: it belongs to an earlier result."""
     place = stack.source.resolution.get("error") if stack.source else None
     if place and "error" in stack and holds(stack.source.image.parts[place.part], place.channels, stack["error"]):
         for channel in place.channels:

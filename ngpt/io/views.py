@@ -6,7 +6,7 @@
 | OpenEXR's, many parts | ``R`` in a part of its own | that part's attribute ``view`` |
 | others | ``right.albedo.R`` | ``multiView``, or ``left`` and ``right`` in names alike |
 
-A view's layers go by names without that of the view, ``albedo.R``, so that all are found in one way.
+A view's layers go by names without the view's name, ``albedo.R``, so that all are found in one way.
 https://openexr.com/en/latest/MultiViewOpenEXR.html
 """
 
@@ -33,8 +33,8 @@ class Part(NamedTuple):
 class View(NamedTuple):
     """One view: its name, "" in a file without views, and for each part of the file its name and channels.
 
-    Channels are told by their names without that of the view: that name -> the one in the file; none in parts of
-    other views. ``infix`` is what new channels have in their names, "" in the first view and in parts of its own.
+    Channels map their name without the view's name to their name in the file; parts of other views have none.
+    ``infix`` is what new channels have in their names, "" in the first view and in parts of its own.
     """
 
     name: str
@@ -93,7 +93,7 @@ def _eyes(parts: Sequence[Part]) -> list[str]:
 
 
 def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str, str]]:
-    """The name of a part without that of the view, and the channels that belong to it."""
+    """The name of a part without the view's name, and the channels that belong to the view."""
     own = part.view or (part.name if part.name in names else "")
     bare = re.sub(rf"(^|[-._ ]){re.escape(view)}$|^{re.escape(view)}[-._ ]", "", part.name)
     if own:
@@ -104,7 +104,7 @@ def _of_view(part: Part, view: str, names: Sequence[str]) -> tuple[str, dict[str
         place = next((i for i in reversed(range(len(words) - 1)) if words[i] in names), None)
         if (words[place] if place is not None else names[0]) == view:
             name = ".".join(word for i, word in enumerate(words) if i != place)
-            # Of two with one name the one that names its view is the view's.
+            # Where two channels get one name, the one that names the view wins.
             found[name] = channel if place is not None else found.get(name, channel)
     return bare, found
 

@@ -16,7 +16,7 @@ from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
 
-# Of the shipped networks, as PyTorch has them: in an installed package beside their .onnx, in the repository apart.
+# The shipped networks in PyTorch's form: beside their .onnx in an installed package, apart from them in the repository
 _PACKAGE = Path(__file__).parents[1]
 FOLDERS = (_PACKAGE / "weights", _PACKAGE.parent / "export" / "weights")
 FORMAT = 1

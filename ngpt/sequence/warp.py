@@ -44,7 +44,7 @@ def bilinear_taps(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """The four pixels, (4, N) numbers row by row, and weights of each place x + motion, and where it is among pixels.
 
-    Weights and ``shift`` are those of ``warped``, of an image of ``size`` (h, w). N is H * W, the last array (H, W).
+    Weights and ``shift`` are as in ``warped``, for an image of ``size`` (h, w). N is H * W, the last array (H, W).
     Beside the outermost pixels nothing is found.
     """
     (x, y), (height, width) = _aims(motion, shift), size

@@ -154,7 +154,7 @@ class _Handler(logging.Handler):
 
 @contextmanager
 def logged(verbose: bool, quiet: bool = False) -> Iterator[None]:
-    """Shows what the logger "ngpt" is told: warnings, down to the details if ``verbose``, or errors alone."""
+    """Shows what the logger "ngpt" gets: warnings, also details if ``verbose``, or only errors if ``quiet``."""
     logger, handler = logging.getLogger("ngpt"), _Handler()
     handler.setFormatter(logging.Formatter("%(relativeCreated)7.0f ms  %(name)s: %(message)s" if verbose else None))
     before = logger.level
@@ -191,7 +191,7 @@ class Console:
     ) -> Iterator[Callable[[int, int], None]]:
         """Yields ``update(done, total)``; the first call says what was done before, and from it on time counts.
 
-        ``rate``: units per second are told, too. ``begins``: what goes on until the second call.
+        ``rate``: units per second are shown, too. ``begins``: what goes on until the second call.
         """
         if self.quiet:
             yield lambda done, total: None

@@ -129,7 +129,7 @@ def atomic_output(path: str | os.PathLike, overwrite: bool = False) -> Iterator[
 
 
 def _umask() -> int:
-    """Of the process. It is known only by setting it: two threads that did so at once would leave it at 0."""
+    """The umask of the process. It is known only by setting it: two threads that did so at once would leave it at 0."""
     with _one_at_a_time:
         umask = os.umask(0)
         os.umask(umask)

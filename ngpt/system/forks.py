@@ -54,7 +54,7 @@ def until_fork(most: int) -> Callable[[Callable[Given, Made]], Callable[Given, M
 def in_children(call: Callable[[], object]) -> None:
     """``call`` is called in every forked child from now on, in the thread that forked; once, however often it is given.
 
-    For pools that cannot be dropped, as those of OpenMP: with one thread a child needs none of them.
+    For pools that cannot be dropped, such as OpenMP's: with one thread a child needs none of them.
     """
     if hasattr(os, "register_at_fork"):
         os.register_at_fork(after_in_child=call)

@@ -26,7 +26,7 @@ def warn(text: str) -> None:
 
 
 def points(group: str) -> Iterator[Any]:
-    """The entry points of a ``group``, without those of packages that are not there any more; nothing is imported."""
+    """The entry points of a ``group`` whose packages are still there; nothing is imported."""
     from importlib.metadata import entry_points  # takes 50 ms
 
     for point in entry_points(group=group):

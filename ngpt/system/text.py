@@ -53,5 +53,5 @@ def printable(text: str) -> str:
 
 
 def markup(text: str) -> str:
-    """The same as part of a page, text or the value of an attribute."""
+    """``printable`` text, escaped for HTML: as text or as the value of an attribute."""
     return escape(printable(text))

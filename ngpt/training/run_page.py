@@ -190,7 +190,7 @@ def _over_time(run: Run, unit: float) -> list[tuple[float, float]]:
 
 
 def _time(seconds: float) -> str:
-    """A duration, "-" where none is told."""
+    """A duration, "-" where none is known."""
     return span(seconds) if math.isfinite(seconds) else "-"
 
 

@@ -55,7 +55,7 @@ def split(crops: Sequence[Any], validation: tuple[str, ...] = (), share: float =
 
 
 def _of_one_scene(crops: list[Any], measurable: list[Any], share: float) -> Split:
-    """Crops of one scene show the same things, so their errors are lower than those of another scene would be."""
+    """Crops of one scene show the same things, so their errors are lower than on another scene."""
     scene, number = measurable[0].scene, len(measurable)
     count = min(_count(number, share), number - 1)
     if not count:

@@ -46,7 +46,7 @@ def scenes(folder: Path) -> set[str]:
 
 
 def steps(work: Path) -> int:
-    """Those that all runs have trained, by their checkpoints."""
+    """How many steps all runs together have trained, by their checkpoints."""
     return sum(run.get("checkpoint at step", 0) for run in gather(work)["runs"].values())
 
 

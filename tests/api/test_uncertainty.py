@@ -147,6 +147,18 @@ def test_the_command_writes_the_layer(stack, tmp_path):
     assert not np.array_equal(ngpt.read(tmp_path / "third.exr")["error"], expected.error)
 
 
+def test_the_command_takes_halves(stack, tmp_path, rng):
+    halves = [stack.replace(primal=stack["primal"] + 0.2 * rng.standard_normal((32, 48, 3))) for _ in range(2)]
+    for name, one in zip(("stack", "a", "b"), (stack, *halves), strict=True):
+        ngpt.write(tmp_path / f"{name}.exr", one)
+    a, b = (str(tmp_path / f"{name}.exr") for name in "ab")
+    command = ["denoise", str(tmp_path / "stack.exr"), "-m", "wcv", "--halves", a, b]
+    assert main([*command, "-o", str(tmp_path / "out.exr")]) == 0
+    expected = ngpt.reconstruct_with_error(stack, "wcv", halves=(ngpt.read(a), ngpt.read(b)))
+    assert np.allclose(ngpt.read(tmp_path / "out.exr")["error"], expected.error, rtol=1e-5)
+    assert main([*command[:2], a, b, *command[2:], "-o", str(tmp_path)]) == 2
+
+
 def test_the_page_has_the_numbers_of_the_benchmark():
     from bench.uncertainty import line
 

@@ -49,7 +49,7 @@ def test_a_place_survives_files_and_results(stack, tmp_path):
         assert ngpt.read(ngpt.write(tmp_path / "again.exr", other, overwrite=True)).place == part.place
     assert main(["denoise", path, "-o", str(tmp_path / "result.exr"), "-m", "primal"]) == 0
     assert ngpt.read(tmp_path / "result.exr").place == part.place
-    # Cut without being told where: nothing is known of its place.
+    # The layers are cut and the place is not: nothing is known of where they lie.
     assert GradientStack({"primal": part["primal"][:5]}, place=part.place).place == Place.whole(24, 5)
 
 

@@ -67,7 +67,7 @@ def test_the_pilot_takes_no_longer_than_the_time_it_advises_on(renderer, capsys,
 def test_what_is_expected_comes_with_where_it_may_lie(seen, capsys):
     rows = advice(capsys, "--seconds", "0.5")
     assert all(row["low"] < row["error"] < row["high"] for row in rows)
-    # Of more samples over those of the pilot less is known, and least of networks with gradients.
+    # The further beyond the pilot's samples, the less is known, and least about networks with gradients.
     from data_gen.choosing.pipelines import Pipeline
 
     combine, wcv = (Pipeline("gpt", name, 16, 0.01, -0.9, 0.001, 0.0) for name in ("ngpt-combine", "wcv"))

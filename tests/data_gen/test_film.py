@@ -163,7 +163,7 @@ def test_batches_have_the_variance_of_their_means(renderer, film, rng):
 
 
 def test_a_last_batch_with_fewer_samples_counts_for_less(renderer, film, rng):
-    """Eight, eight and one samples: the mean is that of all 17, and its variance as for independent ones."""
+    """Eight, eight and one samples: the mean is over all 17, and its variance as for independent ones."""
     claimed, real = [], []
     for _ in range(400):
         samples = rng.normal(size=(6, 17, 3)).astype(np.float32)

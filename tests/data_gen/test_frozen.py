@@ -21,7 +21,7 @@ def textured_lamp():
 
 
 def render(mi, scene, sampler, samples, others=(), **options):
-    """The film of passes with so many samples, after each of which one of the ``others`` is loaded."""
+    """The film of passes with so many samples; after each pass one of the ``others`` is loaded."""
     from data_gen.film import GradientFilm
     from data_gen.passes import recording
     from data_gen.paths.camera import CameraSamples
@@ -48,7 +48,7 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, sampler):
 
 @pytest.mark.parametrize("scene", [textured_lamp, "environment"])
 def test_lamps_of_any_kind_are_recorded_once(renderer, recordings, scene):
-    """Those with a texture make the distribution that they are sampled by when they are first asked."""
+    """A lamp with a texture makes the distribution that it is sampled by when it is first asked."""
     render(renderer, load(renderer, scene, (9, 7)), "gpt", [16, 48, 16])
     assert recordings.of == {"samples": 1}
 

@@ -86,7 +86,7 @@ def test_the_image_is_the_one_that_mitsuba_renders(renderer, scene_file, case):
     for sampler in ("auto", "primal"):
         ours = [data_gen.render_scene(file, 32, i, sampler, points="independent") for i in range(6)]
         a, b = np.array([stack["primal"] for stack, _ in ours]), np.array(theirs)
-        # Of quarters of the image, whose means are independent of each other
+        # Means of quarters of the image, which are independent of each other
         a, b = (x.reshape(6, 2, 6, 2, 8, 3).mean(axis=(2, 4, 5)) for x in (a, b))
         z = (a.mean(axis=0) - b.mean(axis=0)) / np.sqrt((a.var(axis=0, ddof=1) + b.var(axis=0, ddof=1)) / 6 + 1e-12)
         assert b.mean() > 0.01 and np.abs(z).max() < 5, f"{sampler}: {z}"
@@ -105,7 +105,7 @@ def test_depths_and_what_hides_are_taken_over(renderer):
 
 
 def test_an_integrator_of_ones_own_is_called_as_mitsuba_calls_it(renderer):
-    """By ``ADIntegrator.render``: with keywords, some of which it may leave to ``**kwargs``."""
+    """As ``ADIntegrator.render`` does: with keywords. The integrator may leave some of them to ``**kwargs``."""
     mi = renderer
 
     class Grey(mi.ad.integrators.common.ADIntegrator):

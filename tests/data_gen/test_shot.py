@@ -57,7 +57,7 @@ CROP = """<integer name="crop_offset_x" value="$x"/><integer name="crop_offset_y
 
 
 def cropped(tmp_path, x="{frame}", width="8"):
-    """A shot at rest, of which crop windows show a part: a farm's frames, or a subject that is followed."""
+    """A shot at rest; crop windows show a part of it: a farm's frames, or a subject that is followed."""
     path = tmp_path / "cropped.xml"
     path.write_text(XML.replace("</film>", CROP).replace("<integrator", '<default name="x" value="0"/><integrator', 1))
     path.write_text(path.read_text().replace("<integrator", '<default name="width" value="8"/><integrator', 1))

@@ -79,7 +79,7 @@ def _foreign() -> list[tuple[str, bytes]]:
 
 
 def _with_checksums(data: bytes) -> bytes:
-    """A PNG whose chunks are what their checksums say, so that damage is not found by those alone."""
+    """A PNG with checksums that fit its chunks, so that damage gets past them."""
     place, out = 8, data[:8]
     while place + 12 <= len(data):
         length = min(struct.unpack_from(">I", data, place)[0], len(data) - place - 12)

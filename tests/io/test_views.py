@@ -13,7 +13,7 @@ LAYERS = {"Combined": "RGBA", "Denoising Albedo": "RGB", "Depth": "Z", "Vector":
 
 
 def value(view, layer, suffix):
-    """An image that says of which channel it is."""
+    """An image whose values say which channel it is."""
     start = 100 * (view == "right") + 10 * list(LAYERS).index(layer) + "RGBAXYZW".index(suffix)
     return np.full(SIZE, start / 256, np.float16 if layer == "Combined" else np.float32)
 
@@ -28,7 +28,7 @@ def bare(layer, suffix):
 
 
 BOTH = {"multiView": ["left", "right"]}
-# Layout -> the parts of a file: those of OpenEXR's documentation, of Blender 5.0 in one part and in many, and others.
+# Layout -> the parts of a file: as in OpenEXR's documentation, as Blender 5.0 writes one part or many, and others.
 LAYOUTS = {
     "one part, the first view without a name": [
         (channels(lambda v, k, c: bare(k, c) if v == "left" else

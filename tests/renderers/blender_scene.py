@@ -5,7 +5,7 @@ in Blender's Python, where ngpt is not installed.
 
 Options before the folder: ``--blur`` opens the lens, ``--interleaved`` writes one part instead of one for each pass,
 ``--denoised`` has Cycles denoise, ``--size WIDTHxHEIGHT``. ``--moving`` writes the pass *Vector*, and the camera goes
-right and up by some pixels a frame, of which ``NAME=SPP:SEED:FRAME`` renders one; ``--stereo`` writes two eyes.
+right and up by some pixels a frame; ``NAME=SPP:SEED:FRAME`` renders one frame. ``--stereo`` writes two eyes.
 """
 
 import argparse

@@ -180,7 +180,7 @@ def test_neither_torch_nor_mitsuba_is_imported():
 
 @pytest.mark.parametrize("grows", [0, 2])
 def test_windows_that_move_find_their_history(rng, history, grows):
-    """A shot at rest, of which frames are a part that moves and changes its size."""
+    """A shot at rest; each frame is a part of it that moves and changes its size."""
     image, features = view()
     stacks = [frame_of(image, features, rng) for _ in range(6)]
     windows = [(4 * i, i, 30 + grows * (i % 3), 30 - grows * (i % 2)) for i in range(len(stacks))]

@@ -84,7 +84,7 @@ def test_frames_do_not_depend_on_those_that_are_not_wanted(stacks):
 
 
 def test_windows_of_pixels_that_move_meet_where_they_lie(rng):
-    """Frames at rest, of which the files hold a part that moves and changes its size."""
+    """Frames at rest; each file holds a part that moves and changes its size."""
     steep = np.linspace(1, 5, SIZE[1])[:, None] + np.zeros(SIZE)
     stacks = [stack.replace(primal=stack["primal"] + steep) for stack in wall(rng, 5, growth=0)]
     slope = np.diff(steep, axis=1, append=steep[:, -1:])

@@ -39,7 +39,7 @@ def test_a_share_of_the_scenes_is_set_aside_whole(scenes, share):
     assert len(apart) == min(max(1, round(share * scenes)), scenes - 1)
     assert not apart & {crop.scene for crop in training} and len(training) + len(held_out) == len(given)
     assert told.startswith(f"validation: {len(apart)} of {scenes} scenes set aside, {2 * len(apart)} crops: ")
-    # The order of the crops, and that of folders, change nothing.
+    # The order of crops and of folders changes nothing.
     assert {crop.scene for crop in split(given[::-1], (), share).held_out} == apart
 
 

@@ -109,7 +109,7 @@ class BDPT(GradientIntegrator):
         film.put_all(values)
 
     def samples(self, plan: Plan, camera: CameraSamples, sums: tuple = ()) -> tuple[dict, tuple]:
-        """Layers, and the ``sums`` of splats with those of paths from lights, if there are any."""
+        """Layers, and the ``sums`` of splats with the splats of paths from lights added, if there are any."""
         sight, lit = Sight.of(camera), None
         if plan.joins:
             splatter = Splatter(Splats.on(sight.eye.pixels, 3, sums), sight.ray, sight.importance)

@@ -93,7 +93,7 @@ class GBDPT(BDPT):
 
     def samples(self, plan: Plan, camera: CameraSamples, sums: Any = None) -> tuple:
         """Layers, Δ in the order of SHIFTS and where it is on the film, what is marked, which paths are bent, and the
-        ``sums`` of splats and the ``Worth`` of paths from lights, with those of this pass."""
+        ``sums`` of splats and the ``Worth`` of paths from lights, with this pass added."""
         ray, importance, _ = camera.rays()
         inside = [camera.rays(shift)[2] for shift in SHIFTS.values()]
         rater = None
@@ -136,7 +136,7 @@ def shift_bent(frozen: Frozen, plan: Plan, camera: CameraSamples, bent: mi.Bool,
 
 
 def bent_differences(plan: Plan, camera: CameraSamples, alone: mi.Bool) -> list[mi.Color3f]:
-    """Δ in the order of SHIFTS of the camera paths that are ``alone``, those that are bent."""
+    """Δ in the order of SHIFTS of bent camera paths only, in the lanes where ``alone`` is true."""
     return both_paths(plan, camera, Unseen(), alone)[2]
 
 

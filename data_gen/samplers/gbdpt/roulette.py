@@ -45,7 +45,7 @@ class Worth:
 
     @classmethod
     def nothing(cls, lanes: int, longest: int) -> Worth:
-        """That of so many ``lanes``, of light paths of at most ``longest`` edges, before they are traced."""
+        """The worth of so many ``lanes`` of light paths, of at most ``longest`` edges, before they are traced."""
         places = lanes * min(RATED, longest - 1)
         worth = cls(dr.zeros(mi.Float, places), dr.zeros(mi.UInt32, places), mi.UInt32(lanes))
         dr.make_opaque(worth)

@@ -127,9 +127,10 @@ def _inflated(file: BinaryIO, size: int) -> bytes:
 
 
 def _unfiltered(lines: np.ndarray, step: int) -> np.ndarray:
-    """(rows, bytes) of (rows, 1 + bytes), of which the first says what was taken off the row, in pixels of ``step``.
+    """Undoes the filters of rows: (rows, 1 + bytes) -> (rows, bytes). The first byte of a row is its filter.
 
-    A pixel needs those to its left, above, and above that. So all on a diagonal are done at once.
+    ``step`` is the number of bytes of a pixel. A pixel needs the ones to its left, above, and above left. So all on a
+    diagonal are done at once.
     """
     filters, coded = lines[:, 0], lines[:, 1:]
     if filters.max(initial=0) > 4:

@@ -14,7 +14,7 @@ import numpy as np
 from ngpt.io.foreign.form import Damage, Form, Unread
 
 _MOST = 2**16  # bytes of the header
-_SHORTEST, _LONGEST = 8, 0x7FFF  # lines in between are those of the newer run lengths
+_SHORTEST, _LONGEST = 8, 0x7FFF  # lines of a length in between may have the newer run lengths
 
 
 def describe(file: BinaryIO) -> Form:

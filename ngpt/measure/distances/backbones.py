@@ -113,7 +113,7 @@ def _checked(kind: type[SqueezeNet] | type[Vgg16], file: Path) -> dict[str, Tens
 def load(kind: type[SqueezeNet] | type[Vgg16], path: str = "") -> nn.Module:
     """A backbone with torchvision's weights, from ``path`` or PyTorch's cache, frozen.
 
-    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if its SHA-256 is that of the file,
+    A .safetensors is read as it is. torchvision's own file, a pickle, is read only if its SHA-256 is the known one,
     whatever its name, and then by the reader of PyTorch that takes tensors and no code. Raises NgptError where there is
     no such file, it is another, or it has other tensors.
     """
