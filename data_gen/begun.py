@@ -172,8 +172,11 @@ class Asked:
             ("options", options, wanted if entry else options),
         ):
             if theirs != asked:
+                # Names alike differ in the checksum, which says nothing to anybody.
+                alike = what == "scene" and theirs.rpartition(" ")[0] == asked.rpartition(" ")[0]
+                why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
                 raise NgptError(
-                    f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}; give another name, or "
+                    f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}{why}; give another name, or "
                     "--force in place of --skip-existing to replace it"
                 )
 

@@ -52,7 +52,8 @@ def test_a_file_is_finished_where_it_has_what_is_asked_for(tmp_path):
 def test_a_file_of_another_render_is_neither_taken_nor_replaced(tmp_path):
     path = there(tmp_path / "a.exr", samplerOptions="lamps=uniform")
     for what, asked in {
-        "scene box 1, not box 2": Asked("box 2", 3, spp=9),
+        "scene box 1, not ball 1": Asked("ball 1", 3, spp=9),
+        r"scene box 1, not box 2 \(its file, -D, --sensor, .* was another\)": Asked("box 2", 3, spp=9),
         "size 16x12, not 16x16": Asked("box 1", 3, size=(16, 16), spp=9),
         "seed 3, not 4": Asked("box 1", 4, spp=9),
         "sampler gpt, not primal": Asked("box 1", 3, "primal", spp=9),
