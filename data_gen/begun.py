@@ -176,8 +176,8 @@ class Asked:
                 alike = what == "scene" and theirs.rpartition(" ")[0] == asked.rpartition(" ")[0]
                 why = " (its file, -D, --sensor, --camera, --fps or --dt was another)" if alike else ""
                 raise NgptError(
-                    f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}{why}; give another name, or "
-                    "--force in place of --skip-existing to replace it"
+                    f"{path}: is another render: {what} {_text(theirs)}, not {_text(asked)}{why}; give another name, "
+                    "or --force in place of --skip-existing to replace it"
                 )
 
 

@@ -54,25 +54,37 @@ def reconstruct_with_error(
     ``stack`` was merged from: half as many values are then more than five standard errors off, in four times the time.
 
     The error is NaN in pixels where a variance is not finite, since their noise is unknown. The same stacks
-    give the same bits. Raises NgptError where the stack has no variances or a half is of another size, and as
-    ``reconstruct`` does.
+    give the same bits. Raises NgptError where the stack has no variances, where a half is of another size or place,
+    or both halves have the same seed, and as ``reconstruct`` does.
     """
     result = reconstruct(stack, method, **options)
     again = reconstruct(noisier(stack), method, **options)
     factor, known = FACTORS.get(result.method, FACTOR), known_noise(stack)
     error, seconds = change(result.image, again.image, known), result.seconds + again.seconds
     if halves is not None:
-        for half in halves:
-            if (half.width, half.height) != (stack.width, stack.height):
-                raise NgptError(
-                    f"a half of the samples is {half.width}x{half.height} and the stack {stack.width}x{stack.height}; "
-                    "give two stacks of the same view, such as those that it was merged from"
-                )
+        _check_halves(stack, halves)
         one, other = (reconstruct(half, result.method, **options) for half in halves)
         # Each half has twice the variance, so their difference has four times the variance of their mean.
         error = np.sqrt((error**2 + (change(one.image, other.image, known) / 2) ** 2) / 2)
         seconds += one.seconds + other.seconds
     return replace(result, error=(factor * error).astype(np.float32), seconds=seconds)
+
+
+def _check_halves(stack: GradientStack, halves: tuple[GradientStack, GradientStack]) -> None:
+    """Raises NgptError where they cannot be halves of the samples of the stack."""
+    for half in halves:
+        known = half.place.known and stack.place.known
+        if half.place.data != stack.place.data if known else half.place.data.size != stack.place.data.size:
+            raise NgptError(
+                f"a half of the samples is {half.place} and the stack {stack.place}; give two stacks of the same view, "
+                "such as those that it was merged from"
+            )
+    one, other = (set(str(half.attributes.get("ngpt:seed", "")).split()) for half in halves)
+    if both := one & other:
+        raise NgptError(
+            f"both halves were rendered with seed {min(both)}: the same samples twice differ in nothing; give two "
+            "stacks of different seeds"
+        )
 
 
 def known_noise(stack: GradientStack) -> np.ndarray:

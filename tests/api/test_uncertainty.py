@@ -1,6 +1,7 @@
 """The standard error of a reconstruction: what it says of noise, of scale, and of what a stack must hold."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
+from ngpt.windows import Place, Window
 
 
 @pytest.fixture
@@ -67,6 +69,19 @@ def test_halves_show_a_blotch_that_variances_do_not(stack, rng):
     with pytest.raises(NgptError, match=r"half of the samples is 20x32 and the stack 48x32"):
         small = GradientStack({name: stack[name][:, :20] for name in stack.names})
         ngpt.reconstruct_with_error(merged, "wcv", halves=(small, other))
+
+
+def test_halves_are_of_one_place_and_of_different_seeds(stack):
+    def half(seed, left=0):
+        place = Place(Window(left, 0, 48, 32), Window(0, 0, 96, 32))
+        return replace(stack, attributes={"ngpt:seed": seed}, place=place)
+
+    whole = half("1 2 3")
+    assert ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1"), half("2 3"))).error is not None
+    with pytest.raises(NgptError, match=r"48x32 at \(48, 0\) .* and the stack 48x32 at \(0, 0\)"):
+        ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1"), half("2", left=48)))
+    with pytest.raises(NgptError, match="both halves were rendered with seed 2"):
+        ngpt.reconstruct_with_error(whole, "wcv", halves=(half("1 2"), half("2 3")))
 
 
 def test_without_noise_there_is_none(stack):
