@@ -39,8 +39,8 @@ def way(sources: Sequence[Path], names: Mapping[str, str], by_wcv: bool) -> tupl
 
 def motion_hint(pairs: Sequence[tuple[Path, Path]], reports: Sequence[dict], args: argparse.Namespace) -> str:
     """What to say of a shot without motion, and of layers that may hold it; "" for a shot with motion."""
-    why = {report.get("why no history") for report in reports[1:] if not {"skipped", "error"} & report.keys()}
-    if why != {NO_MOTION}:
+    why = [report["why no history"] for report in reports[1:] if "why no history" in report]
+    if not why or any(reason != NO_MOTION for reason in why):
         return ""
     stack = read_views(pairs[-1][0], dict(args.layer), args.untrusted, view=args.view)[0]
     proposed = propose(stack.source.view.parts, stack.source.resolution).get("motion") if stack.source else None
