@@ -94,7 +94,7 @@ def render_stack(
 
     def look(film: GradientFilm) -> None:
         whole[:] = [film]
-        newest(lambda: stack_of(film, sensor, seed, sampler, start, False, {}))
+        newest(lambda: stack_of(film, sensor, seed, sampler, start, {}))
 
     limits["look"] = look
     # Of samples that time may end nobody knows how many there will be, though no more than ``spp``.
@@ -125,7 +125,7 @@ def render_stack(
     chosen = chosen | {"ngpt:spp": done} | options_as_attribute(entry, settings)
     if failed or (stop() and (spp is None or done < spp)):
         chosen[UNFINISHED] = "failed" if failed else "interrupted"
-    stack = stack_of(film, sensor, seed, sampler, start, diagnostics, chosen)
+    stack = stack_of(film, sensor, seed, sampler, start, chosen, diagnostics=diagnostics)
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack
@@ -143,8 +143,9 @@ def stack_of(
     seed: int,
     sampler: str,
     start: float,
-    diagnostics: bool,
     more: dict[str, Any],
+    *,
+    diagnostics: bool = False,
 ) -> GradientStack:
     """The stack of a sensor's film, whose rendering began at ``start`` (time.perf_counter()), with ``more`` attributes.
 

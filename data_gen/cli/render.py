@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--diagnostics",
         action="store_true",
-        help="write the rates of failed shifts and of discarded values for each pixel too",
+        help="write each pixel's rates of failed shifts and lost values",
     )
     parser.add_argument(
         "--live",

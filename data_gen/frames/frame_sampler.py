@@ -64,6 +64,8 @@ class Remembering:
             self._sampler = self.entry.made(scene, self.seed, self.spp, self.memory, **self.options)
         film = self._sampler.film(index, motion, depth, (scene, shapes) if self.changes else None)
         more = {"ngpt:confidence": self._sampler.confidence} | options_as_attribute(self.entry, self.options)
-        stack = stack_of(film, scene.sensors()[0], self.seed, self.entry.name, start, self.diagnostics, more)
+        stack = stack_of(
+            film, scene.sensors()[0], self.seed, self.entry.name, start, more, diagnostics=self.diagnostics
+        )
         progress(self.spp, self.spp)
         return stack

@@ -61,7 +61,8 @@ class Frozen:
             return tried(self.functions[f])
         except RuntimeError as error:
             stop_if_interrupted(error)
-            result, self.functions[f] = tried(f), f
+            self.functions[f] = evaluated(f)
+            result = tried(self.functions[f])
             _say(f, " ".join(str(error.__cause__ or error).split()))
             return result
 
@@ -117,6 +118,8 @@ def mapped(f: Callable, value: Any) -> Any:
         return type(value)(mapped(f, part) for part in value)
     if isinstance(value, dict):
         return {key: mapped(f, part) for key, part in value.items()}
+    if dr.is_tensor_v(value):
+        return type(value)(f(value.array), value.shape)
     if dr.is_array_v(value):
         if not dr.is_jit_v(value):
             return value
@@ -132,6 +135,9 @@ def leaves(value: Any) -> list:
         parts = value
     elif isinstance(value, dict):
         parts = value.values()
+    elif dr.is_tensor_v(value):
+        # Iterating over a tensor would slice it, row by row and element by element.
+        return [value.array]
     elif dr.is_array_v(value):
         if dr.is_jit_v(value) and dr.depth_v(value) == 1:
             return [value]
@@ -150,6 +156,17 @@ def fields(value: Any) -> Iterable[str]:
 def call(f: Callable, *args: Any) -> Any:
     """The same, recorded each time."""
     return f(*args)
+
+
+def evaluated(f: Callable) -> Callable:
+    """f, whose results are evaluated at once, as those of frozen functions are: else each use would trace them anew."""
+
+    def computed(*args: Any) -> Any:
+        result = f(*args)
+        dr.eval(result)
+        return result
+
+    return computed
 
 
 def arrays(owner: Any) -> list:

@@ -260,7 +260,7 @@ def test_render_denoise_diff(renderer, tmp_path, capsys):
     captured = capsys.readouterr()
     assert json.loads(captured.out)["layers"][:4] == ["primal", "direct", "dx", "dy"]
     # No terminal here: plain lines, first and last among them.
-    assert "render diffuse: 0/16 spp\n" in captured.err and "render diffuse: 16/16 spp" in captured.err
+    assert "render diffuse: 0/16 spp" in captured.err and "render diffuse: 16/16 spp" in captured.err
     assert main(["render", "diffuse", "-o", ref, "--spp", "512", "--sampler", "primal", "--size", "128x96", "-q"]) == 0
     assert main(["denoise", stack, "-o", out, "--method", "l1", "-q"]) == 0
     errors = []

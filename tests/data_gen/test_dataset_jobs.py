@@ -58,7 +58,7 @@ def test_configurations_can_be_read():
         ("scenes = 0", "no scenes"),
         ("scenes = 1\nsampler = 'gtp'", "unknown sampler 'gtp'"),
         ("scenes = 1\nsampler = 'primal'", "reference_method 'wcv' needs gradients, and sampler 'primal' renders none"),
-        ("scene = 3", "unknown key 'scene'; there are: seed, size"),
+        ("scene = 3", "unknown key 'scene'; did you mean 'scenes'\\? there are: seed, size"),
         ("seed = ", "cannot be read"),
         ("scenes = 1\nsights = {media = 1.0}", "set varied = true"),
         ("scenes = 1\nvaried = true\nsights = {fog = 1.0}", "no sight is called 'fog'; there are fine, hair"),

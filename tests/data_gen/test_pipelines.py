@@ -128,7 +128,7 @@ def test_a_plan_fits_into_the_time_and_leaves_the_scene_as_it_was(renderer, monk
     assert found.sampler in ("gpt", "primal") and found.method in plans.methods_for(found.sampler)
     assert 0 < found.render < 200 and "expected to leave an error of" in found.reason
     assert tuple(scene.sensors()[0].film().size()) == (48, 32)
-    with pytest.raises(NgptError, match="there is no method 'none'"):
+    with pytest.raises(NgptError, match="unknown method 'none'"):
         plans.plan(scene, 200.0, "none")
     # Where there is no time for a pilot the description decides, and what is left is rendered.
     found = plans.plan(scene, 1.0, "wcv", clock=ticking(0.1))

@@ -5,6 +5,7 @@ import pytest
 from data_gen_scenes import leaf
 from unbiased import load, render_ours, render_references, right_integrator
 
+from ngpt.errors import NgptError
 from ngpt.testing import z_test
 
 
@@ -47,7 +48,7 @@ def test_elsewhere_it_is_the_integrator_itself(renderer, more):
         def sample(self, *_):
             raise Called
 
-    with pytest.raises(Called):
+    with pytest.raises(NgptError, match="Called"):
         radiance(scene, Own())(None, None, None, True)
 
 

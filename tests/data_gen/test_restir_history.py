@@ -54,7 +54,7 @@ class Room:
         for frame in range(count):
             now = self.at(frame)
             # Shapes do not move, and are not looked at.
-            now = type(now)(() if before is None else before.shapes, now.film)
+            now = type(now)(() if before is None else before.shapes, now.film, now.place)
             motion = None if before is None else motion_vectors(self.scene, now, before)
             values, before = history.next_frame(motion), now
             yield history, {n: images(getattr(values, n), chains) for n in ("path", "primal", "dx", "dy")}

@@ -86,7 +86,7 @@ class GBDPT(BDPT):
         if plan.joins:
             splats["primal"].take(sums[0])
             threshold = thresholds(camera, values["primal"] - values["direct"], splats["primal"])
-            shift_splats(frozen, plan, camera, splats, sums[1], marks, threshold)
+            shift_splats(frozen, plan, camera, splats, sums[1], marks=marks, threshold=threshold)
         if not plan.materials.all_connectable:
             shift_bent(frozen, plan, camera, bent, Δ)
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
@@ -146,6 +146,7 @@ def shift_splats(
     camera: CameraSamples,
     splats: dict[str, Splats],
     worth: Worth,
+    *,
     marks: mi.UInt64,
     threshold: mi.Float,
 ) -> None:
