@@ -51,7 +51,8 @@ def reconstruct_with_error(
     """As ``ngpt.reconstruct``, with ``Result.error``: the standard error of the image, (H, W, 3) float32, in its unit.
 
     It takes twice the time. ``halves`` are two stacks of independent halves of the samples, such as those that
-    ``stack`` was merged from: half as many values are then more than five standard errors off, in four times the time.
+    ``stack`` was merged from: 0.4 to 0.75 times as many values are then more than five standard errors off, in four
+    times the time.
 
     The error is NaN in pixels where a variance is not finite, since their noise is unknown. The same stacks
     give the same bits. Raises NgptError where the stack has no variances, where a half is of another size or place,
