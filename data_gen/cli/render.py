@@ -89,7 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--diagnostics",
         action="store_true",
-        help="write each pixel's rates of failed shifts and lost values",
+        help="write rates of failed shifts and of lost values too",
     )
     parser.add_argument(
         "--live",
@@ -136,7 +136,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     existing.add_argument(
         "--skip-existing",
         action="store_true",
-        help="leave out what is there already with all that is asked for, and go on with what is there in part",
+        help="leave out what is finished, and go on with what is there in part",
     )
     add_json(parser)
 

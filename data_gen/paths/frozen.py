@@ -118,9 +118,9 @@ def mapped(f: Callable, value: Any) -> Any:
         return type(value)(mapped(f, part) for part in value)
     if isinstance(value, dict):
         return {key: mapped(f, part) for key, part in value.items()}
-    if dr.is_tensor_v(value):
-        return type(value)(f(value.array), value.shape)
     if dr.is_array_v(value):
+        if dr.is_tensor_v(value):
+            return type(value)(f(value.array), value.shape)
         if not dr.is_jit_v(value):
             return value
         return f(value) if dr.depth_v(value) == 1 else type(value)(*(mapped(f, part) for part in value))
@@ -135,10 +135,10 @@ def leaves(value: Any) -> list:
         parts = value
     elif isinstance(value, dict):
         parts = value.values()
-    elif dr.is_tensor_v(value):
-        # Iterating over a tensor would slice it, row by row and element by element.
-        return [value.array]
     elif dr.is_array_v(value):
+        if dr.is_tensor_v(value):
+            # Iterating over a tensor would slice it, row by row and element by element.
+            return [value.array]
         if dr.is_jit_v(value) and dr.depth_v(value) == 1:
             return [value]
         parts = value if dr.is_jit_v(value) else ()

@@ -81,10 +81,12 @@ class _Parser(argparse.ArgumentParser):
 
 
 class _Top(_Parser):
-    """The parser of ``ngpt`` itself: its help lists the verbs under headings."""
+    """The parser of ``ngpt`` itself: its help lists the ``verbs`` under headings."""
+
+    verbs: dict[str, Verb]
 
     def format_help(self) -> str:
-        formatter, verbs = self._get_formatter(), all_verbs()
+        formatter, verbs = self._get_formatter(), self.verbs
         group: Any = self._subparsers
         formatter.add_usage(self.usage, self._actions, self._mutually_exclusive_groups)
         formatter.add_text(self.description)
@@ -151,6 +153,7 @@ def _parser(called: str, verbs: dict[str, Verb]) -> argparse.ArgumentParser:
             raise WrongUse(f"there is no verb '{called}' here; {no_renderer()}")
         raise WrongUse(f"there is no verb '{called}'; {meant}verbs: {', '.join(verbs)}; see `ngpt --help`")
     parser = _Top(prog="ngpt", description="Gradient-domain reconstruction of Monte Carlo renderings.")
+    parser.verbs = verbs
     parser.epilog = "Exit status: 0 done, 1 work failed or images differ, 2 wrong use, 130 Ctrl-C, 143 SIGTERM."
     parser.add_argument("--version", action="version", version=f"ngpt {__version__}")
     parser.add_argument(
