@@ -624,7 +624,8 @@ def test_mirrors_in_front_of_the_camera_are_followed(renderer, long_passes, monk
         return scene
 
     def noise():
-        layers = render_ours(load(renderer, behind_a_mirror, (24, 24)), "gbdpt", 1, 256)[0]
+        # Independent points: claims of four batches of a net go by few pixels here.
+        layers = render_ours(load(renderer, behind_a_mirror, (24, 24)), "gbdpt", 1, 256, points="independent")[0]
         return layers["dx_var"].mean() + layers["dy_var"].mean()
 
     followed = noise()
