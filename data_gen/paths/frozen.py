@@ -159,7 +159,7 @@ def call(f: Callable, *args: Any) -> Any:
 
 
 def evaluated(f: Callable) -> Callable:
-    """f with results that are evaluated at once, as frozen functions do. Each use of lazy ones would trace all paths."""
+    """f, with its results evaluated at once, as frozen functions do it: each use of lazy ones would trace all paths."""
 
     def computed(*args: Any) -> Any:
         result = f(*args)
