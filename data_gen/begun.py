@@ -19,7 +19,7 @@ import numpy as np
 
 from data_gen.samplers import FRAME_SAMPLERS, find
 from ngpt.errors import NgptError
-from ngpt.io.exr import pass_through, read, write
+from ngpt.io.exr import MADE_BY, pass_through, read, with_channels, write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.merging import DIAGNOSTICS, UNFINISHED, merge
@@ -183,11 +183,20 @@ class Asked:
 
 def begun_stack(path: Path, diagnostics: bool) -> GradientStack:
     """What a file has of a render; raises NgptError where the rest of it would have other channels."""
-    stack = read(path)
-    if diagnostics != any(name.startswith(DIAGNOSTICS) for name in pass_through(stack)):
+    stack = rendered(read(path))
+    if diagnostics != bool(pass_through(stack)):
         has, remedy = ("none", "leave --diagnostics out") if diagnostics else ("some", "pass --diagnostics")
         raise NgptError(f"{path}: has {has} of the channels that --diagnostics writes; {remedy}, or give another name")
     return stack
+
+
+def rendered(read: GradientStack) -> GradientStack:
+    """What was rendered of a stack that was read from a file: without the image that a method made of it, if any."""
+    layers = {name: read[name] for name in read.names if name != "error"}
+    attributes = {name: value for name, value in read.attributes.items() if name not in MADE_BY}
+    further = {name: channel for name, channel in pass_through(read).items() if name.startswith(DIAGNOSTICS)}
+    stack = GradientStack(layers, attributes, path=read.path, place=read.place)
+    return with_channels(stack, further) if further else stack
 
 
 def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
@@ -203,18 +212,23 @@ def joined(begun: GradientStack, rest: GradientStack) -> GradientStack:
     return whole
 
 
+def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> GradientStack:
+    """``joined``; where that fails, the rest is written beside ``path``, and NgptError says so."""
+    try:
+        return joined(begun, rest)
+    except NgptError as error:
+        other = path.with_name(f"{path.stem}.rest.exr")
+        save(other, lambda path, overwrite: write(path, rest, overwrite=overwrite))
+        raise NgptError(f"{error}; what was rendered now is in {other}") from error
+
+
 def write_part(path: Path, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None) -> GradientStack:
     """Writes a stack, in place of the one that was ``begun`` and together with it; returns what is written.
 
     Nothing that was rendered is lost: what cannot be written there goes elsewhere (``ngpt.system.files.save``).
     """
     if begun is not None:
-        try:
-            stack, overwrite = joined(begun, stack), True
-        except NgptError as error:
-            other = path.with_stem(f"{path.stem}.rest")
-            save(other, lambda path, overwrite: write(path, stack, overwrite=overwrite))
-            raise NgptError(f"{error}; what was rendered now is in {other}") from error
+        stack, overwrite = joined_or_kept(path, stack, begun), True
     save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite), overwrite)
     return stack
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name, write_part
+from data_gen.begun import Asked, Rest, Unfinished, begun_stack, scene_name
 from data_gen.frames.pattern import filled
+from data_gen.outputs import Denoising, Output
 from data_gen.samplers import FRAME_SAMPLERS
 from data_gen.session import DEFAULT_SPP, render_frames
 from ngpt.errors import NgptError, WrongUse
@@ -42,21 +43,27 @@ def write_frames(
     shard: tuple[int, int] = (0, 1),
     overwrite: bool = False,
     skip_existing: bool = False,
+    denoising: Denoising | None = None,
     made: Callable[[Written, int], None] = lambda written, total: None,
     stop: Callable[[], bool] = lambda: False,
     **options: Any,
 ) -> Written:
     """Writes the stack of each frame to its file, ``files``: frame -> file, all of the shot in order.
 
-    Only those of the part i of n where ``shard`` is (i, n). ``made`` is called with what is written so far and the
-    number of frames, at first and after each. ``options`` are those of ``render_frames``. Raises NgptError as that
-    does, and for files that exist unless one of ``overwrite`` and ``skip_existing`` says what to do with them.
+    With ``denoising`` its image instead, see ``data_gen.outputs``. Only those of the part i of n where ``shard`` is
+    (i, n). ``made`` is called with what is written so far and the number of frames, at first and after each.
+    ``options`` are those of ``render_frames``. Raises NgptError as that does, and for files that exist unless one of
+    ``overwrite`` and ``skip_existing`` says what to do with them.
     """
     number, parts = shard
     # Of frames side by side, each needs the scene of the one before.
     part_of = {frame: i * parts // len(files) for i, frame in enumerate(files)}
     ours = [frame for frame in files if part_of[frame] == number]
-    for frame in ours:
+    outputs = {frame: Output(files[frame], denoising) for frame in ours}
+    for frame, output in outputs.items():
+        output.check()
+        if skip_existing:
+            output.check_skipping()
         check_output(files[frame], overwrite or skip_existing, may_skip=True)
     written = Written()
     asked = {frame: asked_of(scene, frame, **options) for frame in ours}
@@ -74,6 +81,7 @@ def write_frames(
         if part_of[frame] != number or frame in gone_on:
             return True
         there = skip_existing and finished(files[frame]) and asked[frame].left(files[frame]) is None
+        there = there and outputs[frame].done(asked[frame])
         written.skipped += there
         return there
 
@@ -81,11 +89,12 @@ def write_frames(
         asked[frame].name(stack)
         cut = skip_existing and files[frame].exists() and not finished(files[frame])
         # Another machine may have been faster.
-        if not (skip_existing and asked[frame].done(files[frame])):
+        by: dict[str, Any] = {}
+        if not (skip_existing and outputs[frame].done(asked[frame])):
             before = begun_stack(files[frame], bool(options.get("diagnostics"))) if frame in gone_on else None
-            stack = write_part(files[frame], stack, overwrite or cut, before)
+            stack, by = outputs[frame].write(stack, overwrite or cut, before)
         said = {"in place of": "a file that was not whole"} if cut else {}
-        written.frames.append(report_of(stack, files[frame]) | said)
+        written.frames.append(report_of(stack, files[frame], by) | said)
         made(written, len(ours))
 
     def write_all(skip: Callable[[int], bool], more: Mapping[str, Any]) -> None:
@@ -142,9 +151,13 @@ def asked_of(
     return Asked(name, seed, sampler, options, size, spp, seconds, frame=frame)
 
 
-def report_of(stack: GradientStack, file: Path) -> dict[str, Any]:
-    """What ``ngpt render --json`` says of a stack: its file, its size, and the attributes of ours, by short names."""
-    ours = {name.removeprefix("ngpt:"): value for name, value in stack.attributes.items() if "ngpt:" in name}
+def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
+    """What ``ngpt render --json`` says of a stack: its file, its size, and the attributes of ours, by short names.
+
+    ``made`` are those of its image, if any.
+    """
+    attributes = {**stack.attributes, **made}
+    ours = {name.removeprefix("ngpt:"): value for name, value in attributes.items() if "ngpt:" in name}
     return {"output": str(file), "width": stack.width, "height": stack.height} | ours
 
 

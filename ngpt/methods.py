@@ -208,6 +208,15 @@ def unknown_method(name: str) -> WrongUse:
     return WrongUse(f"unknown method '{name}'; {meant}choose one of: auto, {', '.join(by_standing('use', 'niche'))}")
 
 
+def runnable(name: str) -> Method:
+    """The method of that name. Raises WrongUse where there is none, and NgptError where it does not run here."""
+    if name not in METHODS:
+        raise unknown_method(name)
+    if lack := METHODS[name].missing():
+        raise NgptError(f"method '{name}' cannot be used: {lack}; name another, or auto")
+    return METHODS[name]
+
+
 # The best first, by the errors that docs/lab/RESULTS.md has for the layers of a stack. ngpt-primal is not in it: beside
 # OIDN's mean error it leaves 0.78 to 0.84 times in rooms, but 1.13 to 1.49 times in simple scenes.
 ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")

@@ -48,6 +48,7 @@ data_gen.uneven
 data_gen.samplers
 data_gen.made
 data_gen.adaptive data_gen.begun
+data_gen.outputs
 data_gen.plugins
 data_gen.backend
 data_gen.render data_gen.inspect

@@ -27,9 +27,8 @@ import numpy as np
 from data_gen.adaptive import LEAST, Adaptive, assess, gain
 from data_gen.choosing.trials import Trial, Witnesses
 from data_gen.samplers import SAMPLERS
-from ngpt.errors import NgptError
 from ngpt.merging import merge
-from ngpt.methods import METHODS, reconstruct, unknown_method
+from ngpt.methods import METHODS, reconstruct, runnable
 from ngpt.stack import GradientStack
 
 # The best of each kind of stack at some number of samples; what is not here is behind one of them, or far slower.
@@ -209,12 +208,8 @@ def methods_for(sampler: str, only: str = "auto") -> list[str]:
     """What may reconstruct the sampler's stacks, of what runs here."""
     names: tuple[str, ...] = WITH_GRADIENTS if SAMPLERS[sampler].gradients else WITHOUT
     if only != "auto":
-        if only not in METHODS:
-            raise unknown_method(only)
-        lack = METHODS[only].missing()
-        if lack:
-            raise NgptError(f"method '{only}' cannot be used: {lack}; name another, or auto")
-        names = (only,) if SAMPLERS[sampler].gradients or "dx" not in METHODS[only].needs else ()
+        needs = runnable(only).needs
+        names = (only,) if SAMPLERS[sampler].gradients or "dx" not in needs else ()
     return [m for m in names if not METHODS[m].missing()]
 
 

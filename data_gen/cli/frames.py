@@ -61,8 +61,6 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
     found = {number: Path(filled(pattern, number)) for number in numbers}
     seen: dict[Path, int] = {}
     for number, path in found.items():
-        if path.suffix.lower() != ".exr":
-            raise WrongUse(f"{path}: ngpt writes OpenEXR; let the name end in .exr")
         if (other := seen.setdefault(path, number)) != number:
             raise WrongUse(f"{path}: would be frame {other} and frame {number}; write {{frame:04d}} in the name")
     for path in found.values():

@@ -19,6 +19,9 @@ from ngpt.system.console import Console
 from ngpt.system.files import make_folder
 from ngpt.windows import Place, put
 
+# Kinds of files that hold results
+IMAGES = (".exr", ".pfm", *PICTURES)
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.epilog = (
@@ -108,18 +111,23 @@ def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
     return image[seen.within(place.data)]
 
 
+def check_image(target: Path) -> None:
+    """Raises an error for what cannot be the file of a result, or of one that this machine cannot make."""
+    kind = target.suffix.lower()
+    if kind not in IMAGES:
+        raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")
+    if kind in PICTURES:
+        check_kind(target, PICTURES)
+
+
 def check_picture(target: Path, args: argparse.Namespace) -> None:
     """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
-    kinds = (".pfm", *PICTURES)
-    if target.suffix.lower() not in kinds:
-        raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in .exr {' '.join(kinds)}")
+    check_image(target)
     for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
         if given:
             raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:
         raise WrongUse(f"--skip-existing knows whole files of OpenEXR alone; leave it out for {target}")
-    if target.suffix.lower() in PICTURES:
-        check_kind(target, PICTURES)
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:

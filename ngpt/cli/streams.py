@@ -37,7 +37,7 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
     """The names of inputs and output with files in the place of ``-``.
 
     What comes by standard input is there when the block begins. What the block has written goes to standard output when
-    it ends well. OpenEXR files are read and written here and there, so neither can do without a file.
+    it ends. OpenEXR files are read and written here and there, so neither can do without a file.
 
     Raises NgptError for ``-`` beside other inputs, without an output, and for images that would go to a terminal.
     """
@@ -57,9 +57,12 @@ def as_files(stacks: list[str], output: str | None) -> Iterator[tuple[list[str],
             return
         with tempfile.TemporaryDirectory(prefix="ngpt-") as folder:
             target = Path(folder) / "standard-output.exr"
-            with called(str(target), "standard output"):
-                yield inputs, str(target)
-            if target.exists():
-                with target.open("rb") as file:
-                    shutil.copyfileobj(file, sys.stdout.buffer)
-                sys.stdout.buffer.flush()
+            try:
+                with called(str(target), "standard output"):
+                    yield inputs, str(target)
+            finally:
+                # Also of a render that failed, which has written what was done before.
+                if target.exists():
+                    with target.open("rb") as file:
+                        shutil.copyfileobj(file, sys.stdout.buffer)
+                    sys.stdout.buffer.flush()

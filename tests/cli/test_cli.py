@@ -202,7 +202,7 @@ def test_info_prints_the_aliases(capsys):
         (["info", "missing.exr"], "missing.exr: not found"),
         (["render", "diffuse", "--size", "0x5"], "'0x5' is not a size"),
         (["render", "diffuse", "--spp", "0"], "'0' is not a whole number of 1 or more"),
-        (["render", "diffuse", "-o", "{dir}/s.png"], "let the name end in .exr"),
+        (["render", "diffuse", "-o", "{dir}/s.tga"], "let the name end in .exr"),
         (["frobnicate"], "there is no verb 'frobnicate'; verbs: denoise"),
         ([], "required: VERB"),
     ],

@@ -1,0 +1,133 @@
+"""The arguments of ``ngpt render``."""
+
+import argparse
+
+from data_gen.cli.frames import frames
+from data_gen.samplers import by_standing
+from data_gen.session import DEFAULT_SPP
+from ngpt.cli.arguments import Names, add_force, add_json, assignment, duration, natural, part, positive, size
+from ngpt.cli.picture import IMAGES, add_look
+from ngpt.methods import METHODS
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", help="a Mitsuba 3 scene file, or a built-in scene (see `ngpt info`)")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="FILE",
+        help="stack to write (default: SCENE.exr in this folder; -: standard output); of another kind "
+        f"({' '.join(IMAGES[1:])}) it is the denoised image",
+    )
+    parser.add_argument(
+        "--denoise",
+        nargs="?",
+        const="auto",
+        metavar="METHOD",
+        choices=Names(METHODS),
+        help="write the image that this method makes of the stack, as `ngpt denoise` would (default: what --for names "
+        "or a pilot chooses, else auto); in .exr the stack is in it, too",
+    )
+    parser.add_argument("--keep", metavar="STACK", help="write the stack as well, beside a picture for example")
+    add_look(parser)
+    parser.add_argument("--spp", type=positive, help=f"paths per pixel (default: {DEFAULT_SPP})")
+    parser.add_argument(
+        "--time",
+        type=duration,
+        metavar="SECONDS",
+        help="render for this long, kernel compilation included; with --spp: until the first is reached",
+    )
+    parser.add_argument(
+        "--adaptive",
+        action="store_true",
+        help="more samples where the error of the result is large; --spp is then their mean",
+    )
+    parser.add_argument(
+        "--error",
+        type=float,
+        metavar="E",
+        help="--adaptive, until the result is expected to have this relative error (0.05: 5 %%); --spp and --time may "
+        "end it before",
+    )
+    parser.add_argument(
+        "--for",
+        dest="method",
+        metavar="METHOD",
+        help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv). With "
+        "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
+        "too. --time is then that of pilot, render and method",
+    )
+    parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the film (default: the scene's own)")
+    parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")
+    first = "; ".join(f"{name}: {entry.summary}" for name, entry in by_standing("use").items())
+    others = ", ".join(by_standing("niche"))
+    parser.add_argument(
+        "--sampler",
+        default="auto",
+        metavar="NAME",
+        help=f"auto: by the scene and a pilot (default); {first}; for some scenes: {others}. See `ngpt info`",
+    )
+    parser.add_argument(
+        "-O",
+        "--option",
+        action="append",
+        default=[],
+        type=assignment,
+        metavar="NAME=VALUE",
+        help="of the sampler; may be repeated. See `ngpt info NAME`",
+    )
+    parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
+    parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
+    parser.add_argument(
+        "--diagnostics",
+        action="store_true",
+        help="write rates of failed shifts and of lost values too",
+    )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="serve a page on 127.0.0.1 that shows the render, noisy and denoised, while it goes on",
+    )
+    parser.add_argument("--view", metavar="HOST:PORT", help="send the same to tev (its own: 127.0.0.1:14158)")
+    parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")
+    parser.add_argument(
+        "-D", dest="define", action="append", default=[], type=assignment, metavar="NAME=VALUE", help="scene parameter"
+    )
+    shot = parser.add_argument_group(
+        "shots",
+        "SCENE, the values of -D and the output may hold {frame}, {frame:04d} or {10 + frame * 3:.2f}. The output may "
+        "be a folder.",
+    )
+    shot.add_argument(
+        "--frames",
+        type=frames,
+        metavar="FRAMES",
+        help="frames to render, a stack with motion vectors for each: 0:120 (120 is not in it), 0:120:2, 1,5,9; "
+        "as farms write them: 1-10 (10 is in it), 1-9x2",
+    )
+    shot.add_argument(
+        "--camera",
+        metavar="PATH",
+        help="of the camera: key frames (.json), or a file with an animated one (.glb, .gltf)",
+    )
+    shot.add_argument(
+        "--dt",
+        type=positive,
+        default=0,
+        metavar="PAIRS",
+        help="differences to the frame before too, of so many pairs of paths a pixel (2 or more; a quarter of --spp "
+        "is enough), for `ngpt denoise --temporal -m wcv`",
+    )
+    shot.add_argument("--fps", type=float, default=24.0, help="frames a second of a .glb or .gltf (default: 24)")
+    shot.add_argument(
+        "--shard", type=part, metavar="i/n", help="render only this part of the frames, for job arrays: 0/4 to 3/4"
+    )
+    shot.add_argument("--cluster", metavar="ADDRESS", help="scheduler of a Dask cluster to render the frames on")
+    existing = parser.add_mutually_exclusive_group()
+    add_force(existing)
+    existing.add_argument(
+        "--skip-existing",
+        action="store_true",
+        help="leave out what is finished, and go on with what is there in part",
+    )
+    add_json(parser)

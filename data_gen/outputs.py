@@ -1,0 +1,130 @@
+"""Where a render goes: its stack into a file, or at once the image that a method makes of it.
+
+Such an image is what `ngpt denoise` makes of the stack, to the bit. In OpenEXR the whole stack is beside it, so that a
+render that was begun goes on from a result as from a stack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from data_gen.begun import Asked, joined_or_kept, write_part
+from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
+from ngpt.cli.picture import check_image
+from ngpt.errors import NgptError, WrongUse
+from ngpt.io.exr import write
+from ngpt.io.openexr import read_header
+from ngpt.io.whole import finished
+from ngpt.methods import reconstruct, runnable
+from ngpt.stack import GradientStack
+from ngpt.system.files import save
+
+
+@dataclass(frozen=True)
+class Denoising:
+    """``method`` is a name, or "auto": the one that a pilot has chosen (``ngpt:for``), else the best for the layers.
+
+    ``transform`` and ``exposure`` are those of a picture, as of `ngpt denoise`.
+    """
+
+    method: str = "auto"
+    transform: str = "standard"
+    exposure: float | str = 0.0
+
+    def check(self, sampler: str, spp: int | None) -> None:
+        """Raises an error for a method that does not run here, or that needs what such a render lacks."""
+        if self.method == "auto":
+            return
+        needs, entry = runnable(self.method).needs, SAMPLERS.get(sampler)
+        if "dx" in needs and (sampler in FRAME_SAMPLERS or (entry and not entry.gradients)):
+            raise WrongUse(
+                f"method '{self.method}' needs gradients, and sampler '{sampler}' renders none; name another"
+            )
+        if spp == 1 and any(name.endswith("_var") for name in needs):
+            raise WrongUse(
+                f"method '{self.method}' needs variances, and one sample per pixel has none: --spp 2 or more"
+            )
+
+    def write(self, file: Path, stack: GradientStack, overwrite: bool, keeps: bool) -> dict[str, Any]:
+        """Makes and writes the image, and returns the attributes that say what made it.
+
+        What was rendered is not lost where that fails: the stack is written beside ``file``, unless one ``keeps`` it.
+        """
+        from ngpt.cli.denoise_files import Frame, write_frame  # imports metrics, which a stack does not need
+
+        name = stack.attributes.get("ngpt:for", "auto") if self.method == "auto" else self.method
+        try:
+            result = reconstruct(stack, str(name))
+        except (NgptError, MemoryError) as error:
+            if keeps:
+                raise
+            other = file.with_name(f"{file.stem}.stack.exr")
+            save(other, lambda path, overwrite: write(path, stack, overwrite=overwrite))
+            raise NgptError(f"{error or 'out of memory'}; what was rendered is in {other}") from error
+        frame = Frame(Path(stack.path), file, stack, result)
+        write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
+        return result.attributes
+
+
+@dataclass(frozen=True)
+class Output:
+    """The ``file`` for a stack or, with ``denoising``, for its image; ``kept`` is one for the stack then, if any."""
+
+    file: Path
+    denoising: Denoising | None = None
+    kept: Path | None = None
+
+    @property
+    def stack(self) -> Path:
+        """The file that has the stack."""
+        return self.kept or self.file
+
+    def check(self) -> None:
+        """Raises WrongUse for files that cannot be such."""
+        if self.denoising is not None:
+            check_image(self.file)
+        for path in (self.kept, None if self.denoising else self.file):
+            if path is not None and path.suffix.lower() != ".exr":
+                raise WrongUse(
+                    f"{path}: stacks are OpenEXR; let the name end in .exr, or for an image in .png .jpg .webp"
+                )
+
+    def check_skipping(self) -> None:
+        """Raises WrongUse where nothing could tell what is there of a render."""
+        if self.stack.suffix.lower() != ".exr":
+            raise WrongUse(
+                f"{self.file}: --skip-existing knows whole files of OpenEXR alone; keep the stack too: --keep FILE.exr"
+            )
+
+    def done(self, asked: Asked) -> bool:
+        """Whether all is there that is asked for. Raises NgptError where a stack is there in place of its image."""
+        if not asked.done(self.stack):
+            return False
+        if self.kept is not None:
+            return finished(self.file) if self.file.suffix.lower() == ".exr" else self.file.exists()
+        if self.denoising is not None and "ngpt:method" not in read_header(self.file)[0]:
+            raise NgptError(
+                f"{self.file}: has all samples, and no image: it is a stack; `ngpt denoise` makes one of it, or give "
+                "another name"
+            )
+        return True
+
+    def write(
+        self, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None
+    ) -> tuple[GradientStack, dict[str, Any]]:
+        """Writes a stack, in place of the one that was ``begun`` and together with it, or the image of both.
+
+        Returns the whole stack, and the attributes that say what made the image. Nothing that was rendered is lost.
+        """
+        if self.denoising is None or self.kept is not None:
+            stack = write_part(self.stack, stack, overwrite, begun)
+        elif begun is not None:
+            stack, overwrite = joined_or_kept(self.file, stack, begun), True
+        return stack, self.image(stack, overwrite) if self.denoising else {}
+
+    def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
+        """Writes the image of the whole stack."""
+        assert self.denoising is not None
+        return self.denoising.write(self.file, stack, overwrite, keeps=self.kept is not None)
