@@ -9,7 +9,7 @@ from folders import read, write_scene
 from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import read_config
-from ngpt.evaluation.curves import REACH, error_at
+from ngpt.evaluation.curves import REACH, error_at, first_at
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
 from ngpt.report.evaluation import write_evaluation_report
@@ -29,6 +29,13 @@ def test_far_outside_a_curve_it_is_read_at_the_factor():
     assert error_at(1e6, LAW) == (pytest.approx(0.3 * (128 * REACH) ** -0.7), ">")
     assert error_at(1e-6, LAW) == (pytest.approx(0.3 * (8 / REACH) ** -0.7), "<")
     assert error_at(8, LAW[:1]) is None and error_at(8, []) is None
+
+
+def test_two_renders_of_nearly_the_same_time_say_little_of_later_ones():
+    """Short renders take what recording takes: the slope between them is no law, outside it is at most 1/x."""
+    points = [(1.0, 1.0), (1.01, 0.5)]
+    assert error_at(2.02, points) == (pytest.approx(0.25), "~") and error_at(0.5, points) == (pytest.approx(2), "~")
+    assert first_at(0.25, points) == (pytest.approx(2.02), "~")
 
 
 def test_who_has_more_time_could_have_taken_less():
