@@ -29,6 +29,7 @@ from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
 from ngpt.errors import NgptError, WrongUse
+from ngpt.layers import FEATURE_NOISE
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
@@ -180,7 +181,9 @@ class Assessment:
 
 def stack_of(film: GradientFilm) -> GradientStack:
     """What is in the film so far, as methods take it."""
-    return GradientStack(film.develop(), {"ngpt:spp": int(film.samples_each.mean()), "ngpt:normalSpace": "camera"})
+    attributes = {"ngpt:spp": int(film.samples_each.mean()), "ngpt:normalSpace": "camera"}
+    noise = film.feature_noise
+    return GradientStack(film.develop(), attributes | ({} if noise is None else {FEATURE_NOISE: noise}))
 
 
 def assess(stack: GradientStack, method: str) -> Assessment:

@@ -22,6 +22,7 @@ from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
+from ngpt.layers import FEATURE_NOISE
 from ngpt.merging import UNFINISHED
 from ngpt.stack import GradientStack
 from ngpt.version import __version__
@@ -160,7 +161,10 @@ def stack_of(
         "ngpt:normalSpace": "camera",
         "ngpt:discarded": film.discarded,
         "software": f"ngpt {__version__}, Mitsuba {mi.__version__} {mi.variant()}",
-    } | more
+    }
+    if (noise := film.feature_noise) is not None:
+        attributes[FEATURE_NOISE] = noise
+    attributes |= more
     stack = GradientStack(layers, attributes=attributes, place=place_of(sensor))
     return with_channels(stack, film.diagnose()) if diagnostics else stack
 

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
     from ngpt.methods import METHODS, Result, reconstruct
     from ngpt.sequence.history import Temporal
     from ngpt.stack import GradientStack
+    from ngpt.system.limits import limit_threads
 
 # Official builds of ONNX Runtime send telemetry by themselves (SECURITY.md). It reads this once, as it is loaded, and
 # who loads it first may not be us: exporters of PyTorch do, too.
@@ -44,6 +45,7 @@ __all__ = [
     "Result",
     "Temporal",
     "denoise",
+    "limit_threads",
     "merge",
     "read",
     "read_image",
@@ -58,7 +60,7 @@ __all__ = [
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")
-_HOMES |= {"reconstruct_with_error": "api.uncertainty", "Temporal": "sequence.history"}
+_HOMES |= {"reconstruct_with_error": "api.uncertainty", "Temporal": "sequence.history", "limit_threads": "system.limits"}
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 

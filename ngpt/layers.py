@@ -53,3 +53,7 @@ LAYERS: dict[str, Layer] = {
 
 # The differences of the contract: layer -> offset (x, y, frames) from a pixel to the one it is compared with; y down.
 DIFFERENCES: dict[str, tuple[int, int, int]] = {"dx": (1, 0, 0), "dy": (0, 1, 0)}
+
+# Header attribute: the variance of a pixel's mean of ``albedo`` or ``normal``, the mean over pixels and channels;
+# whichever is larger
+FEATURE_NOISE = "ngpt:featureNoise"

@@ -22,7 +22,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.io.exr import pass_through, with_channels
-from ngpt.layers import DIFFERENCES
+from ngpt.layers import DIFFERENCES, FEATURE_NOISE
 from ngpt.stack import GradientStack
 from ngpt.windows import Place, Window
 
@@ -57,11 +57,12 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     are known of tiles that overlap by a pixel.
 
     The result's ``ngpt:seed`` lists all seeds, ``ngpt:spp`` is the mean over pixels of the samples that they have,
-    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:unfinished`` is left out, and all other attributes
-    come from the first stack. Raises NgptError for fewer than two stacks, stacks that differ in layers or sampler, or
-    are of pictures of different size, tiles that leave pixels out, a seed that occurs twice in one place, missing
-    ``ngpt:spp`` or ``ngpt:seed``, ``samples`` that are negative or not finite, ``ngpt:seconds`` or ``ngpt:discarded``
-    that are no numbers, results of a reconstruction, and channels of unknown meaning.
+    ``ngpt:seconds`` and ``ngpt:discarded`` are sums, ``ngpt:featureNoise`` is the noise of the merged features where
+    all stacks have it, ``ngpt:unfinished`` is left out, and all other attributes come from the first stack. Raises
+    NgptError for fewer than two stacks, stacks that differ in layers or sampler, or are of pictures of different size,
+    tiles that leave pixels out, a seed that occurs twice in one place, missing ``ngpt:spp`` or ``ngpt:seed``,
+    ``samples`` that are negative or not finite, ``ngpt:seconds``, ``ngpt:discarded`` or ``ngpt:featureNoise`` that are
+    no numbers, results of a reconstruction, and channels of unknown meaning.
     """
     if len(stacks) < 2:
         raise NgptError(f"merging needs at least two stacks, and got {len(stacks)}")
@@ -91,6 +92,9 @@ def merge(stacks: Sequence[GradientStack]) -> GradientStack:
     for name in ("ngpt:seconds", "ngpt:discarded"):
         if all(name in stack.attributes for stack in stacks):
             attributes[name] = sum(_number(stack, name) for stack in stacks)
+    attributes.pop(FEATURE_NOISE, None)
+    if all(FEATURE_NOISE in stack.attributes for stack in stacks):
+        attributes[FEATURE_NOISE] = _feature_noise(tiles, total)
     place = Place(canvas, stacks[0].place.display)
     layers = {name: layer.astype(np.float32) for name, layer in layers.items()}
     merged = GradientStack(layers, attributes, place=place)
@@ -178,6 +182,14 @@ def _mean(tiles: Sequence[_Tile], values: Mapping[_Tile, np.ndarray], name: str 
         weight[tile.part] += w
     with np.errstate(invalid="ignore", divide="ignore"):
         return total / weight
+
+
+def _feature_noise(tiles: Sequence[_Tile], total: np.ndarray) -> float:
+    """The mean over pixels of the variance of merged features: independent means, weighted by samples."""
+    variance = np.zeros(total.shape)
+    for tile in tiles:
+        variance[tile.part] += np.square(tile.counts) * float(_number(tile.stack, FEATURE_NOISE))
+    return float((variance / np.square(np.maximum(total, 1))).mean())
 
 
 def _varies(stack: GradientStack, name: str) -> np.ndarray:
@@ -281,7 +293,7 @@ def _number(stack: GradientStack, name: str) -> Any:
     """The attribute, whole where it is a whole number."""
     given, value = stack.attributes[name], stack.number(name)
     if value is None or value < 0:
-        raise NgptError(f"{stack.path}: attribute '{name}' is {given!r}, and no number that could be summed; remove it")
+        raise NgptError(f"{stack.path}: attribute '{name}' is {given!r}, and no number that can be merged; remove it")
     return given
 
 

@@ -46,6 +46,20 @@ def test_merged_stacks_are_the_stack_of_all_samples(rng, counts):
     assert merged.attributes["ngpt:seconds"] == 1.5 * len(counts)
 
 
+def test_noise_of_features_falls_with_the_samples(rng):
+    noise = "ngpt:featureNoise"
+    a, b = (stack_of(rng.random((n, *SHAPE)), n, **{noise: 0.3 / n}) for n in (2, 4))
+    assert merge([a, b]).attributes[noise] == pytest.approx(0.3 / 6)
+    left, right = (Place(Window(x, 0, 4, 5), Window(0, 0, 8, 5)) for x in (0, 4))
+    tiles = [GradientStack(s.layers, s.attributes, place=at) for s, at in ((a, left), (b, right))]
+    assert merge(tiles).attributes[noise] == pytest.approx((0.3 / 2 + 0.3 / 4) / 2)
+    assert noise not in merge([a, stack_of(rng.random((3, *SHAPE)), 7)]).attributes
+    assert noise not in merge([stack_of(rng.random((3, *SHAPE)), 7), a]).attributes
+    b.attributes[noise] = "low"
+    with pytest.raises(NgptError, match="attribute 'ngpt:featureNoise' is 'low'"):
+        merge([a, b])
+
+
 def test_a_part_that_was_broken_off_is_named(rng, tmp_path, capsys):
     samples = 5 + rng.normal(size=(6, *SHAPE))
     ngpt.write(tmp_path / "a.exr", stack_of(samples[:2], 1, **{"ngpt:unfinished": "interrupted"}))
@@ -267,7 +281,7 @@ def test_attributes_that_cannot_be_summed_are_refused(rng, name, value):
     a, b = (stack_of(rng.random((4, *SHAPE)), seed, **{name: 1}) for seed in range(2))
     assert merge([a, b]).attributes[name] == 2
     b.attributes[name] = value
-    with pytest.raises(NgptError, match=f"1.exr: attribute '{name}' is .* no number that could be summed"):
+    with pytest.raises(NgptError, match=f"1.exr: attribute '{name}' is .* no number that can be merged"):
         merge([a, b])
 
 

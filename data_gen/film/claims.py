@@ -42,14 +42,29 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
     around = np.where(good, np.maximum(sums - filled, 0), np.inf).ravel()
     order = np.argsort(around, kind="stable")
     order = order[: np.count_nonzero(good)]
-    squares, variances = squares.ravel(), variances.ravel()
-    found = np.ones(around.shape)
+    found = _found(squares.ravel(), variances.ravel(), samples.ravel(), net, order, _GROUPS)
+    return found.reshape(*good.shape, 1)
+
+
+def factor(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net: int) -> np.ndarray:
+    """The same of pixels (N, C) that are one group, however much noise each of them has, (N, 1)."""
+    squares, variances = np.square(contrast).sum(axis=-1), variance.sum(axis=-1)
+    good = np.flatnonzero(np.isfinite(squares) & np.isfinite(variances))
+    return _found(squares, variances, samples, net, good, 1)[:, None]
+
+
+def _found(
+    squares: np.ndarray, variances: np.ndarray, samples: np.ndarray, net: int, order: np.ndarray, groups: int
+) -> np.ndarray:
+    """The factors of pixels by the ``order`` in which they are put into so many ``groups`` at most, all (N); 1 of those
+    that are not there."""
+    found = np.ones(len(squares))
     if not len(order):
-        return found.reshape(*good.shape, 1)
-    numbers, kind = np.unique(samples.ravel(), return_inverse=True)
+        return found
+    numbers, kind = np.unique(samples, return_inverse=True)
     laws = [law(max(int(n), 2), net) for n in numbers]
     seen, truth = (np.array(each) for each in zip(*laws, strict=True))
-    for group in np.array_split(order, max(1, min(_GROUPS, len(order) // _LEAST))):
+    for group in np.array_split(order, max(1, min(groups, len(order) // _LEAST))):
         claimed = np.bincount(kind[group], variances[group], len(numbers))
         total = claimed.sum()
         if total > 0:
@@ -58,7 +73,7 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
             # What is seen falls from law to law, and np.interp wants it to rise.
             which = np.interp(-ratio, -(claimed @ seen) / total, np.arange(seen.shape[1]))
             found[group] = (truth @ _hat(which, seen.shape[1]))[kind[group]]
-    return found.reshape(*good.shape, 1)
+    return found
 
 
 def _hat(place: float, n: int) -> np.ndarray:

@@ -8,8 +8,8 @@ import numpy as np
 
 from data_gen.film import claims
 from data_gen.film.moments import Moments, Strands, accumulate, no_moments, one_more, put_back, taken
-from data_gen.film.nets import split
 from data_gen.film.splats import SPLAT_BYTES, Splats
+from data_gen.film.statistics import contrast, statistics
 from ngpt.layers import DIFFERENCES
 
 # What samplers shift paths by, (x, y) in pixels, y down: each difference of the contract, and back. The film keeps the
@@ -26,15 +26,19 @@ DISCARDED = "diagnostics.discarded"
 
 # Parts of the primal, by the lobe of the first scattering event
 _SPLIT = ("diffuse", "specular")
-_WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS})
-# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 15; and the moments of
+# Features whose noise is said in one number, see ``GradientFilm.feature_noise``
+_FEATURES = ("albedo", "normal")
+_WITH_VARIANCE = frozenset({"primal", "caustic", *_SPLIT, *SHIFTS, *_FEATURES})
+# Per strand: two counts for each of 10 names, double means of 26 channels and sums of squares of 21; and the moments of
 # one name once more.
-_STRAND_BYTES = 10 * 8 + (26 + 15) * 8 + (8 + 6 * 8)
-# Per strand, of two sets of earlier samples: single means of 15 channels, and counts of the five names they belong to,
+_STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
+# Per strand, of two sets of earlier samples: single means of 21 channels, and counts of the seven names they belong to,
 # with the number of bits
-_HALVES_BYTES = 2 * 15 * 4 + 5 * 3 * 4
+_HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
+# Pixels that tell the mean noise of features within 1 or 2 %
+_ENOUGH = 1 << 16
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
 
@@ -251,6 +255,27 @@ class GradientFilm:
             layers["samples"] = self._image(self.counts)
         return {name: np.ascontiguousarray(layer, np.float32) for name, layer in layers.items()}
 
+    @property
+    def feature_noise(self) -> float | None:
+        """The variance of the pixel mean of ``albedo`` or of ``normal``, whichever is larger: each the mean over pixels
+        and channels, of images with many pixels over some of them. None where it is not known: there are no features,
+        or no pixel has more than one sample.
+        """
+        self.end_pass()
+        some = np.arange(0, self.pixels, -(-self.pixels // _ENOUGH))
+        place = mi.UInt32((np.arange(self.strands)[:, None] * self.pixels + some).ravel())
+        found = []
+        for name in _FEATURES:
+            if name in self.moments:
+                moments = taken(self.moments[name], place) if len(some) < self.pixels else self.moments[name]
+                variance = statistics(moments, self.strands, self.batch)[2]
+                if self.net:
+                    seen = contrast(moments, self.strands, self._numbers[some])
+                    variance = variance * claims.factor(seen, variance, self._numbers[some], self._net_of_numbers)
+                if np.isfinite(variance).any():
+                    found.append(float(np.nanmean(variance)))
+        return max(found, default=None)
+
     def diagnose(self) -> dict[str, np.ndarray]:
         """Diagnostic images, (H, W) float32 in [0, 1]: the mean of what was put under the names of ``DIAGNOSTICS``, and
         which share of a pixel's values was left out because it was not finite."""
@@ -268,28 +293,10 @@ class GradientFilm:
         }
 
     def _statistics(self, name: str) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """How many values (pixels, 1), mean and variance of the mean (pixels, C), of all strands of a pixel together.
+        return statistics(self.moments[name], self.strands, self.batch)
 
-        Values are samples, or batches. Unknown must not look like zero: the mean of no sample is NaN, and so is the
-        variance of fewer than two. Chan, Golub, LeVeque 1983, "Algorithms for computing the sample variance", eq. 2.1.
-        """
-        moments, shape = self.moments[name], (self.strands, self.pixels)
-        counts = np.array(moments.count, np.float64).reshape(shape)
-        count = counts.sum(axis=0)
-        values = np.ceil(count / self.batch) if self.batches else count
-        means, variances = [], []
-        with np.errstate(invalid="ignore", divide="ignore"):
-            for channel in moments.mean:
-                strands = np.array(channel).reshape(shape)
-                # 0 / 0 is NaN, as it should be. A single strand keeps its mean to the last bit.
-                mean = strands[0] * (count / count) if self.strands == 1 else (counts * strands).sum(axis=0) / count
-                means.append(mean)
-                if moments.m2:
-                    m2 = np.array(moments.m2[len(variances)]).reshape(shape).sum(axis=0)
-                    if self.strands > 1:
-                        m2 += (counts * np.square(strands - mean)).sum(axis=0)
-                    variances.append(np.where(values > 1, m2 / (values - 1) / count, np.nan))
-        return values[:, None], np.stack(means, axis=-1), np.stack(variances, axis=-1) if variances else None
+    def _contrast(self, name: str) -> np.ndarray:
+        return contrast(self.moments[name], self.strands, self._numbers)
 
     def _gradient(self, layer: str) -> tuple[np.ndarray, np.ndarray]:
         """Both directions of one difference, each with weight 1/2 (survey, Algorithm 1), and the variance of that.
@@ -321,11 +328,11 @@ class GradientFilm:
         sum of ``terms``: name, which pixels, factor."""
         if not self.net:
             return variance
-        contrast = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
+        seen = sum(factor * self._image(self._contrast(name))[pixels] for name, pixels, factor in terms)
         where = terms[0][1]
         claimed = variance.copy()
         samples = self._image(self._numbers)[where][..., 0]
-        claimed[where] *= claims.factors(contrast, variance[where], samples, self._net_of_numbers)
+        claimed[where] *= claims.factors(seen, variance[where], samples, self._net_of_numbers)
         return claimed
 
     @property
@@ -338,27 +345,6 @@ class GradientFilm:
         """How many of these values the first round of points has, a power of two: a batch is a block of points."""
         net = self.net // self.batch if self.batches else self.net
         return 1 << max(net.bit_length() - 1, 0)
-
-    def _contrast(self, name: str) -> np.ndarray:
-        """The later samples of each pixel against the earlier ones, (pixels, C), as ``claims.factors`` wants it."""
-        moments, shape = self.moments[name], (self.strands, self.pixels)
-        earlier = moments.earlier[0]
-        counts = [np.array(each, np.int64).reshape(shape) for each in (*earlier.counts[::-1], moments.count)]
-        bits = np.array(earlier.bits, np.int64).reshape(shape)
-        numbers, kind = np.unique(self._numbers, return_inverse=True)
-        splits = np.array([split(max(int(n), 2)) for n in numbers])[kind]
-        # The samples of a strand whose numbers are less than ``splits``: all, or as many as one of ``earlier``.
-        which = np.clip(np.log2(splits).astype(np.int64) + 2 - bits, 0, 2)
-        before, n = np.choose(which, counts), counts[-1].sum(axis=0)
-        n1 = before.sum(axis=0)
-        columns = []
-        with np.errstate(invalid="ignore", divide="ignore"):
-            for channel in zip(*earlier.means[::-1], moments.mean, strict=True):
-                means = [np.array(each, np.float64).reshape(shape) for each in channel]
-                first = (before * np.choose(which, means)).sum(axis=0) / n1
-                # last - first, times sqrt(n1 (n - n1)) / n
-                columns.append(((counts[-1] * means[-1]).sum(axis=0) / n - first) * np.sqrt(n1 / (n - n1)))
-        return np.stack(columns, axis=-1)
 
     def _image(self, columns: np.ndarray) -> np.ndarray:
         return columns.reshape(self.height, self.width, -1)

@@ -119,6 +119,8 @@ Graph load(const Ort::Env &environment, const std::string &path, const std::stri
     Ort::SessionOptions options;
     options.SetLogSeverityLevel(ORT_LOGGING_LEVEL_FATAL);
     options.SetIntraOpNumThreads(threads);
+    // Threads that wait for each other would keep their cores busy, which what works beside them then lacks.
+    options.AddConfigEntry("session.intra_op.allow_spinning", "0");
     // ONNX Runtime 1.21 gives the nodes it makes here one name, since ours have none, and then refuses the model.
     options.AddConfigEntry("optimization.disable_specified_optimizers", "GatherSliceToSplitFusion");
     use(device, options);

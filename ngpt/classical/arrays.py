@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.system.late import fft
+from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
 # Array is a NumPy array or a torch tensor: (..., H, W), float32 or float64.
@@ -122,14 +123,14 @@ def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
 def dct2(x: Array) -> Array:
     """Orthonormal cosine transform (type II) over the last two axes; a NumPy ``x`` is overwritten."""
     if isinstance(x, np.ndarray):
-        return fft.dctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=-1)
+        return fft.dctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
     return _dct(_dct(x).mT).mT
 
 
 def idct2(x: Array) -> Array:
     """Inverse (and transpose) of ``dct2``."""
     if isinstance(x, np.ndarray):
-        return fft.idctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=-1)
+        return fft.idctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
     return _idct(_idct(x.mT).mT)
 
 

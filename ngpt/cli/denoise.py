@@ -44,6 +44,7 @@ from ngpt.sequence.history import Temporal
 from ngpt.sequence.network import Network
 from ngpt.stack import GradientStack
 from ngpt.system.console import Console
+from ngpt.system.limits import limit_threads
 from ngpt.system.pipeline import overlapped
 
 
@@ -81,6 +82,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
     )
+    parser.add_argument("--threads", type=int, metavar="N", help="that work at once (default: as many as processors)")
     parser.add_argument(
         "-O",
         "--option",
@@ -141,6 +143,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace, console: Console) -> int:
     if args.json and args.output == STREAM:
         raise NgptError("-o - and --json both want standard output; leave one out")
+    if args.threads is not None:
+        limit_threads(args.threads)
     with as_files(args.stacks, args.output) as (args.stacks, args.output):
         return denoise(args, console)
 

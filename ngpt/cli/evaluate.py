@@ -25,8 +25,11 @@ def run(args: argparse.Namespace, console: Console) -> int:
     path = config_of(args, configs.EVALUATION)
     if args.init:
         from ngpt.evaluation.config import Config
+        from ngpt.system.records import read_toml
         from ngpt.system.templates import template
 
+        if base := read_toml(path).get("base"):
+            raise WrongUse(f"{path.stem} is {base} with other numbers: give --init that one")
         return write_template(args, template(path.read_text(encoding="utf-8"), {"": Config}), "evaluate", console)
     if not args.out:
         raise WrongUse("--out is missing: the folder of the results")

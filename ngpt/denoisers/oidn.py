@@ -32,12 +32,12 @@ def oidn(data: Repaired, auxiliary: str, quality: str) -> np.ndarray:
     ``auxiliary``  what OIDN is told of the features: "prefiltered" denoises them by its own models first and calls them
                    clean then, which is how its documentation has the best quality made; "clean" calls them clean as
                    they are; "noisy" does not; "none" hides them
-    ``quality``    "high", "balanced" or "fast"
+    ``quality``    "high", "balanced" or "fast", for the image and for features that are denoised first
     """
     require_oidn()
     features = {}
     if auxiliary == "prefiltered":
-        features = prefiltered(data.features, "high")
+        features = prefiltered(data.features, quality)
     elif auxiliary != "none":
         features = _in_range(data.features)
     # With the light sources seen, as a renderer hands it over and OIDN was trained.

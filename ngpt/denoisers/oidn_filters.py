@@ -1,7 +1,7 @@
 """OIDN's devices and filters, which all threads of a process share: one thread uses them at a time.
 
 Two threads that set images of one filter would get each other's pixels. They lose no time by waiting, since OIDN works
-on all cores. To make a filter takes longer than to run it on a small image, so filters are kept.
+on all cores, or as many as ``ngpt.limit_threads`` allows. To make a filter takes longer than to run it on a small image, so filters are kept.
 """
 
 from collections.abc import Mapping
@@ -12,6 +12,7 @@ import numpy as np
 
 from ngpt.errors import NgptError
 from ngpt.system.forks import hold_while_forking
+from ngpt.system.limits import limited, processors
 
 # By the names of OIDN's devices in Python.
 DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal": "Metal", "sycl": "SYCL"}
@@ -19,7 +20,8 @@ DEVICES = {"auto": "Default", "cpu": "CPU", "cuda": "CUDA", "hip": "HIP", "metal
 _MOST = 8
 
 _lock = Lock()
-_devices: dict[str, Any] = {}
+# By name and threads.
+_devices: dict[tuple[str, int], Any] = {}
 _filters: dict[tuple, Any] = {}
 
 
@@ -38,12 +40,14 @@ def filtered(
     import mitsuba_oidn
 
     result = np.empty_like(next(iter(images.values())))
-    key = (device, weights, tuple(images), result.shape, tuple(settings.items()))
+    # 0: those that it shares with Dr.Jit.
+    where = device, processors() if limited() else 0
+    key = (where, weights, tuple(images), result.shape, tuple(settings.items()))
     try:
         with _lock:
             # Out of those that are kept until it has worked: one that failed is not used again.
-            made = _filters.pop(key, None) or _made(device, weights, settings)
-            _run(_devices[device], made, images, result)
+            made = _filters.pop(key, None) or _made(where, weights, settings)
+            _run(_devices[where], made, images, result)
             # Networks of the user's own are many, and as large as an image.
             if weights is None:
                 _filters[key] = made
@@ -54,12 +58,17 @@ def filtered(
     return result
 
 
-def _made(device: str, weights: bytes | None, settings: Mapping[str, Any]) -> Any:
+def _made(where: tuple[str, int], weights: bytes | None, settings: Mapping[str, Any]) -> Any:
+    """A filter on the device of that name, which has so many threads of its own if it is a processor."""
     import mitsuba_oidn
 
-    if device not in _devices:
-        _devices[device] = mitsuba_oidn.Device(getattr(mitsuba_oidn.DeviceType, DEVICES[device]))
-    made = _devices[device].new_filter("RT")
+    if where not in _devices:
+        name, threads = where
+        device = mitsuba_oidn.Device(getattr(mitsuba_oidn.DeviceType, DEVICES[name]))
+        if threads and device.type == mitsuba_oidn.DeviceType.CPU:
+            device.num_threads = threads
+        _devices[where] = device
+    made = _devices[where].new_filter("RT")
     if weights is not None:
         made.set_data("weights", weights)
     for name, value in settings.items():

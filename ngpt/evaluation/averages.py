@@ -2,6 +2,7 @@
 
 import statistics
 from collections.abc import Iterable, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -23,3 +24,10 @@ def mean(values: Sequence[float], geometric: bool) -> float:
     if not geometric:
         return float(np.mean(values))
     return float(np.exp(np.mean(np.log(np.maximum(values, 1e-30)))))
+
+
+def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
+    """Those of the ``scenes`` that are in each group of the configuration, and if they are several "all"."""
+    found = list(dict.fromkeys(scenes))
+    groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
+    return groups | ({"all": found} if len(found) > 1 else {})

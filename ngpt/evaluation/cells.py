@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,9 @@ from ngpt.system.writing import write_json
 # That numbers depend on, or whose absence makes rows absent.
 PACKAGES = ("numpy", "scipy", "mitsuba", "torch", "mitsuba-oidn", "scikit-image", "flip-evaluator")
 
+# Of a cell in the cache: its time by both clocks
+_FORMAT = 2
+
 
 class Scorer:
     """Runs methods warm and measures what they give."""
@@ -33,7 +37,7 @@ class Scorer:
         self.config, self.cache = config, cache
         self.cache.mkdir(parents=True, exist_ok=True)
         self._warm: set[tuple] = set()
-        self._code = [library_hash(), versions(*PACKAGES)]
+        self._code = [_FORMAT, library_hash(), versions(*PACKAGES)]
         # Options of metrics that have some.
         self.options = {"E-LPIPS": config.elpips}
         found = {name: METRICS[name].missing for name in config.metrics}
@@ -45,7 +49,7 @@ class Scorer:
     def cell(
         self, column: Column, stack: Callable[[], GradientStack], reference: Reference, key: list, image: Path | None
     ) -> dict[str, Any]:
-        """``metrics``, ``seconds`` to reconstruct, and ``image`` in whose file it was written, or why it is ``absent``.
+        """``metrics``, seconds to ``reconstruct`` by clock, or why it is ``absent``; its picture goes to ``image``.
 
         ``key`` is what the stack depends on; ``stack`` is called only when the cell is not in the cache.
         """
@@ -61,7 +65,9 @@ class Scorer:
                 # Files of weights, just-in-time compilation, filters that are made once.
                 reconstruct(data, column.method, **column.options)
                 self._warm.add(warm)
+            begins = time.process_time()
             result = reconstruct(data, column.method, **column.options)
+            seconds = {"wall": result.seconds, "processor": time.process_time() - begins}
             values = self._scores(self.metrics, result.image, *reference.images)
         except NgptError as error:
             # Not kept: what is missing may be there the next time.
@@ -69,7 +75,7 @@ class Scorer:
         if image is not None:
             image.parent.mkdir(parents=True, exist_ok=True)
             write(image, result.image, overwrite=True)
-        cell = {"metrics": values, "reconstruct": result.seconds, "absent": None}
+        cell = {"metrics": values, "reconstruct": seconds, "absent": None}
         write_json(path, cell)
         return cell
 

@@ -49,6 +49,8 @@ class Config:
     ``scenes``    built-in scenes, scene files, patterns, or folders of stacks: KIND-SPP-SEED.exr and reference.exr
     ``size``      width and height in pixels
     ``spp``       samples per pixel of the stacks by ``clock``; other stacks have as many as take that time
+    ``rival_spp``  the same for the columns of ``against``, if it is not empty: their curves should reach as far as what
+              takes longer to reconstruct
     ``seeds``     renders of each stack
     ``methods``   of `ngpt info`, or variants: tables [variants.NAME] with method, options, stack and sampler
     ``samplers``, ``rivals``  samplers of stacks with gradients, and without; tables [samplers.NAME] give them options
@@ -63,6 +65,7 @@ class Config:
     ``elpips``    files of E-LPIPS: backbone and weights
     ``references``  references from elsewhere, NAME = "FILE" or NAME = ["FILE", "FILE"] for two halves
     ``groups``    of scenes, NAME = ["SCENE", ...]: rows of means in the tables
+    ``against``   rivals at equal whole time, NAME = ["COLUMN", ...]: settings, of which the best counts at each time
     ``variants``  methods with options of their own, by name
     """
 
@@ -70,6 +73,7 @@ class Config:
     scenes: tuple[str, ...] = ()
     size: tuple[int, int] = (320, 180)
     spp: tuple[int, ...] = (4, 16, 64)
+    rival_spp: tuple[int, ...] = ()
     seeds: int = 3
     methods: tuple[str, ...] = ("primal", "l1", "wcv")
     samplers: tuple[str, ...] = (KINDS["gradients"],)
@@ -87,15 +91,15 @@ class Config:
     elpips: dict[str, str] = field(default_factory=dict)
     references: dict[str, Any] = field(default_factory=dict)
     groups: dict[str, Any] = field(default_factory=dict)
+    against: dict[str, Any] = field(default_factory=dict)
     variants: dict[str, dict[str, Any]] = field(default_factory=dict)
     # What tables in the place of ``samplers`` hold: files have no entry of this name.
     sampler_options: dict[str, dict[str, Any]] = field(default_factory=dict, metadata={"internal": True})
 
     def __post_init__(self) -> None:
-        low = min((*self.spp, self.seeds, *self.size, self.timing_spp, self.timing_repeats), default=0)
+        low = min((*self.spp, *self.rival_spp, self.seeds, *self.size, self.timing_spp, self.timing_repeats), default=0)
         unknown = [name for name in (*self.metrics, self.primary) if name not in METRICS]
         for bad, text in (
-            (not self.scenes, "no scenes: name built-in scenes, scene files, patterns or folders of stacks"),
             (not self.spp or not self.methods, "spp and methods must not be empty"),
             (low < 1, "spp, seeds, size and timing must be at least 1"),
             (self.reference_spp <= 0 and self.reference_seconds <= 0, "set reference_spp or reference_seconds"),
@@ -119,12 +123,29 @@ class Config:
         for name, files in self.references.items():
             if not isinstance(files, str) and (not isinstance(files, list) or [type(f) for f in files] != [str, str]):
                 raise NgptError(f"evaluation: references.{name} = {files!r}: must be a file, or a list of two halves")
-        for name, scenes in self.groups.items():
-            if not isinstance(scenes, list) or not all(isinstance(scene, str) for scene in scenes):
-                raise NgptError(f"evaluation: groups.{name} = {scenes!r}: must be a list of scenes' names")
-        parts = [file_part(column.name) for column in self.columns()]
+        columns = [column.name for column in self.columns()]
+        for entry, what in (("groups", "scenes"), ("against", "columns")):
+            for name, listed in getattr(self, entry).items():
+                if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
+                    raise NgptError(f"evaluation: {entry}.{name} = {listed!r}: must be a list of {what}' names")
+        for name, listed in self.against.items():
+            if unknown := [item for item in listed if item not in columns]:
+                raise NgptError(
+                    f"evaluation: against.{name}: there is no column '{unknown[0]}' among: {', '.join(columns)}"
+                )
+        parts = [file_part(column) for column in columns]
         if repeated := next((part for i, part in enumerate(parts) if part in parts[:i]), ""):
             raise NgptError(f"evaluation: two columns would be called '{repeated}'; name the variant otherwise")
+
+    def places(self) -> list[tuple[int, int, list[Column]]]:
+        """Nominal samples per pixel, seed, and the columns that are measured there, in the order of the tables."""
+        settings = {column for listed in self.against.values() for column in listed} if self.rival_spp else set()
+        pairs = [(column, self.rival_spp if column.name in settings else self.spp) for column in self.columns()]
+        return [
+            (spp, seed, [column for column, counts in pairs if spp in counts])
+            for spp in sorted({spp for _, counts in pairs for spp in counts})
+            for seed in range(self.seeds)
+        ]
 
     def columns(self) -> list[Column]:
         """Methods and samplers in the order of the tables."""
@@ -160,7 +181,9 @@ class Config:
             raise NgptError(f"evaluation: samplers.{name}: {error}") from None
 
     def scene_files(self) -> dict[str, str]:
-        """Name -> built-in scene, scene file or folder of stacks; patterns are resolved."""
+        """Name -> built-in scene, scene file or folder of stacks; patterns are resolved. Raises NgptError for none."""
+        if not self.scenes:
+            raise NgptError("evaluation: no scenes: name built-in ones, scene files, patterns or folders with --scenes")
         result: dict[str, str] = {}
         for entry in self.scenes:
             found = sorted(glob(entry, recursive=True), key=natural) if has_magic(entry) else [entry]
@@ -191,10 +214,11 @@ def scene_name(scene: str) -> str:
 def read_config(path: str | Path) -> Config:
     """Reads a TOML file; raises NgptError for entries that do not exist or have the wrong type.
 
+    ``base`` names another file, from the folder of this one: what it has and this one has not is taken from there.
     ``samplers`` may be tables of options: those of samplers with gradients are compared, others are for ``rivals``, and
     those that a variant names are for this variant alone.
     """
-    values = read_toml(path)
+    values = _with_base(Path(path))
     if isinstance(tables := values.get("samplers"), dict):
         check(tables, {str: dict}, f"{path}: samplers")
         gradients = find_renderer().gradients
@@ -202,3 +226,14 @@ def read_config(path: str | Path) -> Config:
         with_gradients = [n for n, table in tables.items() if n not in own and gradients(table.get("sampler", n))]
         values |= {"samplers": with_gradients or [KINDS["gradients"]], "sampler_options": tables}
     return from_table(Config, values, str(path))
+
+
+def _with_base(path: Path) -> dict[str, Any]:
+    """The entries of a file, and those of its base."""
+    values = read_toml(path)
+    base = values.pop("base", None)
+    if base is None:
+        return values
+    if not isinstance(base, str) or (path.parent / base).resolve() == path.resolve():
+        raise NgptError(f"{path}: base = {base!r}: must be the name of another file")
+    return _with_base(path.parent / base) | values

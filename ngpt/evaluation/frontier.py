@@ -14,7 +14,10 @@ COLORS = ("#777777", "#2f7fd6", "#d9772b", "#3a9a5b", "#b0489a", "#c9a400", "#17
 
 @dataclass(frozen=True)
 class Point:
-    """A method at a sample count: total seconds and error, both positive; one colour for each ``family``."""
+    """A method at a sample count: total seconds and error, both positive; one colour for each ``family``.
+
+    ``spp`` is 0 for a point of a curve that is no count of its own.
+    """
 
     method: str
     spp: int
@@ -52,12 +55,14 @@ def draw(points: list[Point], title: str, metric: str, doubt: float | None = Non
         parts.append(axes.level(doubt, "#999999", "what the reference can tell"))
     looks = _looks(points)
     for method, (color, dash) in looks.items():
-        own = sorted((p for p in points if p.method == method), key=lambda p: p.spp)
+        own = sorted((p for p in points if p.method == method), key=lambda p: (p.spp, p.seconds))
         path = "L".join(f"{axes.x(p.seconds):.1f} {axes.y(p.error):.1f}" for p in own)
         dashes = f' stroke-dasharray="{dash}"' if dash else ""
         parts.append(f'<path d="M{path}" fill="none" stroke="{color}" stroke-width="1.6"{dashes}/>')
         for p in own:
             shape = f'cx="{axes.x(p.seconds):.1f}" cy="{axes.y(p.error):.1f}"'
+            if not p.spp:
+                continue
             name = markup(f"{method}, {p.spp} spp: {p.seconds:.3g} s, {p.error:.3g}")
             look = f'r="4.5" fill="{color}" stroke="black"' if p in best else f'r="2.5" fill="{color}"'
             parts.append(f"<circle {shape} {look}><title>{name}</title></circle>")

@@ -1,4 +1,4 @@
-"""What the folder of results holds: results.json, results.csv, results.md, worth.* and plots, all from the cells."""
+"""What the folder of results holds: results.*, worth.*, against.csv and plots, all from the cells."""
 
 from __future__ import annotations
 
@@ -7,15 +7,17 @@ import io
 from pathlib import Path
 from typing import Any
 
-from ngpt.evaluation.averages import mean, median, summary
+from ngpt.evaluation.averages import groups_of, mean, median, summary
 from ngpt.evaluation.frontier import Point, draw, pareto
 from ngpt.evaluation.tables import tables, worth_page
+from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
+from ngpt.evaluation.wholetime import as_csv as against_csv
 from ngpt.evaluation.worth import as_csv as worth_csv
 from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import draw_worth, write_map
 from ngpt.system.writing import write_json, write_text
 
-_SECONDS = ("render", "reconstruct", "total")
+_SECONDS = ("render", "reconstruct", "total", "reconstruct wall")
 
 
 def write_results(results: dict[str, Any], out: Path) -> None:
@@ -29,12 +31,58 @@ def write_results(results: dict[str, Any], out: Path) -> None:
             name = scene or "mean"
             title = scene or f"geometric mean over {len(shared_scenes(results))} scenes"
             doubt = results["scenes"][scene]["reference"]["doubt"] if scene else None
-            write_text(out / f"plots/frontier-{name}.svg", draw(points, title, results["primary"], doubt))
-            results["plots"]["frontier"][name] = f"plots/frontier-{name}.svg"
+            _write_frontier(results, out, name, draw(points, title, results["primary"], doubt))
     _write_worth(results, out)
+    _write_against(results, out)
     write_json(out / "results.json", results)
     write_text(out / "results.csv", as_csv(results))
     write_text(out / "results.md", tables(results))
+
+
+def _write_frontier(results: dict[str, Any], out: Path, name: str, plot: str) -> None:
+    path = f"plots/frontier-{name.replace(' ', '-')}.svg"
+    write_text(out / path, plot)
+    results["plots"]["frontier"][name] = path
+
+
+def _write_against(results: dict[str, Any], out: Path) -> None:
+    """Adds ``against`` to the results and writes its files: none where the configuration names no rivals."""
+    if not results["settings"]["against"]:
+        return
+    against = results["against"] = against_rivals(results)
+    against["tables"] = against_tables(results)
+    write_text(out / "against.csv", against_csv(against))
+    for group, scenes in groups_of(results, shared_scenes(results)).items():
+        points = points_against(results, scenes)
+        if points:
+            title = f"{group}: geometric mean over {len(scenes)} scenes"
+            _write_frontier(results, out, f"rivals-{group}", draw(points, title, results["primary"]))
+
+
+def points_against(results: dict[str, Any], scenes: list[str]) -> list[Point]:
+    """Geometric means over the scenes of the columns that are no rival's setting, and each rival at its best."""
+    rivals = results["settings"]["against"]
+    points = [
+        Point(rival, 0, seconds, error, rival)
+        for rival in rivals
+        for seconds, error in envelope(results, rival, scenes)
+    ]
+    settings = {column for columns in rivals.values() for column in columns}
+    for method in (name for name in results["methods"] if name not in settings):
+        for spp in results["settings"]["spp"]:
+            here = [r for r in results["summary"] if (r["spp"], r["method"]) == (spp, method) and r["scene"] in scenes]
+            if scenes and len(here) == len(scenes) and all(map(_is_drawn, here)):
+                seconds, error = (mean([get(row) for row in here], True) for get in (_total, _error))
+                points.append(Point(method, spp, seconds, error, method))
+    return points
+
+
+def _total(row: dict[str, Any]) -> float:
+    return row["seconds"]["total"]
+
+
+def _error(row: dict[str, Any]) -> float:
+    return row["error"]
 
 
 def _write_worth(results: dict[str, Any], out: Path) -> None:
@@ -87,7 +135,7 @@ def summarised(results: dict[str, Any]) -> list[dict[str, Any]]:
         seconds = {key: median(cell["seconds"][key] for cell in cells) for key in _SECONDS}
         rows.append(_row(results, scene, spp, method, scores, seconds, len(cells)))
     scenes = shared_scenes(results)
-    for spp in results["settings"]["spp"]:
+    for spp in sorted({row["spp"] for row in rows}):
         for method in results["methods"]:
             parts = [row for row in rows if (row["spp"], row["method"]) == (spp, method)]
             if scenes and len(parts) == len(scenes):

@@ -78,7 +78,7 @@ def evaluate(
     for name, lack in {**lacks, **scorer.absent_metrics}.items():
         if lack:
             console.say(f"{name}: absent: {lack}")
-    total = len(scenes) * len(config.spp) * config.seeds * len(columns)
+    total = len(scenes) * sum(len(here) for *_, here in config.places())
     with exclusive(out), console.progress("evaluate", "cells") as progress:
         progress(0, total)
         for i, (name, source) in enumerate(scenes.items()):
@@ -95,9 +95,8 @@ def evaluate(
                 results["scenes"].setdefault(name, {"file": source})["absent"] = str(error)
                 results["cells"] += [
                     _absent(name, spp, column.name, seed, str(error))
-                    for spp in config.spp
-                    for seed in range(config.seeds)
-                    for column in columns
+                    for spp, seed, here in config.places()
+                    for column in here
                 ]
             # After each scene, so that a long run can be looked at.
             write_results(results, out)
@@ -130,51 +129,54 @@ def _scene(
     entry["reference"] = _reference_entry(reference, scorer, name, out)
     entry["absent"] = None
     cells: list[dict[str, Any]] = []
-    for spp in config.spp:
-        for seed in range(config.seeds):
-            held: dict[str, GradientStack] = {}
-            for column in columns:
-                advance(len(cells))
-                if lacks[column.name]:
-                    cells.append(_absent(name, spp, column.name, seed, lacks[column.name]))
-                    continue
-                render = renders[column.name]
-                used = stacks.samples(render, spp, costs)
+    for spp, seed, here in config.places():
+        held: dict[str, GradientStack] = {}
+        for column in here:
+            advance(len(cells))
+            if lacks[column.name]:
+                cells.append(_absent(name, spp, column.name, seed, lacks[column.name]))
+                continue
+            render = renders[column.name]
+            used = stacks.samples(render, spp, costs)
 
-                def load(render: Render = render, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
-                    if render.name not in held:
-                        held[render.name] = stacks.stack(render, n, s)
-                    return held[render.name]
+            def load(render: Render = render, n: int = used, s: int = seed, held: dict = held) -> GradientStack:
+                if render.name not in held:
+                    held[render.name] = stacks.stack(render, n, s)
+                return held[render.name]
 
-                image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
-                key = stacks.stack_key(render, used, seed)
-                cell = scorer.cell(column, load, reference, key, out / image if image else None)
-                if cell["absent"]:
-                    cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
-                    continue
-                rendered = load().number("ngpt:seconds")
-                seconds = {"render": rendered, "reconstruct": cell["reconstruct"], "total": None}
-                if rendered is not None:
-                    seconds["total"] = rendered + cell["reconstruct"]
-                cells.append(
-                    {
-                        "scene": name,
-                        "spp": spp,
-                        "method": column.name,
-                        "seed": seed,
-                        "spp used": used,
-                        "seconds": seconds,
-                        "metrics": cell["metrics"],
-                        "image": image,
-                        "absent": None,
-                    }
-                )
+            image = picture_path(name, spp, column.name, seed) if wanted(config.images, seed) else None
+            key = stacks.stack_key(render, used, seed)
+            cell = scorer.cell(column, load, reference, key, out / image if image else None)
+            if cell["absent"]:
+                cells.append(_absent(name, spp, column.name, seed, cell["absent"]))
+                continue
+            cells.append(
+                {
+                    "scene": name,
+                    "spp": spp,
+                    "method": column.name,
+                    "seed": seed,
+                    "spp used": used,
+                    "seconds": _seconds(load().number("ngpt:seconds"), cell["reconstruct"], config.time),
+                    "metrics": cell["metrics"],
+                    "image": image,
+                    "absent": None,
+                }
+            )
     maps = gradient_map(stacks, pilot, costs, out)
     if maps:
         entry["gradients"] = maps
     # All at once: a scene that fails half-way is absent as a whole.
     results["scenes"][name] = entry
     results["cells"] += cells
+
+
+def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:
+    """Of a cell by the ``clock``: to render, features, film and what recording takes included, to reconstruct, and the
+    whole; and those of the wall to reconstruct. Kernels are compiled and weights are read before."""
+    total = None if render is None else render + reconstruct[clock]
+    seconds = {"render": render, "reconstruct": reconstruct[clock], "total": total}
+    return seconds | {"reconstruct wall": reconstruct["wall"]}
 
 
 def _pilot(renders: list[Render]) -> Render:

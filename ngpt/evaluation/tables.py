@@ -7,8 +7,13 @@ from typing import Any
 import numpy as np
 
 from ngpt.evaluation.averages import mean
+from ngpt.evaluation.curves import REACH
 from ngpt.evaluation.renders import KINDS
-from ngpt.evaluation.worth import REACH
+
+_MARKS = (
+    "~: outside of the measured times, by the nearest slope. < and >: no nearer than a factor of "
+    f"{REACH:g} outside, where the slope is not followed."
+)
 
 
 def tables(results: dict[str, Any]) -> str:
@@ -40,8 +45,29 @@ def tables(results: dict[str, Any]) -> str:
         lines += [_title_of_others(results), "", *_others(results, others), ""]
     for name in dict.fromkeys((primary, "FLIP")):
         lines += _duels(results, name)
+    lines += _against(results)
     lines += [*_absences(results), _origin(results)]
     return "\n".join(lines) + "\n"
+
+
+def _against(results: dict[str, Any]) -> list[str]:
+    """Errors over those of rivals at equal whole time."""
+    found = results.get("against", {}).get("tables", {})
+    if not found:
+        return []
+    families = [
+        f"{name} ({', '.join(f'`{c}`' for c in columns)})" for name, columns in results["settings"]["against"].items()
+    ]
+    lines = [
+        "At equal whole time (to render and to reconstruct) the rivals are "
+        + "; ".join(families)
+        + ": of these settings "
+        f"each time the one of least error, and for FLIP the one of least FLIP. {_MARKS}",
+        "",
+    ]
+    for title, rows in found.items():
+        lines += [f"{title}:", "", *_table(rows[0], rows[1:], 1), ""]
+    return lines
 
 
 def worth_page(results: dict[str, Any]) -> str:
@@ -49,15 +75,14 @@ def worth_page(results: dict[str, Any]) -> str:
     lines = [
         f"# {results['title']}: worth of gradients",
         "",
-        "W: by how many times more samples the best method without gradients needs for the error of a method with "
-        "them. C: seconds of a sample with gradients over one without, features in both, measured in turn. Gradients "
-        "pay where W/C > 1: then the method without needs W/C times the time. Reconstruction is not counted.",
+        "W/C: the seconds that the best method without gradients needs for the error of a method with them, over the "
+        "seconds of that method; both render and reconstruct. Gradients pay where W/C > 1. W: by how many times more "
+        "samples it needs. C: seconds of a further sample with gradients over one without.",
         "",
         f"Errors are {results['primary']}, medians over seeds. The best of several methods is the one of least error "
-        "with gradients, and of least time for that error without. ~: outside of the measured samples, by the nearest "
-        f"slope. < and >: no nearer than a factor of {REACH:g} outside, where the slope is not followed. blocks: the "
-        "share of the picture's blocks with less error at equal time (plots/worth-SCENE.svg). In means over scenes, "
-        "the number of scenes is in brackets.",
+        f"with gradients, and of least time for that error without. {_MARKS} blocks: the share of the picture's blocks "
+        "with less error at equal rendering time (plots/worth-SCENE.svg). In means over scenes, the number of scenes "
+        "is in brackets.",
         "",
     ]
     for title, rows in results["worth"]["tables"].items():

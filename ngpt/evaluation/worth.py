@@ -1,138 +1,108 @@
-"""What gradients are worth: W, what they cost: C, and where they pay: W / C > 1.
+"""What gradients are worth in whole time: that without them over that with them, for the same error.
 
     n, e    samples of a pipeline with gradients (a sampler and a method), and its error
-    m       the samples at which a pipeline without gradients first has the error e
-    c       seconds per sample of the one over those of the other, measured in turn on the same scene
-    W       m / n, by how many times more samples the best pipeline without gradients needs for the same error
-    C       c, with features on both sides
-    W / C   the time of the pipeline without gradients over that with them, reconstruction left out
+    T       its whole time: seconds to render and to reconstruct
+    T'      the whole time after which a pipeline without gradients first has the error e, and m its samples then
+    W / C   T' / T of the pipeline without gradients that is first: gradients pay above 1
+    W       m / n, by how many times more samples that pipeline needs
+    C       the seconds of a further sample with gradients over those of one of that pipeline
 
-m is read off the error over the samples of the pipeline without gradients: its running minimum, straight between the
-measured points in log-log. Outside of them the nearest slope goes on, for a factor of 4 at most (``REACH``): such an m
-is marked "~", and where it stops at that factor ">" or "<". The best pipeline without gradients is the one that needs
-the least time, of all that the evaluation has.
+W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
+curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has that of W / C). C is by the renders with
+the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
-from ngpt.evaluation.averages import mean
-from ngpt.evaluation.renders import KINDS
+from ngpt.evaluation.averages import groups_of, mean, median
+from ngpt.evaluation.curves import first_at, joined
 
-REACH = 4.0  # how far a slope is trusted past the measured samples
 FIELDS = (
-    *("scene", "spp", "method", "sampler", "best", "error", "rival", "rival samples"),
+    *("scene", "spp", "method", "sampler", "best", "error", "seconds", "rival", "rival seconds", "rival samples"),
     *("W", "C", "W/C", "mark", "blocks"),
 )
-
-
-def samples_for(error: float, points: Sequence[tuple[float, float]]) -> tuple[float, str] | None:
-    """The samples at which a curve of (samples, error) comes down to ``error``, and "", "~", ">" or "<" (see above).
-
-    None where there are fewer than two points, or the error never falls. Errors must be positive.
-    """
-    curve: list[tuple[float, float]] = []
-    for m, e in sorted(points):
-        curve.append((math.log(m), min(math.log(e), curve[-1][1] if curve else math.inf)))
-    falls = [(a, b) for a, b in pairwise(curve) if b[1] < a[1] and b[0] > a[0]]
-    if not falls:
-        return None
-    target, reach = math.log(error), math.log(REACH)
-    (first, _), (_, last) = curve[0], curve[-1]
-    if target > curve[0][1]:
-        m = first + _slope(falls[0]) * (target - curve[0][1])
-        return (math.exp(m), "~") if m >= first - reach else (math.exp(first - reach), "<")
-    if target < last:
-        m = curve[-1][0] + _slope(falls[-1]) * (target - last)
-        limit = curve[-1][0] + reach
-        return (math.exp(m), "~") if m <= limit else (math.exp(limit), ">")
-    if target == curve[0][1]:
-        return math.exp(first), ""
-    a, b = next((a, b) for a, b in falls if b[1] <= target)
-    return math.exp(a[0] + _slope((a, b)) * (target - a[1])), ""
-
-
-def _slope(segment: tuple[tuple[float, float], tuple[float, float]]) -> float:
-    """Samples over error, both logarithms."""
-    (m0, e0), (m1, e1) = segment
-    return (m1 - m0) / (e1 - e0)
 
 
 def worth_of_gradients(results: dict[str, Any]) -> dict[str, Any]:
     """``rows`` for each scene, number of samples and column with gradients (``FIELDS``); ``means`` of them over scenes.
 
-    ``best`` marks the column of least error among those with gradients. C and W/C are None where costs were not
-    measured, as for folders of stacks. ``blocks``, the share of blocks where gradients pay, comes with the maps
-    (``ngpt.evaluation.worthplots``). Both lists are empty where a column of either kind is missing.
+    ``best`` marks the column of least error among those with gradients. ``blocks``, the share of blocks where gradients
+    pay, comes with the maps (``ngpt.evaluation.worthplots``). Both lists are empty where a column of either kind is
+    missing; what has no time, as stacks from elsewhere may have none, has no row.
     """
     rows = [row for scene in results["scenes"] for row in _scene_rows(results, scene)]
     return {"rows": rows, "means": _means(results, rows)}
 
 
 def _scene_rows(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
-    used = {(c["spp"], c["method"]): c["spp used"] for c in results["cells"] if c["scene"] == scene and not c["absent"]}
-    found: dict[str, dict[int, float]] = {}
+    found: dict[str, dict[int, dict[str, Any]]] = {}
     for row in results["summary"]:
-        if row["scene"] == scene and (row["error"] or 0) > 0:
-            found.setdefault(row["method"], {})[row["spp"]] = row["error"]
+        if row["scene"] == scene and (row["error"] or 0) > 0 and row["seconds"]["total"]:
+            found.setdefault(row["method"], {})[row["spp"]] = row
+    renders = {name: _renders(results, scene, name) for name in found}
     ours = [name for name in found if results["methods"][name]["stack"] == "gradients"]
-    curves = {
-        name: [(used[spp, name], error) for spp, error in errors.items()]
-        for name, errors in found.items()
-        if name not in ours
-    }
-    cost = results["scenes"][scene].get("cost") or {}
-    seconds = {name: _seconds(cost, results["methods"][name]) for name in found}
+    rivals = {name: list(rows.values()) for name, rows in found.items() if name not in ours}
     rows = []
     for spp in results["settings"]["spp"]:
-        errors = {name: found[name][spp] for name in ours if spp in found[name]}
-        for name, error in errors.items():
-            if worth := _against(error, used[spp, name], seconds[name], curves, seconds):
+        here = {name: found[name][spp] for name in ours if spp in found[name]}
+        for name, row in here.items():
+            if worth := _against(row, renders[name], rivals, renders):
                 place = {"scene": scene, "spp": spp, "method": name, "sampler": results["methods"][name]["sampler"]}
-                rows.append(place | {"best": error == min(errors.values()), "error": error} | worth)
+                best = row["error"] == min(other["error"] for other in here.values())
+                rows.append(place | {"best": best, "error": row["error"], "seconds": row["seconds"]["total"]} | worth)
     return rows
 
 
+def _renders(results: dict[str, Any], scene: str, method: str) -> dict[int, tuple[int, float]]:
+    """Nominal samples -> those that were used and the median of the seconds that they took to render."""
+    found: dict[int, list[dict[str, Any]]] = {}
+    for cell in results["cells"]:
+        if (cell["scene"], cell["method"]) == (scene, method) and not cell["absent"]:
+            found.setdefault(cell["spp"], []).append(cell)
+    return {
+        spp: (cells[0]["spp used"], median(cell["seconds"]["render"] for cell in cells) or 0.0)
+        for spp, cells in found.items()
+    }
+
+
 def _against(
-    error: float, n: int, cost: float | None, curves: dict[str, list[tuple[float, float]]], costs: dict
+    ours: dict[str, Any],
+    renders: dict[int, tuple[int, float]],
+    rivals: dict[str, list[dict[str, Any]]],
+    of_all: dict[str, dict[int, tuple[int, float]]],
 ) -> dict[str, Any] | None:
     """The rival that is the first to have that error, and W, C, W/C against it."""
     answers = []
-    for name, points in curves.items():
-        if answer := samples_for(error, points):
-            m, mark = answer
-            answers.append((m * (costs[name] or 1.0), m, mark, name))
+    for name, rows in rivals.items():
+        if answer := first_at(ours["error"], [(row["seconds"]["total"], row["error"]) for row in rows]):
+            answers.append((*answer, name))
     if not answers:
         return None
-    _, m, mark, rival = min(answers)
-    W, rival_cost = m / n, costs[rival]
-    C = cost / rival_cost if cost and rival_cost else None
-    return {"rival": rival, "rival samples": m, "W": W, "C": C, "W/C": W / C if C else None, "mark": mark}
+    seconds, mark, rival = min(answers)
+    points = [(of_all[rival][row["spp"]][0], row["error"]) for row in rivals[rival]]
+    samples = first_at(ours["error"], points)
+    W = samples[0] / renders[ours["spp"]][0] if samples else None
+    costs = [_of_a_sample(list(rendered.values())) for rendered in (renders, of_all[rival])]
+    C = costs[0] / costs[1] if costs[0] and costs[1] else None
+    entry = {"rival": rival, "rival seconds": seconds, "rival samples": samples[0] if samples else None}
+    return entry | {"W": W, "C": C, "W/C": seconds / ours["seconds"]["total"], "mark": mark}
 
 
-def _seconds(cost: dict[str, Any], method: dict[str, Any]) -> float | None:
-    """Of one sample, for what this column is given."""
-    entry = cost.get(method["render"])
-    if entry is None:
-        # "auto" and the sampler it stands for on this scene are one.
-        usual = cost.get(method["stack"])
-        entry = usual if usual and usual["sampler"] in (method["sampler"], KINDS[method["stack"]]) else None
-    return entry["median"] if entry else None
+def _of_a_sample(renders: Sequence[tuple[int, float]]) -> float:
+    """Seconds of a further sample, by (samples, seconds) of renders: from the least to the most of them."""
+    (few, short), (many, long) = min(renders), max(renders)
+    return (long - short) / (many - few) if many > few and long > short else long / many
 
 
 def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Geometric means over all scenes and over each group: of each column, and with method None of the best ones."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
-    groups = {"all": scenes} if len(scenes) > 1 else {}
-    groups |= {name: [s for s in scenes if s in listed] for name, listed in results["settings"]["groups"].items()}
+    """Geometric means over each group of scenes and over all: of each column, and with method None of the best ones."""
     means = []
-    for group, members in groups.items():
+    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
         for spp in results["settings"]["spp"]:
             for method in (None, *results["methods"]):
                 here = [row for row in rows if row["scene"] in members and row["spp"] == spp]
@@ -143,10 +113,7 @@ def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str
                 for key in ("W", "C", "W/C"):
                     values = [row[key] for row in here if row[key] is not None]
                     entry[key] = mean(values, geometric=True) if len(values) == len(here) else None
-                marks = {row["mark"] for row in here} - {""}
-                bounds = marks & {"<", ">"}
-                entry["mark"] = bounds.pop() if len(bounds) == 1 else "~" if marks else ""
-                means.append(entry)
+                means.append(entry | {"mark": joined(row["mark"] for row in here)})
     return means
 
 

@@ -59,7 +59,7 @@ def write_map(results: dict[str, Any], scene: str, out: Path) -> dict[str, Any] 
     """Draws the map of a scene from the pictures of the first seed; its path relative to ``out``, and shares of blocks.
 
     At each number of samples the best pipeline with gradients is held against the best without, which has had the same
-    time. None where no pictures were kept, or one of the two kinds is missing.
+    rendering time. None where no pictures were kept, or one of the two kinds is missing.
     """
     entry = results["scenes"][scene]
     reference = entry["reference"]
@@ -84,7 +84,9 @@ def write_map(results: dict[str, Any], scene: str, out: Path) -> dict[str, Any] 
     if not panels:
         return None
     path = f"plots/worth-{scene}.svg"
-    write_text(out / path, draw_map(panels, f"{scene}: error without gradients over error with them, at equal time"))
+    write_text(
+        out / path, draw_map(panels, f"{scene}: error without gradients over error with them, at equal rendering time")
+    )
     return {"map": path, "blocks": shares}
 
 

@@ -63,7 +63,7 @@ def converted(image: np.ndarray, matrix: np.ndarray | None) -> np.ndarray:
     if matrix is None:
         return image
     with np.errstate(over="ignore", invalid="ignore"):
-        return np.ascontiguousarray(image @ matrix.T.astype(image.dtype))
+        return np.ascontiguousarray(np.einsum("...c,dc->...d", image, matrix.astype(image.dtype)))
 
 
 def _conversion(chromaticities: np.ndarray) -> np.ndarray:

@@ -52,7 +52,7 @@ class Network:
 
     ``path``     model.onnx, as ``ngpt export`` writes it
     ``device``   one of ``DEVICES``; "auto" is "cpu"
-    ``threads``  of the CPU, 0 for as many as it has cores
+    ``threads``  of the CPU, 0 for as many as it has cores, or ``ngpt.limit_threads`` allows
 
     Raises NgptError for a file that is none of ours, and for a device that cannot be used: there is no other that is
     taken in silence.
@@ -227,7 +227,7 @@ def session(path: Path, device: str, threads: int):
     # Neither a pipe nor a device, which it would read without an end.
     if not path.is_file():
         raise NgptError(f"{path}: no such file; `ngpt export` writes it")
-    return _made(str(path), path.stat().st_mtime_ns, device, threads)
+    return _made(str(path), path.stat().st_mtime_ns, device, threads or processors())
 
 
 def runtime() -> Any:
@@ -251,7 +251,7 @@ def _made(path: str, _modified: int, device: str, threads: int):
         have = [name for name, provider in DEVICES.items() if provider in available]
         raise NgptError(f"device '{device}': this build of ONNX Runtime has only: {', '.join(have)}; install another")
     options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = threads or processors()
+    options.intra_op_num_threads = threads
     # The plan of which buffers to use again takes most of the start, six times as long as all else, and gains neither
     # time nor memory: the arena has the same buffers again.
     options.enable_mem_reuse = False

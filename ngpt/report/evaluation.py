@@ -95,7 +95,8 @@ def _scene(folder: Path, results: dict, name: str, spp: int, cells: list[dict]) 
     reference = scene["reference"] or {"image": None}
     image = read_image(folder / reference["image"]) if reference["image"] else None
     clock = f"sampler {results['settings']['clock']}" if _several_samplers(results) else "gradients"
-    facts = [f"{scene['size'][0]}x{scene['size'][1]}, equal time to {spp} spp of {clock}; times are render and method"]
+    size = f"{scene['size'][0]}x{scene['size'][1]}"
+    facts = [f"{size}, equal rendering time to {spp} spp of {clock}; times are render and method"]
     # Of references from elsewhere the number of samples may not be known.
     samples = f"reference {reference['spp']:g} spp" if reference.get("spp") else "reference"
     facts += [samples] if image is not None else ["no reference"]
@@ -136,6 +137,7 @@ def _tables(results: dict) -> dict[str, list[list[str]]]:
     }
     worth = results.get("worth", {}).get("tables", {})
     tables |= {f"{title} (worth.md explains)": rows for title, rows in worth.items()}
+    tables |= results.get("against", {}).get("tables", {})
     if _several_samplers(results):
         tables |= _costs(results)
     if absent:

@@ -5,6 +5,8 @@ import os
 from contextlib import suppress
 from pathlib import Path
 
+from ngpt.errors import WrongUse
+
 try:
     import resource
 except ImportError:  # Windows
@@ -13,13 +15,37 @@ except ImportError:  # Windows
 # MiB of address space that stand for no limit: far more than any machine has.
 UNLIMITED = 2**40
 
+# The most threads of one pool that are allowed; None where nobody has set a limit.
+_most: int | None = None
+
 # Bytes of memory where the system does not say how much it has.
 _ASSUMED = 2**34
 
 
 def processors() -> int:
-    """Processors that this process may run on, or where that is not told, those of the machine."""
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    """Processors that this process may run on, at most ``limit_threads``; those of the machine where no system tells.
+
+    So many threads work at once: NumPy's, SciPy's, ONNX Runtime's, OIDN's and OpenEXR's.
+    """
+    own = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(own, _most or own)
+
+
+def limit_threads(most: int) -> None:
+    """From now on work of this package takes at most so many threads. A later call replaces the limit of an earlier.
+
+    PyTorch and renderers have limits of their own, and so has BLAS (OPENBLAS_NUM_THREADS and the like), which no
+    reconstruction needs. Raises WrongUse unless ``most`` is a whole number of at least 1.
+    """
+    global _most
+    if isinstance(most, bool) or not isinstance(most, int) or most < 1:
+        raise WrongUse(f"threads: {most!r} is not allowed; give a whole number, 1 or more")
+    _most = most
+
+
+def limited() -> bool:
+    """Whether there is a limit of ``limit_threads``."""
+    return _most is not None
 
 
 def memory() -> int:

@@ -1,21 +1,21 @@
 """One pool of threads for NumPy: it releases Python's lock while it works, so that parts of an array go in parallel."""
 
-import os
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from ngpt.system.forks import until_fork
+from ngpt.system.limits import processors
 
 
 def map_parts(function: Callable[[Any], Any], parts: Iterable) -> list:
-    """What ``function(part)`` returns for each of ``parts``, in their order, computed on all cores.
+    """What ``function(part)`` returns for each of ``parts``, in their order, computed by ``processors()`` threads.
 
     ``function`` must not call this in its turn: threads that wait for threads of the same pool may wait for ever.
     """
-    return list(_threads().map(function, parts))
+    return list(_threads(processors()).map(function, parts))
 
 
-@until_fork(1)
-def _threads() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="ngpt")
+@until_fork(2)
+def _threads(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="ngpt")

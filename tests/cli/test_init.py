@@ -23,7 +23,8 @@ from ngpt.training.settings import read_settings
 
 KINDS = {"train": configs.TRAINING, "dataset": configs.DATASET, "evaluate": configs.EVALUATION}
 READERS = {"train": read_settings, "dataset": read_data, "evaluate": read_evaluation}
-ALL = [(verb, name) for verb, kind in KINDS.items() for name in configs.names(kind)]
+ON_A_BASE = {("evaluate", "eval-640")}
+ALL = [(verb, name) for verb, kind in KINDS.items() for name in configs.names(kind) if (verb, name) not in ON_A_BASE]
 
 
 def keys(verb: str) -> set[str]:

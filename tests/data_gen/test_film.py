@@ -78,6 +78,31 @@ def test_variance_of_a_gradient_is_that_of_its_mean(renderer, film, rng):
     assert np.allclose(layers["dy_var"][:-1, :, 0], (variance["dy+"][:-1] + variance["dy-"][1:]) / 4)
 
 
+@pytest.mark.parametrize("strands", [1, 6 * 5])
+def test_feature_noise_is_that_of_the_noisier_feature(renderer, film, rng, strands, monkeypatch):
+    import data_gen.film.gradient_film as module
+
+    monkeypatch.setattr(module, "_STRANDS", strands)
+    target = film(3, 2)
+    assert target.feature_noise is None
+    features = {"albedo": rng.random((6, 8, 3)), "normal": 3 * rng.random((6, 8, 3)), "depth": 9 * rng.random((6, 8))}
+    for first, last in ((0, 1), (1, 8)):
+        fill(renderer, target, np.zeros((6, last - first, 3)))
+        for name, samples in features.items():
+            part = samples[:, first:last].astype(np.float32)
+            colour = part.ndim == 3
+            target.put(name, renderer.Color3f(*part.reshape(-1, 3).T) if colour else renderer.Float(part.ravel()))
+        target.end_pass()
+        if last == 1:
+            assert target.feature_noise is None
+    expected = [features[name].var(axis=1, ddof=1).mean() / 8 for name in ("albedo", "normal")]
+    assert target.feature_noise == pytest.approx(max(expected), rel=1e-4)
+    assert not {"albedo_var", "normal_var"} & set(target.develop())
+    monkeypatch.setattr(module, "_ENOUGH", 3)
+    some = features["normal"][::2].var(axis=1, ddof=1).mean() / 8
+    assert target.feature_noise == pytest.approx(some, rel=1e-4)
+
+
 def test_diagnostics_are_images_beside_the_layers(renderer, film, rng):
     mi = renderer
     target = film(2, 2)

@@ -249,6 +249,20 @@ def test_claims_are_those_over_seeds(renderer, sampler, scene, spp):
             assert 0.8 < seen.ravel()[quiet].mean() / told.ravel()[quiet].mean() < 1.25, layer
 
 
+@pytest.mark.parametrize("scene", ["glossy", "lens"])
+def test_noise_of_features_is_that_over_seeds(renderer, scene):
+    from data_gen.render import render_stack
+
+    loaded = load(renderer, scene, (64, 40))
+    stacks = [render_stack(loaded, 16, seed, "primal") for seed in range(8)]
+    seen = max(np.var([s[name] for s in stacks], axis=0, ddof=1).mean() for name in ("albedo", "normal"))
+    told = [stack.attributes["ngpt:featureNoise"] for stack in stacks]
+    assert 0.5 < seen / np.mean(told) < 2
+    assert merge(stacks).attributes["ngpt:featureNoise"] == pytest.approx(np.mean(told) / 8)
+    for spp, options in ((16, {"features": False}), (1, {})):
+        assert "ngpt:featureNoise" not in render_stack(loaded, spp, 0, "primal", **options).attributes
+
+
 EXTENT = 48, 32
 
 

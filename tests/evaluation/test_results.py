@@ -35,7 +35,12 @@ def make_results(errors: dict[str, list[float]], noise: float = 1e-6) -> dict:
         for method, values in errors.items():
             for seed, value in enumerate(values):
                 cell = {"scene": scene, "spp": 16, "method": method, "seed": seed, "spp used": 20, "absent": None}
-                cell["seconds"] = {"render": 2.0, "reconstruct": seed + 1.0, "total": seed + 3.0}
+                cell["seconds"] = {
+                    "render": 2.0,
+                    "reconstruct": seed + 1.0,
+                    "total": seed + 3.0,
+                    "reconstruct wall": 0.5,
+                }
                 cell["metrics"] = {"relMSE": value * factor, "PSNR": 10.0 * factor}
                 results["cells"].append(cell)
     results["summary"] = summarised(results)
@@ -52,7 +57,12 @@ def test_medians_and_means():
     rows = {(row["scene"], row["method"]): row for row in results["summary"]}
     assert rows["a", "l1"]["error"] == 0.02 and rows["a", "l1"]["seeds"] == 3
     assert rows["a", "l1"]["metrics"]["relMSE"] == pytest.approx({"median": 0.02, "low": 0.015, "high": 0.055})
-    assert rows["a", "l1"]["seconds"] == {"render": 2.0, "reconstruct": 2.0, "total": 4.0}
+    assert rows["a", "l1"]["seconds"] == {
+        "render": 2.0,
+        "reconstruct": 2.0,
+        "total": 4.0,
+        "reconstruct wall": 0.5,
+    }
     # Geometric for errors, arithmetic for decibels.
     assert rows[None, "l1"]["error"] == pytest.approx(0.2)
     assert rows[None, "l1"]["metrics"]["PSNR"]["median"] == pytest.approx(505)
@@ -93,8 +103,11 @@ def test_what_the_reference_cannot_tell_is_marked():
 
 def test_csv_has_a_line_for_each_cell():
     lines = as_csv(make_results({"l1": [0.01, 0.02]})).splitlines()
-    assert lines[0] == "scene,spp,method,seed,spp used,render s,reconstruct s,total s,relMSE,PSNR,absent"
-    assert lines[1] == "a,16,l1,0,20,2.0,1.0,3.0,0.01,10.0," and len(lines) == 5
+    assert (
+        lines[0]
+        == "scene,spp,method,seed,spp used,render s,reconstruct s,total s,reconstruct wall s,relMSE,PSNR,absent"
+    )
+    assert lines[1] == "a,16,l1,0,20,2.0,1.0,3.0,0.5,0.01,10.0," and len(lines) == 5
 
 
 def test_the_pareto_set():

@@ -156,7 +156,7 @@ def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monke
     (_, ours, theirs) = [(e.get("stroke"), e.get("stroke-dasharray")) for e in lines]
     assert ours[0] == theirs[0] and ours[1] != theirs[1]  # one colour for l2, dashes by sampler
     page = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
-    assert "l2 (theirs)" in page and "equal time to 4 spp of sampler auto" in page
+    assert "l2 (theirs)" in page and "equal rendering time to 4 spp of sampler auto" in page
     # A single sampler that is not the usual one: names are those of the methods.
     results = evaluate(
         read(text.replace('"theirs"', "").replace('"ours", ', '"ours"'), tmp_path), tmp_path, QUIET, "", service

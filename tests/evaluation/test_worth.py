@@ -10,8 +10,9 @@ from folders import read, smooth_image, write_halves
 import ngpt
 from data_gen import service
 from ngpt.errors import NgptError
+from ngpt.evaluation.curves import REACH, first_at
 from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.worth import REACH, samples_for, worth_of_gradients, worth_tables
+from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import block_errors, block_size, draw_map, log_ratio, share_that_pays
 from ngpt.report.evaluation import write_evaluation_report
 from ngpt.stack import GradientStack
@@ -48,24 +49,24 @@ stack = "features"
     ("samples", "mark"), [(8, ""), (20, ""), (32, ""), (128, ""), (200, "~"), (127 * REACH, "~"), (4, "~"), (2.1, "~")]
 )
 def test_a_power_law_is_read_exactly(samples, mark):
-    found, how = samples_for(0.3 * samples**-0.7, LAW)
+    found, how = first_at(0.3 * samples**-0.7, LAW)
     assert found == pytest.approx(samples, rel=1e-6)
     assert how == mark or samples in (8, 128)  # the ends, up to rounding
 
 
 def test_a_slope_is_followed_for_a_factor_and_no_further():
-    assert samples_for(1e-9, LAW) == (pytest.approx(128 * REACH), ">")
-    assert samples_for(1e9, LAW) == (pytest.approx(8 / REACH), "<")
+    assert first_at(1e-9, LAW) == (pytest.approx(128 * REACH), ">")
+    assert first_at(1e9, LAW) == (pytest.approx(8 / REACH), "<")
 
 
 def test_a_curve_that_rises_has_the_error_it_had_before():
     # Noise put the second point above the first: more samples do no harm, so the first crossing counts.
     points = [(1, 1.0), (4, 2.0), (16, 0.25)]
-    assert samples_for(0.5, points) == (pytest.approx(8), "")
+    assert first_at(0.5, points) == (pytest.approx(8), "")
     # It stays at 0.25 until 64 at least: what comes below is sought from there on, by the last slope that falls.
-    found, mark = samples_for(0.125, [*points, (64, 0.3)])
+    found, mark = first_at(0.125, [*points, (64, 0.3)])
     assert (found, mark) == (pytest.approx(64 * 2), "~")
-    assert samples_for(0.2, [(1, 0.5), (4, 0.6)]) is None and samples_for(0.2, [(1, 0.5)]) is None
+    assert first_at(0.2, [(1, 0.5), (4, 0.6)]) is None and first_at(0.2, [(1, 0.5)]) is None
 
 
 def write_room(folder, rng):
@@ -107,8 +108,9 @@ def test_stacks_of_known_worth(room):
     assert [row["mark"] for row in best] == ["", "", "~"]  # three times 64 samples were not measured
     worse = [row["W"] for row in results["worth"]["rows"] if row["method"] == "ours-worse"]
     assert worse == pytest.approx([WORTH / 2] * 3, rel=0.15)
-    # Nobody measured what samples of these stacks cost.
-    assert all(row["C"] is None and row["W/C"] is None for row in results["worth"]["rows"])
+    # Samples take the same time with gradients, and copying an image takes none: worth over cost is the worth.
+    assert all(row["C"] == pytest.approx(1) for row in results["worth"]["rows"])
+    assert all(row["W/C"] == pytest.approx(row["W"], rel=0.05) for row in best)
     # At equal time, which without costs are equal samples, nearly all blocks are better.
     assert all(row["blocks"] > 0.5 for row in best)
     with open(folder / "out" / "worth.csv", newline="") as file:
@@ -116,45 +118,74 @@ def test_stacks_of_known_worth(room):
     assert [float(line["W"]) for line in lines if line["best"] == "True"] == [row["W"] for row in best]
     page = (folder / "out" / "worth.md").read_text()
     assert f"| room | 16 | ours | primal | {best[1]['W']:.2f} |" in page and "the command" in page
-    assert f"| rooms (1) | 64 | ~{best[2]['W']:.2f} |" in page
+    assert f"| rooms (1) | 64 | ~{best[2]['W']:.2f} | 1.00 |" in page
     ElementTree.parse(folder / "out" / results["plots"]["worth"]["room"])
     report = write_evaluation_report(folder / "out", folder / "report.html").read_text()
     assert "Worth of gradients, scene by scene" in report and "worth: room" in report
 
 
-def test_costs_make_the_difference(room):
-    """C is of what the two columns are given, and the rival is the one that is done first."""
-    folder, text = room
-    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
-    results["scenes"]["room"]["cost"] = {
-        "gradients": {"median": 0.03, "sampler": "gpt"},  # the usual one here: "gpt" is found under this name
-        "gradients slow": {"median": 0.06, "sampler": "slow"},
-        "features": {"median": 0.015, "sampler": "primal"},
-        "path": {"median": 0.01, "sampler": "primal"},
+def of_known_costs(costs: dict[str, tuple[float, float]], worth: float = WORTH) -> dict:
+    """Results of one scene: errors 1/n, with gradients 1/(worth n); whole seconds of a method by (begin, a sample)."""
+    results = {
+        "settings": {"spp": [4, 16], "groups": {}},
+        "methods": {m: {"stack": "gradients" if "ours" in m else "features", "sampler": "any"} for m in costs},
+        "scenes": {"room": {}},
+        "cells": [],
+        "summary": [],
     }
-    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(results)["rows"]}
-    assert rows["ours", 16]["C"] == pytest.approx(3.0) and rows["ours", 16]["W/C"] == pytest.approx(1.0, rel=0.15)
-    assert rows["ours-worse", 16]["C"] == pytest.approx(6.0)
-    # "theirs-worse" needs 4 times the samples of "primal"; if each cost a tenth, it would be the first all the same.
-    results["scenes"]["room"]["cost"]["features"]["median"] = 0.001
-    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(results)["rows"]}
-    assert rows["ours", 4]["rival"] == "theirs-worse" and rows["ours", 4]["C"] == pytest.approx(30.0)
-    assert rows["ours", 4]["W"] == pytest.approx(4 * WORTH, rel=0.2)
+    for method, (begins, sample) in costs.items():
+        for n in (4, 16, 64, 256):
+            place = {"scene": "room", "method": method, "spp": n}
+            seconds = {"render": n * sample, "reconstruct": begins, "total": begins + n * sample}
+            results["cells"].append(place | {"spp used": n, "seconds": seconds, "absent": None})
+            error = 1 / n / (worth if "ours" in method else 1)
+            results["summary"].append(place | {"error": error, "seconds": seconds})
+    return results
+
+
+def test_the_whole_time_makes_the_difference():
+    """W/C is the seconds without over those with, both whole; C that of further samples, whatever a method takes."""
+    rows = {
+        (row["method"], row["spp"]): row
+        for row in worth_of_gradients(of_known_costs({"ours": (0, 3.0), "theirs": (0, 1.0)}))["rows"]
+    }
+    assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, 1))
+    # Our method takes as long as all of the samples: half as much is left of W/C, and C stays.
+    rows = {
+        (row["method"], row["spp"]): row
+        for row in worth_of_gradients(of_known_costs({"ours": (48.0, 3.0), "theirs": (0, 1.0)}))["rows"]
+    }
+    assert (rows["ours", 16]["W"], rows["ours", 16]["C"], rows["ours", 16]["W/C"]) == pytest.approx((3, 3, 0.5))
+    assert rows["ours", 4]["W/C"] == pytest.approx(12 / 60) and rows["ours", 4]["seconds"] == 60
+    # Of two rivals the one that is done first counts: the quick samples of the one wait for a slow method.
+    costs = {"ours": (0, 3.0), "slow-begin": (100.0, 0.5), "slow-samples": (0.0, 1.0)}
+    rows = {(row["method"], row["spp"]): row for row in worth_of_gradients(of_known_costs(costs))["rows"]}
+    assert rows["ours", 4]["rival"] == "slow-samples" and rows["ours", 4]["rival seconds"] == pytest.approx(12)
+
+
+def test_cells_without_a_time_have_no_worth():
+    results = of_known_costs({"ours": (0, 3.0), "theirs": (0, 1.0)})
+    for row in results["summary"]:
+        if row["method"] == "ours" and row["spp"] == 4:
+            row["seconds"] = row["seconds"] | {"total": None}
+    assert [row["spp"] for row in worth_of_gradients(results)["rows"]] == [16]
 
 
 def test_means_over_scenes_are_geometric_and_carry_marks(room):
     folder, text = room
     results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
+    results["settings"]["groups"] = {"rooms": ["b", "c"]}
     row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
     rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
     from ngpt.evaluation.worth import _means
 
-    (best,) = [mean for mean in _means(results, rows) if mean["method"] is None]
+    one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
+    assert (one["group"], one["scenes"], one["W"]) == ("rooms", 1, pytest.approx(4.0))
     assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")
     assert (best["W"], best["C"], best["W/C"]) == pytest.approx((2.0, 2.0, 1.0))
     results["worth"] = {"rows": rows, "means": _means(results, rows)}
     table = next(iter(worth_tables(results).values()))
-    assert table[1][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]
+    assert table[2][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]
 
 
 def test_without_both_kinds_of_methods_nothing_is_written(room):

@@ -4,6 +4,7 @@ import os
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
+from threading import get_ident
 
 import numpy as np
 import pytest
@@ -11,10 +12,16 @@ from full_stack import full_stack
 from processes import complete, in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
+from ngpt.classical import arrays
 from ngpt.denoisers import oidn_filters
+from ngpt.errors import NgptError
 from ngpt.measure.metrics import METRICS, scores
 from ngpt.methods import METHODS
+from ngpt.network import run_onnx
+from ngpt.network.run import WEIGHTS
+from ngpt.system import limits
 from ngpt.system.forks import until_fork
+from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
 THREADS, ROUNDS = 6, 2
@@ -142,3 +149,42 @@ def test_what_owns_threads_is_made_anew_in_parent_and_child():
     child = np.frombuffer(in_a_child(made, 1), first.dtype)
     assert child[0] != os.getpid() and child[1] == 1
     assert made(1) is not first
+
+
+@pytest.fixture
+def limit():
+    """``limit_threads``, without a limit after the test."""
+    yield ngpt.limit_threads
+    limits._most = None
+
+
+def test_a_limit_of_threads_holds_for_everything_that_has_some(limit, monkeypatch):
+    limit(1)
+    assert len({get_ident() for _ in range(9)} | set(map_parts(lambda _: get_ident(), range(64)))) == 2
+    assert run_onnx.Network(WEIGHTS / "ngpt-fast.onnx").session.get_session_options().intra_op_num_threads == 1
+    workers = []
+    real = arrays.scipy.fft.dctn
+    monkeypatch.setattr(arrays.scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given))
+    ngpt.denoise(stack(0), "l2")
+    assert workers and set(workers) == {1}
+    limit(processors() + 5)
+    assert processors() == len(os.sched_getaffinity(0)), "a limit asks for no more than there is"
+    for bad in (0, -1, 1.5, True):
+        with pytest.raises(NgptError, match="threads: .* is not allowed; give a whole number, 1 or more"):
+            limit(bad)
+
+
+@pytest.mark.skipif(METHODS["oidn"].missing() != "", reason="OIDN is not installed")
+def test_a_limit_of_threads_holds_for_oidn(limit):
+    free = ngpt.denoise(stack(0), "oidn")
+    limit(1)
+    assert np.allclose(ngpt.denoise(stack(0), "oidn"), free, rtol=1e-5, atol=1e-6)
+    device = oidn_filters._devices["auto", 1]
+    assert device.type.name != "CPU" or device.num_threads == 1
+
+
+def test_a_network_sleeps_when_it_has_nothing_to_do():
+    ngpt.denoise(full_stack(64, 96), "ngpt-fast")
+    before = time.process_time()
+    time.sleep(0.2)
+    assert time.process_time() - before < 0.1

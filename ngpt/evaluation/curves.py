@@ -1,0 +1,88 @@
+"""Errors over samples or seconds as curves, read off between the measured points and a little outside of them.
+
+A curve is the running minimum of its points, straight between them on logarithmic axes: who has more samples could
+have taken fewer. Outside of the points the nearest slope that falls goes on, for a factor of ``REACH`` at most. Marks
+say which it was:
+
+    ""      between measured points
+    "~"     outside, by the nearest slope
+    "<" ">" farther outside: read at the factor, so that the truth is below or above
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from itertools import pairwise
+
+REACH = 4.0  # how far a slope is trusted past the measured points
+
+# (samples or seconds, error)
+Points = Sequence[tuple[float, float]]
+_Segment = tuple[tuple[float, float], tuple[float, float]]
+
+
+def first_at(error: float, points: Points) -> tuple[float, str] | None:
+    """Where a curve first comes down to ``error``, and its mark.
+
+    None where there are fewer than two points, or the error never falls. All numbers must be positive.
+    """
+    curve, falls = _curve(points)
+    if not falls:
+        return None
+    target, reach = math.log(error), math.log(REACH)
+    (first, highest), (last, lowest) = curve[0], curve[-1]
+    if target > highest:
+        x = first + (target - highest) / _slope(falls[0])
+        return (math.exp(x), "~") if x >= first - reach else (math.exp(first - reach), "<")
+    if target < lowest:
+        x = last + (target - lowest) / _slope(falls[-1])
+        return (math.exp(x), "~") if x <= last + reach else (math.exp(last + reach), ">")
+    if target == highest:
+        return math.exp(first), ""
+    segment = next(segment for segment in falls if segment[1][1] <= target)
+    return math.exp(segment[0][0] + (target - segment[0][1]) / _slope(segment)), ""
+
+
+def error_at(x: float, points: Points) -> tuple[float, str] | None:
+    """The error of a curve at ``x``, and the mark of what is divided by it: ">" where the error is below that.
+
+    None where there are fewer than two points. All numbers must be positive.
+    """
+    curve, falls = _curve(points)
+    if len(curve) < 2:
+        return None
+    at, reach = math.log(x), math.log(REACH)
+    (first, highest), (last, lowest) = curve[0], curve[-1]
+    if at < first:
+        error = highest + (max(at - first, -reach) * _slope(falls[0]) if falls else 0.0)
+        return math.exp(error), "~" if at >= first - reach else "<"
+    if at > last:
+        error = lowest + (min(at - last, reach) * _slope(falls[-1]) if falls else 0.0)
+        return math.exp(error), "~" if at <= last + reach else ">"
+    a, b = next((a, b) for a, b in pairwise(curve) if at <= b[0])
+    return math.exp(a[1] + (at - a[0]) * _slope((a, b))), ""
+
+
+def joined(marks: Iterable[str]) -> str:
+    """The mark of a mean: a bound where all bounds are of one side, else "~" where there is any mark."""
+    found = set(marks) - {""}
+    bounds = found & {"<", ">"}
+    return bounds.pop() if len(bounds) == 1 else "~" if found else ""
+
+
+def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:
+    """Logarithms of the running minimum, and those of its segments that fall."""
+    curve: list[tuple[float, float]] = []
+    for x, error in sorted(points):
+        lowest = min(math.log(error), curve[-1][1] if curve else math.inf)
+        if curve and math.log(x) == curve[-1][0]:
+            continue  # the least of those at one place came first
+        curve.append((math.log(x), lowest))
+    return curve, [(a, b) for a, b in pairwise(curve) if b[1] < a[1]]
+
+
+def _slope(segment: _Segment) -> float:
+    """Error over samples or seconds, both logarithms."""
+    (x0, e0), (x1, e1) = segment
+    return (e1 - e0) / (x1 - x0)

@@ -1,0 +1,187 @@
+"""Errors over those that rivals have after the same whole time: rendering and reconstruction.
+
+A rival is a family of columns, the settings of one denoiser on the samples of one renderer (``against`` in the
+configuration). Each setting has a curve of errors over whole seconds (``ngpt.evaluation.curves``). At a time the rival
+has the least error of all its settings, and the least FLIP, whichever setting that is of: its user knew the best one.
+A setting counts from its quickest cell on, unless no setting was measured in so little time.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from typing import Any
+
+from ngpt.evaluation.averages import groups_of, mean
+from ngpt.evaluation.curves import Points, error_at, joined
+
+FIELDS = ("scene", "spp", "method", "seconds", "rival", "setting", "error", "mark", "FLIP", "FLIP mark")
+FLIP = "FLIP"
+# Points of an envelope that is drawn
+_STEPS = 17
+
+
+def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
+    """``rows`` for each scene, count of samples, column and rival that it is no setting of (``FIELDS``), and ``means``.
+
+    ``error`` is the primary metric over the rival's at the column's ``seconds``, ``setting`` the column of the rival
+    that it is over; FLIP likewise. Means are geometric over the scenes of each group and over all; ``less`` and ``less
+    FLIP`` count the scenes where the column has less, of as many as ``scenes`` and ``scenes FLIP`` say. What was not
+    measured, is not positive or has no time makes no row.
+    """
+    rows = []
+    for scene in results["scenes"]:
+        here = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
+        curves = {name: _curves(results, here, name) for name in results["settings"]["against"]}
+        for row in here:
+            if row["spp"] in results["settings"]["spp"] and (row["error"] or 0) > 0:
+                for rival, columns in results["settings"]["against"].items():
+                    found = _over(row, results["primary"], curves[rival]) if row["method"] not in columns else None
+                    if found:
+                        place = {name: row[name] for name in ("scene", "spp", "method")}
+                        rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
+    return {"rows": rows, "means": _means(results, rows)}
+
+
+def _curves(results: dict[str, Any], rows: list[dict[str, Any]], rival: str) -> dict[str, dict[str, Points]]:
+    """Metric -> setting -> points of seconds and error, on one scene."""
+    found: dict[str, dict[str, list[tuple[float, float]]]] = {}
+    for row in rows:
+        if row["method"] in results["settings"]["against"][rival]:
+            for metric in dict.fromkeys((results["primary"], FLIP)):
+                value = _value(row, metric)
+                if value:
+                    points = found.setdefault(metric, {}).setdefault(row["method"], [])
+                    points.append((row["seconds"]["total"], value))
+    return {metric: dict(settings) for metric, settings in found.items()}
+
+
+def _value(row: dict[str, Any], metric: str) -> float | None:
+    value = row["metrics"].get(metric, {}).get("median")
+    return value if value is not None and value > 0 else None
+
+
+def _least(seconds: float, settings: dict[str, Points]) -> tuple[float, str, str] | None:
+    """The least error of all settings at a time, its mark and its setting."""
+    found = [(*answer, name) for name, points in settings.items() if (answer := error_at(seconds, points))]
+    begun = [answer for answer in found if min(settings[answer[2]])[0] <= seconds]
+    return min(begun or found, default=None)
+
+
+def _over(row: dict[str, Any], primary: str, curves: dict[str, dict[str, Points]]) -> dict[str, Any] | None:
+    """The column's values over the rival's at its time; None without an error of the rival."""
+    least = _least(row["seconds"]["total"], curves.get(primary, {}))
+    if least is None:
+        return None
+    error, mark, setting = least
+    entry = {"setting": setting, "error": row["error"] / error, "mark": mark, "FLIP": None, "FLIP mark": ""}
+    flip, mine = _least(row["seconds"]["total"], curves.get(FLIP, {})), _value(row, FLIP)
+    return entry | ({"FLIP": mine / flip[0], "FLIP mark": flip[1]} if flip and mine else {})
+
+
+def _means(results: dict[str, Any], rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    means = []
+    for group, members in groups_of(results, [row["scene"] for row in rows]).items():
+        for spp in results["settings"]["spp"]:
+            for method in results["methods"]:
+                for rival in results["settings"]["against"]:
+                    key = (spp, method, rival)
+                    here = [r for r in rows if r["scene"] in members and (r["spp"], r["method"], r["rival"]) == key]
+                    if here:
+                        entry = {"group": group, "spp": spp, "method": method, "rival": rival}
+                        means.append(entry | _mean(here))
+    return means
+
+
+def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    seen = [row for row in rows if row["FLIP"] is not None]
+    return {
+        "scenes": len(rows),
+        "seconds": mean([row["seconds"] for row in rows], geometric=True),
+        "error": mean([row["error"] for row in rows], geometric=True),
+        "mark": joined(row["mark"] for row in rows),
+        "less": sum(row["error"] < 1 for row in rows),
+        "scenes FLIP": len(seen),
+        "FLIP": mean([row["FLIP"] for row in seen], geometric=True) if seen else None,
+        "FLIP mark": joined(row["FLIP mark"] for row in seen),
+        "less FLIP": sum(row["FLIP"] < 1 for row in seen),
+    }
+
+
+def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tuple[float, float]]:
+    """What to draw of a rival: (seconds, error) from its quickest to its slowest cell, geometric means over the scenes.
+
+    Each point is at the same share of the way between these two in each scene, on a logarithmic axis.
+    """
+    parts = []
+    for scene in scenes:
+        here = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
+        settings = _curves(results, here, rival).get(results["primary"], {})
+        times = [math.log(seconds) for points in settings.values() for seconds, _ in points]
+        if times:
+            at = [math.exp(min(times) + i / (_STEPS - 1) * (max(times) - min(times))) for i in range(_STEPS)]
+            parts.append([(seconds, _least(seconds, settings)) for seconds in at])
+    if not parts or any(least is None for part in parts for _, least in part):
+        return []
+    return [
+        (mean([seconds for seconds, _ in column], True), mean([least[0] for _, least in column if least], True))
+        for column in zip(*parts, strict=True)
+    ]
+
+
+def as_csv(against: dict[str, Any]) -> str:
+    """One line for each row."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(FIELDS)
+    for row in against["rows"]:
+        writer.writerow(["" if row[name] is None else row[name] for name in FIELDS])
+    return text.getvalue()
+
+
+def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
+    """Title -> rows of text, the first is the head: means of the groups, then each scene."""
+    against, tables = results["against"], {}
+    rivals = list(results["settings"]["against"])
+    heads = [text for rival in rivals for text in (f"error over {rival}", f"FLIP over {rival}")]
+    heads += [text for rival in rivals for text in (f"less error than {rival}", f"less FLIP than {rival}")]
+    if against["means"]:
+        rows = [["scenes", "spp", "method", "seconds", *heads]]
+        for (group, spp, method), by_rival in _by_place(against["means"], "group").items():
+            one = next(iter(by_rival.values()))
+            found = [by_rival.get(rival) for rival in rivals]
+            counts = [text for row in found for text in (_count(row, ""), _count(row, " FLIP"))]
+            first = [f"{group} ({one['scenes']})", str(spp), method, f"{one['seconds']:.3g}"]
+            rows.append([*first, *_ratios(found), *counts])
+        tables["Errors over those of rivals at equal whole time, geometric means"] = rows
+    if against["rows"]:
+        rows = [["scene", "spp", "method", "seconds", *heads[: 2 * len(rivals)]]]
+        for (scene, spp, method), by_rival in _by_place(against["rows"], "scene").items():
+            one = next(iter(by_rival.values()))
+            first = [scene, str(spp), method, f"{one['seconds']:.3g}"]
+            rows.append([*first, *_ratios([by_rival.get(rival) for rival in rivals])])
+        tables["Errors over those of rivals at equal whole time, scene by scene"] = rows
+    return tables
+
+
+def _by_place(rows: list[dict[str, Any]], first: str) -> dict[tuple, dict[str, dict[str, Any]]]:
+    found: dict[tuple, dict[str, dict[str, Any]]] = {}
+    for row in rows:
+        found.setdefault((row[first], row["spp"], row["method"]), {})[row["rival"]] = row
+    return found
+
+
+def ratio(row: dict[str, Any] | None, key: str) -> str:
+    """A ratio with its mark, key "error" or "FLIP"; "" where there is none."""
+    if row is None or row[key] is None:
+        return ""
+    return f"{row['mark' if key == 'error' else 'FLIP mark']}{row[key]:.2f}"
+
+
+def _ratios(rows: list[dict[str, Any] | None]) -> list[str]:
+    return [ratio(row, key) for row in rows for key in ("error", FLIP)]
+
+
+def _count(row: dict[str, Any] | None, key: str) -> str:
+    return f"{row[f'less{key}']} of {row[f'scenes{key}']}" if row else ""

@@ -1,0 +1,198 @@
+"""Errors over rivals' at equal whole time: curves and envelopes of hand-made numbers, and folders of stacks."""
+
+import csv
+import xml.etree.ElementTree as ElementTree
+
+import pytest
+from folders import read, write_scene
+
+from data_gen import service
+from ngpt.errors import NgptError
+from ngpt.evaluation.config import read_config
+from ngpt.evaluation.curves import REACH, error_at
+from ngpt.evaluation.run import evaluate
+from ngpt.evaluation.wholetime import against_rivals, against_tables, envelope
+from ngpt.report.evaluation import write_evaluation_report
+from ngpt.system.console import Console
+
+QUIET = Console(quiet=True)
+LAW = [(t, 0.3 * t**-0.7) for t in (8, 32, 128)]
+
+
+@pytest.mark.parametrize(("seconds", "mark"), [(8, ""), (20, ""), (128, ""), (200, "~"), (500, "~"), (2.1, "~")])
+def test_errors_are_read_off_a_power_law_exactly(seconds, mark):
+    error, how = error_at(seconds, LAW)
+    assert error == pytest.approx(0.3 * seconds**-0.7) and (how == mark or seconds in (8, 128))
+
+
+def test_far_outside_a_curve_it_is_read_at_the_factor():
+    assert error_at(1e6, LAW) == (pytest.approx(0.3 * (128 * REACH) ** -0.7), ">")
+    assert error_at(1e-6, LAW) == (pytest.approx(0.3 * (8 / REACH) ** -0.7), "<")
+    assert error_at(8, LAW[:1]) is None and error_at(8, []) is None
+
+
+def test_who_has_more_time_could_have_taken_less():
+    """A point that noise put above the one before counts as that; beyond it, the slope that fell goes on."""
+    points = [(1, 1.0), (4, 0.25), (16, 0.5)]
+    assert error_at(8, points) == (pytest.approx(0.25), "") and error_at(32, points) == (pytest.approx(0.125), "~")
+
+
+def made(rows: dict[str, list[tuple[float, float, float]]], scenes=("a",), **settings) -> dict:
+    """Results of scenes that are alike, by column: (seconds, error, FLIP) at 4, 16, 64 spp."""
+    results = {
+        "primary": "relMSE",
+        "settings": {"spp": [4, 16], "groups": {}, "against": {"oidn": ["oidn", "oidn-fast"]}} | settings,
+        "methods": {name: {} for name in rows},
+        "scenes": {name: {} for name in scenes},
+        "summary": [],
+    }
+    for scene in scenes:
+        for method, cells in rows.items():
+            for spp, (seconds, error, flip) in zip((4, 16, 64), cells, strict=False):
+                metrics = {"relMSE": {"median": error}, "FLIP": {"median": flip}}
+                place = {"scene": scene, "spp": spp, "method": method, "error": error, "metrics": metrics}
+                results["summary"].append(place | {"seconds": {"total": seconds}})
+    return results
+
+
+RIVALS = {
+    # Errors 8 / seconds after a slow start, and 16 / seconds: the quick setting is ahead until 16 seconds.
+    "oidn": [(16, 0.5, 0.2), (32, 0.25, 0.1), (64, 0.125, 0.05)],
+    "oidn-fast": [(2, 2.0, 0.8), (8, 1.0, 0.4), (32, 0.5, 0.2)],
+}
+
+
+def test_a_rival_has_the_least_error_of_its_settings_at_our_time():
+    results = made({"ours": [(4, 0.7, 0.9), (24, 0.25, 0.1)], **RIVALS})
+    early, late = against_rivals(results)["rows"]
+    assert (early["spp"], early["seconds"], early["setting"], early["mark"]) == (4, 4, "oidn-fast", "")
+    assert early["error"] == pytest.approx(0.7 / 2**0.5) and early["FLIP"] == pytest.approx(0.9 / (0.8 / 2**0.5))
+    assert (late["setting"], late["mark"]) == ("oidn", "")
+    assert late["error"] == pytest.approx(0.25 / (8 / 24)) and late["FLIP"] == pytest.approx(0.1 / (0.2 * 16 / 24))
+    # Before its first cell a setting does not count where another was measured: 8/12 would be less.
+    (between,) = against_rivals(made({"ours": [(12, 0.7, 0.9)], **RIVALS}))["rows"]
+    assert between["setting"] == "oidn-fast" and between["error"] == pytest.approx(0.7 / (2 / 6**0.5))
+    # The rival's own settings are not held against it.
+    assert {row["method"] for row in against_rivals(results)["rows"]} == {"ours"}
+
+
+def test_marks_say_on_which_side_the_truth_is():
+    results = made({"ours": [(1000, 0.001, 0.1), (100, 0.01, 0.1)], **RIVALS})
+    marks = {row["spp"]: row["mark"] for row in against_rivals(results)["rows"]}
+    assert marks == {4: ">", 16: "~"}
+    text = against_tables(results | {"against": against_rivals(results)})
+    assert [row[4] for row in next(iter(text.values()))[1:]] == [">0.03", "~0.13"]
+
+
+def test_means_and_counts_are_of_what_was_measured():
+    results = made({"ours": [(4, 0.7, 0.9), (24, 0.25, 0.1)], **RIVALS}, ("a", "b", "c"), groups={"first": ["a", "z"]})
+    for row in results["summary"]:
+        if row["method"] == "ours" and row["scene"] == "b":
+            row["error"] = 4 * row["error"]
+        if row["method"] == "ours" and row["scene"] == "c":
+            # What is not there, has no time or no positive error makes no cell; FLIP may be missing alone.
+            row["metrics"].pop("FLIP")
+            row["error"] = -0.1 if row["spp"] == 16 else row["error"]
+    found = {(m["group"], m["spp"]): m for m in against_rivals(results)["means"]}
+    assert list(found) == [("first", 4), ("first", 16), ("all", 4), ("all", 16)]
+    assert (found["first", 16]["scenes"], found["first", 16]["less"]) == (1, 1)
+    every = found["all", 4]
+    assert (every["scenes"], every["less"], every["scenes FLIP"], every["less FLIP"]) == (3, 2, 2, 0)
+    assert every["error"] == pytest.approx(0.7 / 2**0.5 * 4 ** (1 / 3))
+    assert found["all", 16]["scenes"] == 2
+
+
+def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():
+    results = made({"ours": [(4, 0.7, 0.9)], **RIVALS}, ("a", "b"))
+    points = envelope(results, "oidn", ["a", "b"])
+    assert points[0] == pytest.approx((2, 2.0)) and points[-1] == pytest.approx((64, 0.125))
+    quick = [2 * (2 / t) ** 0.5 for t, _ in points]
+    best = [min(q, 8 / t) if t >= 16 else q for q, (t, _) in zip(quick, points, strict=True)]
+    assert [error for _, error in points] == pytest.approx(best)
+    assert envelope(made({"ours": [(4, 0.7, 0.9)]}), "oidn", ["a"]) == []
+
+
+CONFIG = """
+scenes = ["{folder}"]
+spp = [4, 16]
+rival_spp = [4, 16, 64]
+seeds = 1
+methods = ["l2", "nfor", "primal", "raw"]
+metrics = ["relMSE", "relMSE trimmed"]
+
+[against]
+path = ["primal", "raw"]
+
+[groups]
+rooms = ["room"]
+
+[variants.raw]
+method = "primal"
+stack = "features"
+"""
+
+
+def test_an_evaluation_holds_its_methods_against_rivals(tmp_path, rng):
+    """Rivals have counts of their own; results, tables, plots and the report say what they are at equal whole time."""
+    write_scene(tmp_path / "room", rng, spp=(4, 16, 64), seeds=1)
+    config = read(CONFIG.format(folder=tmp_path / "room"), tmp_path)
+    results = evaluate(config, tmp_path / "out", QUIET, "", service)
+    measured = {(cell["method"], cell["spp"]) for cell in results["cells"]}
+    assert ("primal", 64) in measured and ("l2", 64) not in measured and ("nfor", 64) not in measured
+    rows = {(row["method"], row["spp"]): row for row in results["against"]["rows"]}
+    assert set(rows) == {(method, spp) for method in ("l2", "nfor") for spp in (4, 16)}
+    cell = next(c for c in results["cells"] if (c["method"], c["spp"]) == ("l2", 16))
+    assert (
+        rows["l2", 16]["seconds"] == pytest.approx(1.6 + cell["seconds"]["reconstruct"]) and not rows["l2", 16]["mark"]
+    )
+    assert rows["l2", 16]["error"] < 0.5
+    assert cell["seconds"]["reconstruct wall"] == cell["seconds"]["reconstruct"]  # the clock of this one
+    page = (tmp_path / "out" / "results.md").read_text()
+    assert "| rooms (1) | 16 | l2 | 1.6" in page and "path (`primal`, `raw`)" in page
+    with open(tmp_path / "out" / "against.csv", newline="") as file:
+        assert len(list(csv.DictReader(file))) == 4
+    plot = ElementTree.parse(tmp_path / "out" / results["plots"]["frontier"]["rivals-rooms"])
+    texts = [element.text for element in plot.iter("{http://www.w3.org/2000/svg}text")]
+    assert {"path", "l2", "nfor"} <= set(texts) and "raw" not in texts
+    report = write_evaluation_report(tmp_path / "out", tmp_path / "report.html").read_text()
+    assert "at equal whole time, scene by scene" in report
+
+
+def test_processor_seconds_of_a_reconstruction_are_those_of_all_threads(tmp_path, rng, monkeypatch):
+    from ngpt.evaluation import cells
+
+    write_scene(tmp_path / "room", rng, seeds=1)
+    ticks = iter(range(100))
+    monkeypatch.setattr(cells.time, "process_time", lambda: 3.0 * next(ticks))
+    text = CONFIG.format(folder=tmp_path / "room").replace("rival_spp = [4, 16, 64]", 'time = "processor"')
+    found = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)["cells"]
+    assert {cell["seconds"]["reconstruct"] for cell in found} == {3.0}
+    assert all(cell["seconds"]["reconstruct wall"] < 3 for cell in found)
+    assert found[0]["seconds"]["total"] == pytest.approx(3.4)
+
+
+def test_a_rival_that_is_no_column_is_refused(tmp_path):
+    with pytest.raises(NgptError, match=r"against\.oidn: there is no column 'oidm' among: primal, l1, wcv"):
+        read('scenes = ["diffuse"]\n[against]\noidn = ["oidm"]\n', tmp_path)
+    with pytest.raises(NgptError, match=r"against\.oidn = 'oidn': must be a list of columns' names"):
+        read('scenes = ["diffuse"]\n[against]\noidn = "oidn"\n', tmp_path)
+
+
+def test_a_configuration_may_build_on_another(tmp_path):
+    (tmp_path / "main.toml").write_text('scenes = ["diffuse"]\nspp = [4]\nseeds = 2\n[groups]\nrooms = ["room"]\n')
+    config = read('base = "main.toml"\nspp = [8]\nscenes = []\n', tmp_path)
+    assert (config.spp, config.seeds, config.groups, config.scenes) == ((8,), 2, {"rooms": ["room"]}, ())
+    with pytest.raises(NgptError, match="no scenes: name built-in ones"):
+        config.scene_files()
+    with pytest.raises(NgptError, match=r"none\.toml: not found"):
+        read('base = "none.toml"\n', tmp_path)
+    with pytest.raises(NgptError, match=r"config\.toml: base = 'config\.toml': must be the name of another file"):
+        read('base = "config.toml"\n', tmp_path)
+
+
+def test_the_main_configurations_differ_in_size_alone():
+    """Rivals and groups are written once; every setting of a rival is measured where it has to reach."""
+    main, large = (read_config(f"configs/eval-{name}.toml") for name in ("main", "640"))
+    assert main.against == large.against and main.groups == large.groups and main.columns() == large.columns()
+    for config in (main, large):
+        assert max(config.rival_spp) > max(config.spp) and min(config.rival_spp) == min(config.spp)
