@@ -60,7 +60,11 @@ __all__ = [
 _HOMES = {"GradientStack": "stack", "NgptError": "errors", "merge": "merging"}
 _HOMES |= dict.fromkeys(("Denoiser", "denoise"), "api.arrays")
 _HOMES |= dict.fromkeys(("read", "read_image", "read_views", "write"), "io.exr")
-_HOMES |= {"reconstruct_with_error": "api.uncertainty", "Temporal": "sequence.history", "limit_threads": "system.limits"}
+_HOMES |= {
+    "reconstruct_with_error": "api.uncertainty",
+    "Temporal": "sequence.history",
+    "limit_threads": "system.limits",
+}
 _HOMES |= dict.fromkeys(("METHODS", "Result", "reconstruct"), "methods")
 
 

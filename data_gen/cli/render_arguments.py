@@ -77,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
+    parser.add_argument("--threads", type=positive, metavar="N", help="that work at once (default: all processors)")
     parser.add_argument(
         "--diagnostics",
         action="store_true",

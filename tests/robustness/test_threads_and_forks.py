@@ -164,7 +164,9 @@ def test_a_limit_of_threads_holds_for_everything_that_has_some(limit, monkeypatc
     assert run_onnx.Network(WEIGHTS / "ngpt-fast.onnx").session.get_session_options().intra_op_num_threads == 1
     workers = []
     real = arrays.scipy.fft.dctn
-    monkeypatch.setattr(arrays.scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given))
+    monkeypatch.setattr(
+        arrays.scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given)
+    )
     ngpt.denoise(stack(0), "l2")
     assert workers and set(workers) == {1}
     limit(processors() + 5)
