@@ -22,7 +22,6 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from data_gen.film import GradientFilm
 from data_gen.passes import DEFAULT_MEMORY, Look, Progress, SamplePass
@@ -34,6 +33,7 @@ from ngpt.layers import FEATURE_NOISE
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
+from ngpt.system.late import ndimage
 
 # Least number of samples per pixel in the mean: that of the first step, everywhere, and as many to be shared out
 LEAST = 2 * BLOCK
@@ -190,7 +190,7 @@ def assess(stack: GradientStack, method: str) -> Assessment:
     """The expected error of what a method would make of the stack."""
     result = reconstruct(stack, method)
     again = reconstruct(noisier(stack), method)
-    light = uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
+    light = ndimage.uniform_filter(np.nan_to_num(result.image).astype(np.float64), (3, 3, 1))
     unit = np.sqrt(np.square(light) + EPSILON)
     # Relative before it is averaged over neighbours: that of a lamp's edge is no error of the dark beside it.
     once, twice = (np.nan_to_num(r.image) / unit for r in (result, again))

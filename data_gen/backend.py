@@ -6,6 +6,7 @@ from data_gen.llvm import use_llvm
 from data_gen.plugins import make_classes
 from ngpt.errors import NgptError, WrongUse, did_you_mean, stop_if_interrupted
 from ngpt.system.install import install_command
+from ngpt.system.limits import limited, processors
 
 _LOG = logging.getLogger(f"ngpt.{__name__}")
 
@@ -51,6 +52,7 @@ def use_variant(name: str = DEFAULT_VARIANT) -> None:
     mi.set_log_level(mi.LogLevel.Error)
     import drjit as dr
 
-    # Where there is one core, Dr.Jit has one thread, and some scene files then load for ever (Mitsuba 3.9.1).
-    if dr.thread_count() < 2:
+    if limited():
+        dr.set_thread_count(processors())
+    elif dr.thread_count() < 2:  # which scenes need to be loaded, see data_gen.scenes.load
         dr.set_thread_count(2)

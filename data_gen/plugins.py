@@ -1,7 +1,7 @@
 """Our integrators as Mitsuba's: ``mi.load_dict({"type": "gpt"})`` after ``import data_gen``, whatever the variant.
 
 Mitsuba knows plugins by variant, and only once one is set. So with each variant that is set, constructors are
-registered that know no more than a name. The classes are made when the first of them is used: that takes a second.
+registered that know no more than a name. A class is made when it is first used: all of them take half a second.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _construct(entry: Any, props: Any) -> Any:
     make_classes()
     from data_gen.samplers.common import GradientIntegrator
 
-    module = sys.modules[entry.module]
+    module = importlib.import_module(entry.module)
     for value in vars(module).values():
         if isinstance(value, type) and issubclass(value, GradientIntegrator) and value.__module__ == entry.module:
             return value(props)
@@ -85,8 +85,11 @@ def _construct(entry: Any, props: Any) -> Any:
 
 
 def make_classes() -> None:
-    """Imports the modules of all samplers for the current variant, to which Mitsuba's classes belong, and so those that
-    are derived from them. Raises NgptError for a variant that cannot vectorise."""
+    """Has samplers be those of the current variant, to which Mitsuba's classes belong, and so those derived from them.
+
+    Their modules are imported when they are first used; here those that are there of another variant are made anew.
+    Raises NgptError for a variant that cannot vectorise.
+    """
     global _made_for
     import mitsuba as mi
 
@@ -102,6 +105,4 @@ def make_classes() -> None:
     for module in ("data_gen.samplers.common", *(entry.module for entry in SAMPLERS.values() if entry.module)):
         if module in sys.modules:
             importlib.reload(sys.modules[module])
-        else:
-            importlib.import_module(module)
     _made_for = variant

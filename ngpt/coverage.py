@@ -11,9 +11,9 @@ has more light there than is left.
 """
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter
 
 from ngpt.stack import GradientStack
+from ngpt.system.late import ndimage
 
 # Pixels around light at alpha 0 in which darkness may be chance, as the side of a square.
 _CHANCE = 5
@@ -31,7 +31,7 @@ def empty_pixels(stack: GradientStack) -> np.ndarray:
     empty = uncovered & dark
     if not empty.any() or 2 * light[uncovered].sum() > light.sum():
         return np.zeros_like(empty)
-    return empty & ~maximum_filter(uncovered & ~dark, _CHANCE)
+    return empty & ~ndimage.maximum_filter(uncovered & ~dark, _CHANCE)
 
 
 def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
@@ -49,7 +49,7 @@ def kept_within(image: np.ndarray, stack: GradientStack) -> np.ndarray:
 
 def _around(values: np.ndarray) -> np.ndarray:
     """(H, W, C), the sum over a Gaussian window around each pixel."""
-    return gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)
+    return ndimage.gaussian_filter(values, (_WINDOW, _WINDOW, 0), mode="constant", truncate=3)
 
 
 def _over(values: np.ndarray, divisor: np.ndarray) -> np.ndarray:

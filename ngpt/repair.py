@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from ngpt.errors import NgptError
 from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
+from ngpt.system.late import ndimage
 
 # Sides of the blocks from which the insides of holes are filled: powers of it. Tiles of networks begin at multiples.
 BLOCK = 8
@@ -163,8 +163,8 @@ def _from_neighbours(light: np.ndarray, good: np.ndarray) -> np.ndarray:
     by the mean of those in the smallest block that has any: of 8x8 pixels, 64x64 and so on.
     """
     image = np.where(good[..., None], light, np.float32(0))
-    weight = uniform_filter(good.astype(np.float64), 3, mode="constant")
-    mean = uniform_filter(image.astype(np.float64), (3, 3, 1), mode="constant")
+    weight = ndimage.uniform_filter(good.astype(np.float64), 3, mode="constant")
+    mean = ndimage.uniform_filter(image.astype(np.float64), (3, 3, 1), mode="constant")
     near = ~good & (weight > 1e-6)
     image[near] = mean[near] / weight[near, None]
     far = ~good & ~near

@@ -17,7 +17,6 @@ from dataclasses import dataclass
 
 import mitsuba as mi
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from data_gen.render import render_stack
 from data_gen.samplers import SAMPLERS, choose
@@ -26,6 +25,7 @@ from data_gen.scenes.load import set_film_size
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import EPSILON, trimmed_mean
 from ngpt.stack import GradientStack
+from ngpt.system.late import ndimage
 
 # Samples per pixel of each of a trial's stacks; of a sampler with batches at least two of those
 SPP = 8
@@ -213,7 +213,7 @@ def doubt_of(x: np.ndarray, a: np.ndarray, b: np.ndarray, scale: np.ndarray) -> 
 
 def _denominator(scale: np.ndarray) -> np.ndarray:
     """m² + 1e-3 of an image that has noise itself, which the mean over 7x7 pixels lessens."""
-    return uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON
+    return ndimage.uniform_filter(scale.astype(np.float64), (7, 7, 1)) ** 2 + EPSILON
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from ngpt.io.whole import finished
 from ngpt.merging import UNFINISHED
 from ngpt.system.console import Console
 from ngpt.system.interrupts import Interrupt
+from ngpt.system.limits import limit_threads
 
 # How many times its time a render takes whose user is told why, where it made no more than so many samples per pixel.
 _LATE, _FEW = 1.2, 16
@@ -32,6 +33,8 @@ def run(args: argparse.Namespace, console: Console) -> int:
     if args.output == STREAM and (args.json or args.frames):
         what = "--json also wants standard output" if args.json else "standard output is one file for several frames"
         raise WrongUse(f"-o -: {what}; name a file, or leave one out")
+    if args.threads is not None:
+        limit_threads(args.threads)
     denoising = denoising_of(args)
     with as_files([], args.output) as (_, args.output):
         return shot(args, denoising, console) if args.frames else image(args, denoising, console)
@@ -180,6 +183,8 @@ def shot(args: argparse.Namespace, denoising: Denoising | None, console: Console
         raise WrongUse("--live and --view are for single images; leave them out with --frames")
     if args.adaptive or args.error is not None or args.method is not None:
         raise WrongUse("--adaptive, --error and --for are for single images; leave them out with --frames")
+    if args.threads and args.cluster:
+        raise WrongUse("--threads is for this process, and --cluster renders in others; start its workers with fewer")
     if args.keep:
         raise WrongUse("--keep is for single images; name frames .exr, which have their stacks in them")
     files = targets(args.output, args.scene, args.frames)

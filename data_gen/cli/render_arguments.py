@@ -11,13 +11,13 @@ from ngpt.methods import METHODS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE", help="a Mitsuba 3 scene file, or a built-in scene (see `ngpt info`)")
+    parser.usage = f"{parser.prog} SCENE [options]"  # with all of them it is a fifth of the help
+    parser.add_argument("scene", metavar="SCENE", help="a scene file of Mitsuba 3, or a built-in scene")
     parser.add_argument(
         "-o",
         "--output",
         metavar="FILE",
-        help="stack to write (default: SCENE.exr in this folder; -: standard output); of another kind "
-        f"({' '.join(IMAGES[1:])}) it is the denoised image",
+        help=f"stack (default: SCENE.exr here; -: standard output), or as {' '.join(IMAGES[1:])} the denoised image",
     )
     parser.add_argument(
         "--denoise",
@@ -25,10 +25,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         const="auto",
         metavar="METHOD",
         choices=Names(METHODS),
-        help="write the image that this method makes of the stack, as `ngpt denoise` would (default: what --for names "
-        "or a pilot chooses, else auto); in .exr the stack is in it, too",
+        help="write what `ngpt denoise` makes of the stack, which an .exr keeps (default: the method of --for, or of "
+        "the pilot, else auto)",
     )
-    parser.add_argument("--keep", metavar="STACK", help="write the stack as well, beside a picture for example")
+    parser.add_argument("--keep", metavar="STACK", help="write the stack as well, beside a picture")
     add_look(parser)
     parser.add_argument("--spp", type=positive, help=f"paths per pixel (default: {DEFAULT_SPP})")
     parser.add_argument(
@@ -46,8 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--error",
         type=float,
         metavar="E",
-        help="--adaptive, until the result is expected to have this relative error (0.05: 5 %%); --spp and --time may "
-        "end it before",
+        help="--adaptive, until the result is expected to have this relative error (0.05: 5 %%)",
     )
     parser.add_argument(
         "--for",
@@ -78,6 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
+    parser.add_argument("--threads", type=positive, metavar="N", help="that work at once (default: all processors)")
     parser.add_argument(
         "--diagnostics",
         action="store_true",

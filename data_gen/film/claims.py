@@ -16,7 +16,6 @@ is found by luck, points help much, and where all is, not at all.
 from __future__ import annotations
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from data_gen.film.nets import law
 
@@ -39,7 +38,8 @@ def factors(contrast: np.ndarray, variance: np.ndarray, samples: np.ndarray, net
     # Without the pixel itself: its own variance is large where a rare sample is among its own, and such samples are
     # the ones that are independent of the others. Groups by a pixel's own variance would have them all in one.
     filled = np.where(good, variances, 0)
-    around = np.where(good, np.maximum(_AROUND**2 * uniform_filter(filled, _AROUND) - filled, 0), np.inf).ravel()
+    sums = _AROUND**2 * box_means(filled, _AROUND)
+    around = np.where(good, np.maximum(sums - filled, 0), np.inf).ravel()
     order = np.argsort(around, kind="stable")
     order = order[: np.count_nonzero(good)]
     found = _found(squares.ravel(), variances.ravel(), samples.ravel(), net, order, _GROUPS)
@@ -79,3 +79,24 @@ def _found(
 def _hat(place: float, n: int) -> np.ndarray:
     """Weights that interpolate linearly between ``n`` values at a ``place`` from 0 to n - 1."""
     return np.maximum(1 - np.abs(np.arange(n) - place), 0)
+
+
+def box_means(image: np.ndarray, size: int) -> np.ndarray:
+    """Means over ``size`` x ``size`` pixels around each of (H, W), mirrored at the edges: SciPy's ``uniform_filter``.
+
+    To the bit; but SciPy takes longer to import than the rest of a small render takes for all of its variances.
+    """
+    before = size // 2
+    for axis in (0, 1):
+        lines = np.moveaxis(image, axis, 0).astype(np.float64)
+        lines = np.pad(lines, ((before, size - 1 - before), (0, 0)), mode="symmetric")
+        total = np.zeros(lines.shape[1])
+        for line in lines[:size]:
+            total += line
+        means = np.empty(np.moveaxis(image, axis, 0).shape, image.dtype)
+        means[0] = total / size
+        for i in range(1, len(means)):
+            total += lines[i + size - 1] - lines[i - 1]
+            means[i] = total / size
+        image = np.moveaxis(means, 0, axis)
+    return image

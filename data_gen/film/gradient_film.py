@@ -134,11 +134,11 @@ class GradientFilm:
             self._add_batch(values, splats, spp)
         else:
             # Block b goes to strand b mod strands.
-            pixel = dr.arange(mi.UInt32, self.pixels * self.strands)
-            strand, pixel = pixel // self.pixels, pixel % self.pixels
+            pixel, pixels = dr.arange(mi.UInt32, self.pixels * self.strands), opaque(self.pixels)
+            strand, pixel = pixel // pixels, pixel % pixels
             behind = opaque(self.strands - self.blocks % self.strands)
-            turn = (strand + behind) % self.strands
-            first, number = (turn * self.pixels + pixel) * opaque(block), turn * opaque(block) + opaque(self.samples)
+            turn = (strand + behind) % opaque(self.strands)
+            first, number = (turn * pixels + pixel) * opaque(block), turn * opaque(block) + opaque(self.samples)
             dr.eval(first, number)
             stride, further = opaque(self.strands * self.pixels * block), opaque(self.strands * block)
             strands = Strands(first, opaque(lanes), opaque(block), stride, number, further)

@@ -38,7 +38,8 @@ class CameraSamples:
     """
 
     DRJIT_STRUCT = dict.fromkeys(
-        ("sensor", "pixel", "random", "position", "lens", "time", "wavelength", "seen"), object
+        ("sensor", "pixel", "random", "position", "lens", "time", "wavelength", "seen", "columns", "ends", "steps"),
+        object,
     )
     # (ray, importance) by shift; None where the camera can be asked
     seen: dict | None = None
@@ -54,8 +55,8 @@ class CameraSamples:
         *,
         net: int = 0,
     ):
-        self.sensor, self.seed, self.first, self.net = sensor, seed, first, net
-        self.size = mi.ScalarVector2u(sensor.film().crop_size())
+        self.seed, self.first, self.net = seed, first, net
+        self._see(sensor)
         self.pixels = int(dr.prod(self.size)) if some is None else dr.width(some)
         lane = dr.arange(mi.UInt32, self.pixels * spp)
         # Opaque, here and below: a literal would be compiled into the kernel, a new one for every value.
@@ -69,8 +70,7 @@ class CameraSamples:
         self.pixel = pixel
         self.sample = lane // in_block * in_pixel + lane % in_pixel + first
         self._draw(seed, pixel, self.sample, net)
-        corner = mi.Point2f(pixel % self.size.x, pixel // self.size.x)
-        self.position = corner + self.position
+        self.position = self._corner() + self.position
         dr.schedule(self.position, self.lens, self.time, self.wavelength)
         self.random.schedule_state()
         dr.eval()
@@ -81,10 +81,21 @@ class CameraSamples:
     ) -> Self:
         """Sample ``sample`` of each ``pixel``, at another ``place`` on the film; drawn in the kernel that needs it."""
         camera = cls.__new__(cls)
-        camera.sensor, camera.size, camera.pixel = sensor, mi.ScalarVector2u(sensor.film().crop_size()), pixel
+        camera.pixel = pixel
+        camera._see(sensor)
         camera._draw(seed, pixel, sample, net)
         camera.position = place
         return camera
+
+    def _see(self, sensor: mi.Sensor) -> None:
+        """Takes note of a sensor and of its size: ``columns`` of pixels, ``ends`` of the film, ``steps`` of a pixel."""
+        self.sensor, self.size = sensor, mi.ScalarVector2u(sensor.film().crop_size())
+        self.columns = dr.opaque(mi.UInt32, self.size.x)
+        self.ends = mi.Vector2f(*(dr.opaque(mi.Float, n) for n in self.size))
+        self.steps = mi.Vector2f(*(dr.opaque(mi.Float, 1 / n) for n in self.size))
+
+    def _corner(self) -> mi.Point2f:
+        return mi.Point2f(self.pixel % self.columns, self.pixel // self.columns)
 
     def _draw(self, seed: int, pixel: mi.UInt32, sample: mi.UInt32, net: int) -> None:
         """All random numbers of a camera sample; ``position`` is that within the pixel."""
@@ -113,11 +124,11 @@ class CameraSamples:
         The ``shift`` is a pair of numbers, one of ``QUARTERS``, or a Vector2f with one for each lane.
         """
         p = self.position + self._shift(shift)
-        inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.size.x) & (p.y < self.size.y)
+        inside = (p.x >= 0) & (p.y >= 0) & (p.x < self.ends.x) & (p.y < self.ends.y)
         if self.seen:
             ray, importance = self.seen[shift]
             return mi.RayDifferential3f(ray), importance, inside
-        uv = p / mi.Vector2f(self.size)
+        uv = p * self.steps
         ray, importance = self.sensor.sample_ray_differential(self.time, self.wavelength, uv, self.lens)
         return ray, importance, inside
 
@@ -125,7 +136,7 @@ class CameraSamples:
         if isinstance(shift, mi.Vector2f):
             return shift
         if shift in QUARTERS:
-            within = self.position - mi.Point2f(self.pixel % self.size.x, self.pixel // self.size.x)
+            within = self.position - self._corner()
             half = dr.select(within < 0.5, mi.Vector2f(0.5), -0.5)
             return mi.Vector2f(half.x if "x" in shift else 0, half.y if "y" in shift else 0)
         return mi.Vector2f(*(dr.opaque(mi.Float, s) for s in shift))

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
+import drjit as dr
 import mitsuba as mi
 
 from data_gen.scenes.builtin import SCENES, no_scene
@@ -12,6 +15,9 @@ from data_gen.scenes.cameras import sensor_number
 from data_gen.scenes.integrators import check_integrator, followed
 from data_gen.scenes.merging import load_file
 from ngpt.errors import NgptError, stop_if_interrupted
+
+# Threads that it takes to load any scene
+_LOADING = 2
 
 
 def load_scene(
@@ -33,11 +39,13 @@ def load_scene(
     parameters = parameters or {}
     try:
         if Path(name).is_file():
-            scene = load_file(name, parameters, merged, sensor)
+            with _enough_threads():
+                scene = load_file(name, parameters, merged, sensor)
         elif name in SCENES:
             if parameters:
                 raise NgptError(f"built-in scene '{name}' has no parameters to set (got {', '.join(parameters)})")
-            scene = mi.load_dict(SCENES[name](), parallel=False, optimize=False)
+            with _enough_threads():
+                scene = mi.load_dict(SCENES[name](), parallel=False, optimize=False)
             sensor_number(sensor, [camera.id() for camera in scene.sensors()], name)
         else:
             raise no_scene(name)
@@ -76,6 +84,20 @@ def complaint(error: Exception) -> str:
     if "<animation>" in text:
         return f"animated transforms (motion blur) are not known to Mitsuba {mi.__version__}; remove <animation>"
     return text
+
+
+@contextmanager
+def _enough_threads() -> Iterator[None]:
+    """Sees that Dr.Jit has two threads: with one, some scene files load for ever (Mitsuba 3.9.1)."""
+    before = dr.thread_count()
+    if before >= _LOADING:
+        yield
+        return
+    dr.set_thread_count(_LOADING)
+    try:
+        yield
+    finally:
+        dr.set_thread_count(before)
 
 
 def set_film_size(scene: mi.Scene, size: tuple[int, int]) -> None:

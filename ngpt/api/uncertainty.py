@@ -18,7 +18,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from ngpt.coverage import empty_pixels
 from ngpt.errors import NgptError
@@ -26,6 +25,7 @@ from ngpt.layers import DIFFERENCES
 from ngpt.merging import VARIANCES
 from ngpt.methods import Result, reconstruct
 from ngpt.stack import GradientStack
+from ngpt.system.late import ndimage
 
 SPREAD = 2.6  # pixels, the standard deviation of the window over which the change is averaged: as large as 9x9 pixels
 SEED = 20261122
@@ -142,4 +142,4 @@ def change(image: np.ndarray, other: np.ndarray, known: np.ndarray | None = None
 
 
 def _around(values: np.ndarray) -> np.ndarray:
-    return gaussian_filter(values, (SPREAD, SPREAD, 0), mode="reflect", truncate=3)
+    return ndimage.gaussian_filter(values, (SPREAD, SPREAD, 0), mode="reflect", truncate=3)

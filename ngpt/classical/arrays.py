@@ -11,8 +11,8 @@ from types import ModuleType
 from typing import Any
 
 import numpy as np
-import scipy.fft
 
+from ngpt.system.late import fft
 from ngpt.system.limits import processors
 from ngpt.system.threads import map_parts
 
@@ -123,14 +123,14 @@ def by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
 def dct2(x: Array) -> Array:
     """Orthonormal cosine transform (type II) over the last two axes; a NumPy ``x`` is overwritten."""
     if isinstance(x, np.ndarray):
-        return scipy.fft.dctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
+        return fft.dctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
     return _dct(_dct(x).mT).mT
 
 
 def idct2(x: Array) -> Array:
     """Inverse (and transpose) of ``dct2``."""
     if isinstance(x, np.ndarray):
-        return scipy.fft.idctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
+        return fft.idctn(x, axes=(-2, -1), norm="ortho", overwrite_x=True, workers=processors())
     return _idct(_idct(x.mT).mT)
 
 

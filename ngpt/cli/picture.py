@@ -136,6 +136,7 @@ def add_look(parser: argparse.ArgumentParser) -> None:
         "--transform",
         default="standard",
         choices=TRANSFORMS,
+        metavar="NAME",
         help="view transform of a picture: standard (sRGB, default), filmic (AgX), aces (needs OpenColorIO)",
     )
     parser.add_argument(

@@ -17,9 +17,9 @@ from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
-from scipy.ndimage import median_filter, uniform_filter
 
 from ngpt.magnitude import bound
+from ngpt.system.late import ndimage
 
 RADIUS = 9  # of the neighbourhood, 19x19 pixels
 PATCH = 3  # radius of the patches that are compared
@@ -58,9 +58,9 @@ def nfor(image: np.ndarray, variance: np.ndarray, features: list[np.ndarray]) ->
         # Stein: E|F - truth|² = E[|F - I|² - σ² + 2 σ² dF/dI].
         off = np.clip(result, -most, most) - seen
         error = np.mean(off**2 - variance + 2 * variance * own[..., None], axis=-1)
-        errors.append(uniform_filter(error, 2 * RADIUS + 1))
+        errors.append(ndimage.uniform_filter(error, 2 * RADIUS + 1))
     better = (errors[1] < errors[0]).astype(np.float32)
-    share = uniform_filter(better, 2 * PATCH + 1)[..., None]
+    share = ndimage.uniform_filter(better, 2 * PATCH + 1)[..., None]
     return np.ldexp(((1 - share) * results[0] + share * results[1]).astype(np.float32), power)
 
 
@@ -77,9 +77,9 @@ def estimated_variance(image: np.ndarray) -> np.ndarray:
     What is finer than that counts as noise. It leaves 1.3 to 1.7 times the error of true variances at 4 and 16 spp; a
     second estimate, by what is left to the first result, is no better (docs/lab/log/2026-11.md).
     """
-    squares = (image.astype(np.float64) - median_filter(image, (3, 3, 1), mode="nearest")) ** 2
+    squares = (image.astype(np.float64) - ndimage.median_filter(image, (3, 3, 1), mode="nearest")) ** 2
     for _ in range(2):
-        squares = uniform_filter(squares, (3, 3, 1), mode="nearest")
+        squares = ndimage.uniform_filter(squares, (3, 3, 1), mode="nearest")
     return squares.astype(np.float32)
 
 
@@ -90,7 +90,7 @@ def _trust(image: np.ndarray, variance: np.ndarray) -> np.ndarray:
     alike: without this it is smeared over them.
     """
     total = variance.mean(axis=-1)
-    usual = OUTLIER * median_filter(total, 2 * RADIUS + 1) + _floor(image)
+    usual = OUTLIER * ndimage.median_filter(total, 2 * RADIUS + 1) + _floor(image)
     return (usual / (usual + total))[..., None].astype(np.float32)
 
 
@@ -166,7 +166,7 @@ def _weights(image: np.ndarray, variance: np.ndarray, bandwidth: float) -> Itera
         there = np.s_[max(dy, 0) : height - max(-dy, 0), max(dx, 0) : width - max(-dx, 0)]
         both = variance[here] + variance[there]
         distance = ((image[here] - image[there]) ** 2 - both) / (floor + bandwidth**2 * both)
-        patch = uniform_filter(np.mean(distance, axis=-1), 2 * PATCH + 1)
+        patch = ndimage.uniform_filter(np.mean(distance, axis=-1), 2 * PATCH + 1)
         weights = np.zeros((height, width), np.float32)
         weights[here] = np.exp(-np.maximum(patch, 0))
         yield dy, dx, weights

@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 import numpy as np
-from scipy.ndimage import uniform_filter
 
 from ngpt.repair import Repaired
+from ngpt.system.late import ndimage
 
 
 def with_variances(data: Repaired, image: np.ndarray) -> Repaired:
@@ -41,5 +41,5 @@ def _around(layer: np.ndarray, smooth: np.ndarray) -> np.ndarray:
     """The mean squared residual of a layer around each pixel, (H, W, 3) float32."""
     squares = (layer.astype(np.float64) - smooth) ** 2
     for _ in range(2):
-        squares = uniform_filter(squares, (3, 3, 1), mode="nearest")
+        squares = ndimage.uniform_filter(squares, (3, 3, 1), mode="nearest")
     return squares.astype(np.float32)

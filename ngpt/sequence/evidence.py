@@ -3,7 +3,8 @@
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import gaussian_filter, maximum_filter, minimum_filter
+
+from ngpt.system.late import ndimage
 
 # Pixels, of the window of the evidence (standard deviation).
 WINDOW = 4.0
@@ -46,7 +47,7 @@ def agreement(now: dict[str, np.ndarray], then: dict[str, np.ndarray], found: np
             here, there = (np.log(np.maximum(layer, 1e-6)) for layer in (here, there))
             # A camera that comes nearer changes all depths: alike, if not by the same factor.
             there = there + (np.median((here - there)[found]) if found.any() else 0)
-        low, high = minimum_filter(here, (3, 3, 1)), maximum_filter(here, (3, 3, 1))
+        low, high = ndimage.minimum_filter(here, (3, 3, 1)), ndimage.maximum_filter(here, (3, 3, 1))
         allowed = MIXED * np.sqrt((here - low) * (high - here))
         beyond = np.maximum(np.abs(there - here) - allowed, 0) / scale
         strange += np.square(beyond).sum(axis=-1)
@@ -96,7 +97,7 @@ def _noise(variance: np.ndarray, rest: np.ndarray) -> np.ndarray:
     """The variance of the primal around each pixel, (H, W, 3), positive; of what the method took off where unknown."""
     known = np.isfinite(variance)
     filled = np.where(known, variance, np.square(rest))
-    smooth = gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")
+    smooth = ndimage.gaussian_filter(filled.astype(np.float64), (2, 2, 0), mode="nearest")
     return np.maximum(smooth, 1e-6 * smooth.mean() + 1e-30)
 
 
@@ -112,4 +113,4 @@ def _kept(rest: np.ndarray, noise: np.ndarray, trust: np.ndarray) -> float:
 
 
 def _mean(image: np.ndarray) -> np.ndarray:
-    return gaussian_filter(image, WINDOW, mode="nearest", truncate=3)
+    return ndimage.gaussian_filter(image, WINDOW, mode="nearest", truncate=3)

@@ -20,13 +20,13 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
-from scipy.ndimage import gaussian_filter
 
 from ngpt.errors import NgptError
 from ngpt.network import run, run_onnx, tiles
 from ngpt.network.describe import FRAMES
 from ngpt.network.exposure import statistics
 from ngpt.sequence.evidence import Evidence
+from ngpt.system.late import ndimage
 
 # (H, W, len(INPUTS)) float32 -> corrections (H, W, len(SCALES) + 1) float32.
 Corrections = Callable[[np.ndarray], np.ndarray]
@@ -67,8 +67,8 @@ class Blend:
         lows = [self.history - self.now]
         trusted = self.trust[..., None] * lows[0]
         for scale in SCALES:
-            weight = gaussian_filter(self.trust, scale, mode="nearest", truncate=2.5)
-            low = gaussian_filter(trusted, (scale, scale, 0), mode="nearest", truncate=2.5)
+            weight = ndimage.gaussian_filter(self.trust, scale, mode="nearest", truncate=2.5)
+            low = ndimage.gaussian_filter(trusted, (scale, scale, 0), mode="nearest", truncate=2.5)
             lows.append(low / np.maximum(weight, 1e-3)[..., None])
         return np.stack([*(one - other for one, other in pairwise(lows)), lows[-1]])
 
@@ -86,7 +86,7 @@ class Blend:
         shares = (self.trust[..., None] * np.minimum(shares, self.first[..., None])).astype(np.float32)
         image = self.now + np.einsum("hws,shwc->hwc", shares, self.bands)
         energy = np.square(self.bands).mean(axis=-1).transpose(1, 2, 0)
-        energy = gaussian_filter(energy, (2, 2, 0), mode="nearest") + 1e-6 * energy.mean() + 1e-30
+        energy = ndimage.gaussian_filter(energy, (2, 2, 0), mode="nearest") + 1e-6 * energy.mean() + 1e-30
         b = (shares * energy).sum(axis=-1) / energy.sum(axis=-1)
         return image, b.astype(np.float32)
 

@@ -23,13 +23,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import maximum_filter
-from scipy.sparse import csr_matrix
 
 from ngpt.classical.controlvariates import SWEEPS, decay
 from ngpt.classical.leastsquares import FLOAT32_RANGE, robust_mean
 from ngpt.classical.variances import FLOOR, SHARED, smoothed
 from ngpt.sequence.warp import bilinear_taps, warped
+from ngpt.system.late import ndimage, sparse
 
 # Times the squared difference of two interpolations, what is added to the variance of dt. Of 3, 10 and 30 the one of
 # least error on slow shots of the built-in scenes `diffuse` and `glossy`.
@@ -160,7 +159,7 @@ class _Step:
         known = found & np.isfinite(link.dt).all(axis=-1) & np.isfinite(link.dt_var).all(axis=-1)
         apart: np.ndarray = np.where(known[..., None], spline - linear, 0).astype(dtype)
         noise = smoothed(np.where(known[..., None], link.dt_var, np.nan), True)
-        wrong = maximum_filter(np.square(apart, dtype=np.float64).sum(axis=-1), 3)
+        wrong = ndimage.maximum_filter(np.square(apart, dtype=np.float64).sum(axis=-1), 3)
         variance = np.where(known, _relative(DOUBT * noise + INTERPOLATION * wrong, level), np.inf)
         self.offset: np.ndarray = np.where(known[..., None], link.dt + apart, 0).astype(dtype)
         self.variance: np.ndarray = variance[..., None].astype(dtype)
@@ -168,7 +167,7 @@ class _Step:
         # B, and what all pixels that look at one say of it: the mean by their variances.
         rows = np.broadcast_to(np.arange(known.size), places.shape)
         taps = (weights * known.ravel()).astype(dtype)
-        self.look = csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (known.size, height * width))
+        self.look = sparse.csr_matrix((taps.ravel(), (rows.ravel(), places.ravel())), (known.size, height * width))
         back = self.look.T.tocsr()
         precision: np.ndarray = np.where(known, 1 / variance, 0).reshape(-1, 1).astype(dtype)
         self.precision, total = precision, back @ precision

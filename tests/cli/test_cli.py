@@ -245,13 +245,29 @@ def test_damaged_file_in_a_process_of_its_own(tmp_path, stack_file):
     assert sorted(os.listdir(tmp_path)) == ["clean.png.exr", "damaged.exr", "s.exr"]
 
 
-def test_denoising_imports_neither_torch_nor_mitsuba(stack_file):
-    code = (
-        "import sys; from ngpt.cli import main; main(sys.argv[1:]);"
-        "heavy = {'torch', 'mitsuba', 'drjit', 'skimage'} & set(sys.modules); sys.exit(str(heavy) if heavy else 0)"
-    )
-    run = subprocess.run([sys.executable, "-c", code, "denoise", stack_file(), "-q"], capture_output=True, text=True)
+def imported_by(code, *arguments):
+    """The packages that take long to import, of those that a program has imported in the end."""
+    slow = "{'torch', 'mitsuba', 'drjit', 'skimage', 'scipy', 'rich', 'data_gen.samplers.photons.integrator'}"
+    code = f"import sys\n{code}\nprint(*sorted({slow} & set(sys.modules)), sep=',')"
+    run = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
     assert run.returncode == 0, run.stderr
+    return run.stdout.split()
+
+
+RUN = "from ngpt.cli import main; assert main(sys.argv[1:]) == 0"
+
+
+@pytest.mark.parametrize("method", ["oidn", "nfor", "l1"])
+def test_denoising_imports_neither_torch_nor_mitsuba(stack_file, method):
+    """Nor SciPy, which takes a quarter of a second, unless the method works by it."""
+    names = imported_by(RUN, "denoise", stack_file(), "-q", "-m", method)
+    assert names == (["scipy"] if method in ("nfor", "l1") else [])
+
+
+def test_a_render_imports_its_own_sampler_alone(renderer, tmp_path):
+    words = ["render", "diffuse", "--size", "16x12", "--spp", "2", "--sampler", "gpt", "-q"]
+    for name in ("it.exr", "it.png"):
+        assert imported_by(RUN, *words, "-o", str(tmp_path / name)) == ["drjit,mitsuba"]
 
 
 def test_render_denoise_diff(renderer, tmp_path, capsys):

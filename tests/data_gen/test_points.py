@@ -195,6 +195,18 @@ def test_claims_of_independent_samples_stay(renderer, rng):
     assert np.allclose(claimed[1].mean(), 1 / 32, rtol=0.02)
 
 
+@pytest.mark.parametrize("shape", [(36, 64), (5, 4), (1, 7), (1, 1)])
+@pytest.mark.parametrize("kind", [np.float32, np.float64])
+def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
+    from scipy.ndimage import uniform_filter
+
+    from data_gen.film.claims import box_means
+
+    image = rng.gamma(0.2, size=shape).astype(kind)
+    for size in (5, 4):
+        assert np.array_equal(box_means(image, size), uniform_filter(image, size))
+
+
 @pytest.mark.parametrize("size", [(64, 64), (8, 8)])
 def test_claims_follow_what_is_seen_between_rounds(renderer, rng, size):
     """Each round of samples sums to little: what is left of the noise of the mean is that of the rounds."""
