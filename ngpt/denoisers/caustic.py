@@ -8,10 +8,10 @@ exchange less light the more their surfaces differ, and the more they differ the
 travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
 Methods that call OIDN anyway take its image of this light, which has less error where the light has edges. Half the
-size will do: it takes a quarter of the time, and rare light is less rare there, so that OIDN takes less of it for noise.
-What it takes is given back by one factor for the whole image. Neither larger networks nor the whole size are better,
-nor the mean with what OIDN's image of all light has beyond its image of the rest (docs/lab/log). All other methods must
-not depend on a package.
+size will do: it takes a quarter of the time, and rare light is less rare there, so that OIDN takes less of it for
+noise. What it takes is given back by one factor for the whole image. Neither larger networks nor the whole size are
+better, nor the mean with what OIDN's image of all light has beyond its image of the rest (docs/lab/log). All other
+methods must not depend on a package.
 """
 
 from dataclasses import replace
