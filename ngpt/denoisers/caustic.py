@@ -55,7 +55,7 @@ def _by_oidn(data: Repaired) -> np.ndarray:
     assert data.caustic is not None
     small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
     given = halved(data.caustic)
-    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "clean", "balanced")
+    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "noisy", "high")
     # OIDN may go below zero; there is no negative light.
     light = np.maximum(found, 0)
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)
