@@ -2,11 +2,13 @@
 
     python -m bench.speed --before f72936e
 
-On a synthetic stack with features and variances. Each row runs once in a turn, so that a busy moment hits all alike;
+On synthetic stacks with features and variances. Each row runs once in a turn, so that a busy moment hits all alike;
 those of the commit run in a process of their own, which takes its turn like the others.
 
-    wcv, ngpt-fast, ngpt-combine   as ``ngpt denoise`` runs them
-    oidn            Open Image Denoise with albedo and normal as they are
+    oidn            Open Image Denoise with albedo and normal as they are, its largest quality: the rival of all rows
+    wcv, ngpt-fast, ngpt-primal, ngpt-combine   as ``ngpt denoise`` runs them, by features that are known to be clean
+    ..., caustic    with a layer of that name, as rooms with a mirror or a glass have it
+    ..., noisy      by features whose noise is not known, or large
     oidn-small, oidn-default   networks of that shape, weights at random, on wcv: ``ngpt denoise --weights NET.tza``
     before: ...     the same at the commit
 
@@ -22,11 +24,19 @@ import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 from bench.common import metadata, save, summary
 
 WORKER = "--worker"
-BEFORE = ("wcv", "ngpt-fast", "ngpt-combine")
+# What is run, by method, of which of the stacks.
+ROWS = {
+    "wcv": ("", "caustic"),
+    "ngpt-fast": ("", "caustic"),
+    "ngpt-primal": ("", "noisy"),
+    "ngpt-combine": ("", "caustic", "noisy"),
+}
+CALLS = {", ".join(filter(None, (name, kind))): (name, kind) for name, kinds in ROWS.items() for kind in kinds}
 
 
 def main() -> None:
@@ -47,7 +57,7 @@ def main() -> None:
             calls: dict[str, Callable[[], tuple[float, float]]] = {
                 name: lambda call=call: timed(call) for name, call in rows(args.size, Path(folder)).items()
             }
-            calls |= {f"before: {name}": lambda name=name: ask(worker, name) for name in BEFORE}
+            calls |= {f"before: {name}": lambda name=name: ask(worker, name) for name in CALLS}
             calls = {name: call for name, call in calls.items() if name not in args.without}
             result["rows"] = measured(calls, args.repeats)
             worker.kill()
@@ -70,12 +80,12 @@ def rows(size: str, folder: Path) -> dict[str, Callable[[], object]]:
     import numpy as np
     import torch
 
-    from bench.onnx import stack_of
     from ngpt.methods import reconstruct
     from ngpt.network import tza
     from ngpt.network.oidnet import SHAPES, OidnUNet
 
-    stack = stack_of(*map(int, size.split("x")))
+    given = stacks(size)
+    stack = given[""]
     torch.manual_seed(0)
     files = {}
     for name, channels in zip(("oidn-small", "oidn-default"), SHAPES, strict=True):
@@ -86,9 +96,26 @@ def rows(size: str, folder: Path) -> dict[str, Callable[[], object]]:
     oidn = mitsuba_oidn.Quality.High
     return {
         "oidn": lambda: mitsuba_oidn.denoise(*images.values(), hdr=True, quality=oidn),
-        **{name: lambda name=name: reconstruct(stack, name) for name in BEFORE},
+        **{row: lambda name=name, kind=kind: reconstruct(given[kind], name) for row, (name, kind) in CALLS.items()},
         **{name: lambda file=file: reconstruct(stack, "ngpt", weights=str(file)) for name, file in files.items()},
     }
+
+
+def stacks(size: str) -> dict[str, Any]:
+    """The stacks of the rows by what sets them apart; half a percent of the pixels have light in ``caustic``."""
+    import numpy as np
+
+    from bench.onnx import stack_of
+
+    noisy = stack_of(*map(int, size.split("x")))
+    clean = noisy.replace()
+    # Known since ngpt renders it; earlier commits do not ask.
+    clean.attributes["ngpt:featureNoise"] = 0.0
+    random = np.random.default_rng(2)
+    lit = random.random(noisy["depth"].shape) < 0.005
+    light = np.where(lit, 30 * random.random(noisy["primal"].shape), 0).astype(np.float32)
+    caustic = clean.replace(primal=clean["primal"] + light, caustic=light, caustic_var=light**2)
+    return {"": clean, "caustic": caustic, "noisy": noisy}
 
 
 def measured(calls: dict[str, Callable[[], tuple[float, float]]], repeats: int) -> dict:
@@ -138,12 +165,12 @@ def ask(worker: subprocess.Popen, name: str) -> tuple[float, float]:
 
 def work(size: str) -> None:
     """Runs each method that comes in, and tells what it took."""
-    from bench.onnx import stack_of
     from ngpt.methods import reconstruct
 
-    stack = stack_of(*map(int, size.split("x")))
-    for name in sys.stdin:
-        print(*timed(lambda name=name: reconstruct(stack, name.strip())), flush=True)
+    given = stacks(size)
+    for row in sys.stdin:
+        name, kind = CALLS[row.strip()]
+        print(*timed(lambda name=name, kind=kind: reconstruct(given[kind], name)), flush=True)
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ namespace mitsuba_oidn {
 enum OIDNDeviceType { OIDN_DEVICE_TYPE_CPU = 1 };
 enum OIDNFormat { OIDN_FORMAT_FLOAT3 = 3 };
 enum OIDNError { OIDN_ERROR_NONE = 0 };
-enum OIDNQuality { OIDN_QUALITY_BALANCED = 5 };
+enum OIDNQuality { OIDN_QUALITY_FAST = 4, OIDN_QUALITY_BALANCED = 5, OIDN_QUALITY_HIGH = 6 };
 typedef struct OIDNDeviceImpl *OIDNDevice;
 typedef struct OIDNFilterImpl *OIDNFilter;
 OIDNDevice oidnNewDevice(OIDNDeviceType type);

@@ -8,10 +8,10 @@ exchange less light the more their surfaces differ, and the more they differ the
 travel along as in Schied et al. 2017, "Spatiotemporal variance-guided filtering"].
 
 Methods that call OIDN anyway take its image of this light, which has less error where the light has edges. Half the
-size will do: it takes a quarter of the time, and rare light is less rare there, so that OIDN takes less of it for noise.
-What it takes is given back by one factor for the whole image. Neither larger networks nor the whole size are better,
-nor the mean with what OIDN's image of all light has beyond its image of the rest (docs/lab/log). All other methods must
-not depend on a package.
+size will do: it takes a quarter of the time, and rare light is less rare there, so that OIDN takes less of it for
+noise. What it takes is given back by one factor for the whole image. Neither larger networks nor the whole size are
+better, nor the mean with what OIDN's image of all light has beyond its image of the rest (docs/lab/log). All other
+methods must not depend on a package.
 """
 
 from dataclasses import replace
@@ -55,7 +55,7 @@ def _by_oidn(data: Repaired) -> np.ndarray:
     assert data.caustic is not None
     small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
     given = halved(data.caustic)
-    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "clean", "balanced")
+    found = oidn(replace(data, image=given, direct=np.zeros_like(given), features=small), "noisy", "high")
     # OIDN may go below zero; there is no negative light.
     light = np.maximum(found, 0)
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)

@@ -182,15 +182,17 @@ def test_an_absent_peer_says_what_to_install(room, monkeypatch, name, package):
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
-@pytest.mark.parametrize("noise", [None, inputs.CLEAN, 1.01 * inputs.CLEAN, float("nan")])
-def test_a_combiner_is_given_oidns_images_by_clean_features(noise):
-    """Features are prefiltered unless their noise is known to be little."""
-    stack = full_stack(40, 50)
+@pytest.mark.parametrize("noise", [None, 0.0, 0.99, 1.01, float("nan")])
+@pytest.mark.parametrize("scale", [1, 1000])
+def test_a_combiner_is_given_oidns_images_by_clean_features(noise, scale):
+    """Features are prefiltered unless their noise is known to be little beside the image's, whatever the exposure."""
+    image = np.full((40, 50, 3), scale, np.float32)
+    stack = full_stack(40, 50).replace(primal=image, direct=0 * image, primal_var=0.25 * image**2)
     if noise is not None:
-        stack.attributes[FEATURE_NOISE] = noise
+        stack.attributes[FEATURE_NOISE] = noise * inputs.CLEAN * 0.25 / (1 + inputs._DARK)
     data = repair(stack)
     base = 0.9 * data.image
-    clean = noise == inputs.CLEAN
+    clean = noise in (0.0, 0.99)
     features = data.features | ({} if clean else oidn.prefiltered(data.features, "balanced"))
     images = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
     for name, image, quality in (("denoised", data.image, "high"), ("denoised_base", base, "fast")):

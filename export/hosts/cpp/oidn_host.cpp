@@ -27,29 +27,27 @@ public:
         return empty ? feature : filtered({{name, &feature}}, false, OIDN_QUALITY_BALANCED);
     }
 
-    // An image with emission seen directly, by features that count as clean.
-    Layer denoised(const Layer &color, const Layer &albedo, const Layer &normal, OIDNQuality quality) {
-        return filtered({{"color", &color}, {"albedo", &albedo}, {"normal", &normal}}, true, quality);
+    // An image with emission seen directly, by features that count as clean, or do not.
+    Layer denoised(const Layer &color, const Layer &albedo, const Layer &normal, OIDNQuality quality, bool clean = true) {
+        return filtered({{"color", &color}, {"albedo", &albedo}, {"normal", &normal}}, clean, quality);
     }
 
 private:
     OIDNDevice device_;
 
-    Layer filtered(const std::map<const char *, const Layer *> &images, bool is_color, OIDNQuality quality) {
+    Layer filtered(const std::map<std::string, const Layer *> &images, bool clean, OIDNQuality quality) {
         const Layer &first = *images.begin()->second;
         const size_t height = first.height, width = first.width;
         OIDNFilter filter = oidnNewFilter(device_, "RT");
         std::vector<std::vector<float>> buffers;
         for (auto &[name, image] : images) {
             buffers.push_back(interleaved(*image));
-            oidnSetSharedFilterImage(filter, name, buffers.back().data(), OIDN_FORMAT_FLOAT3, width, height, 0, 0, 0);
+            oidnSetSharedFilterImage(filter, name.c_str(), buffers.back().data(), OIDN_FORMAT_FLOAT3, width, height, 0, 0, 0);
         }
         std::vector<float> output(3 * height * width);
         oidnSetSharedFilterImage(filter, "output", output.data(), OIDN_FORMAT_FLOAT3, width, height, 0, 0, 0);
-        if (is_color) {
-            oidnSetFilterBool(filter, "hdr", true);
-            oidnSetFilterBool(filter, "cleanAux", true);
-        }
+        oidnSetFilterBool(filter, "hdr", images.count("color") > 0);
+        oidnSetFilterBool(filter, "cleanAux", clean);
         oidnSetFilterInt(filter, "quality", quality);
         oidnCommitFilter(filter);
         oidnExecuteFilter(filter);
@@ -154,7 +152,7 @@ int main(int count, char **arguments) try {
     network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
     if (!light.empty()) {
         const Layer given = halved(light.at("caustic"));
-        Layer made = oidn.denoised(given, halved(albedo), halved(normal), OIDN_QUALITY_BALANCED);
+        Layer made = oidn.denoised(given, halved(albedo), halved(normal), OIDN_QUALITY_HIGH, false);
         for (float &value : made.pixels) value = std::max(value, 0.0f);
         // What OIDN took for noise is given back.
         const double before = sum(given), after = sum(made);
