@@ -52,12 +52,8 @@ def test_steps_of_gpt_are_recorded_in_one_place(renderer, monkeypatch):
 
     recorded = []
     for module, name in ((trace, "base_step"), (offset_path, "step_apart"), (offset_path, "step_joined")):
-
-        def counted(*args, real=getattr(module, name), name=name):
-            recorded.append(name)
-            return real(*args)
-
-        monkeypatch.setattr(module, name, counted)
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *args, f=real: (recorded.append(f.__name__), f(*args))[1])
     render(renderer, load(renderer, "glossy", (9, 7)), "gpt", [16])
     assert sorted(recorded) == ["base_step", "step_apart", "step_joined"]
 
