@@ -46,6 +46,18 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, sampler):
     assert len(others) == 2 and recordings.of == {"samples": 1}
 
 
+def test_steps_of_gpt_are_recorded_in_one_place(renderer, monkeypatch):
+    """Recording goes through all materials of the scene at each step: unrolled and repeated steps made it long."""
+    from data_gen.samplers.gpt import offset_path, trace
+
+    recorded = []
+    for module, name in ((trace, "base_step"), (offset_path, "step_apart"), (offset_path, "step_joined")):
+        real = getattr(module, name)
+        monkeypatch.setattr(module, name, lambda *args, f=real: (recorded.append(f.__name__), f(*args))[1])
+    render(renderer, load(renderer, "glossy", (9, 7)), "gpt", [16])
+    assert sorted(recorded) == ["base_step", "step_apart", "step_joined"]
+
+
 @pytest.mark.parametrize("scene", [textured_lamp, "environment"])
 def test_lamps_of_any_kind_are_recorded_once(renderer, recordings, scene):
     """A lamp with a texture makes the distribution that it is sampled by when it is first asked."""

@@ -95,48 +95,38 @@ def start(plan: Plan, base: Path, first: Segment, importance: mi.Spectrum, insid
     )
 
 
-def first_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
-    """Takes all offset paths along the first step, in which none is joined yet.
+def next_steps(scene, plan: Plan, step: Step, offsets: list[Offset], first: bool = False) -> list[Offset]:
+    """Takes all offset paths along a step, which may be known to be the ``first``: all of them are apart there, and
+    none is joined. Most later steps find all of them settled.
 
-    A loop keeps the kernel small; its state rotates, so that each path stays in registers when its turn comes.
-    """
-
-    if not offsets:
-        return []
-
-    def rotate(i, y, *others):
-        y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
-        return i + 1, *others, y
-
-    settle(step, offsets)
-    state = (mi.UInt32(0), *offsets)
-    return list(dr.while_loop(state, lambda i, *_: i < len(offsets), rotate, label="first step")[1:])
-
-
-def later_steps(scene, plan: Plan, step: Step, offsets: list[Offset]) -> list[Offset]:
-    """Takes all offset paths along any other step. Most of these find all of them settled.
-
-    Rare branches are real ones, not masks: they cost 2.5 times less.
+    Loops over the four of them keep the kernel small, and are recorded in a fraction of the time. Their state rotates,
+    so that each path stays in registers when its turn comes. Rare branches are real ones, not masks: they cost 2.5
+    times less.
     """
     if not offsets:
         return []
-    busy, apart = mi.Bool(False), mi.Bool(False)
-    for y in offsets:
-        busy |= y.joined
-        apart |= y.apart
+    count = len(offsets)
+    joined, apart = (dr.any([getattr(y, where) for y in offsets]) for where in ("joined", "apart"))
     settle(step, offsets)
 
-    def join(*offsets):
-        return tuple(step_joined(step, y) for y in offsets)
+    def join(i, y, *others):
+        return i + 1, *others, step_joined(step, y)
 
-    def rotate(i, y, *others):
+    def move(i, y, *others):
         y = dr.if_stmt((y,), y.apart, lambda y: step_apart(scene, plan, step, y), lambda y: y)
         return i + 1, *others, y
 
-    offsets = dr.if_stmt(tuple(offsets), busy, join, lambda *offsets: offsets)
-    if plan.replays:
+    if not first:
+        # What a step at a shared vertex does not know of stays outside: it would be moved about for nothing.
+        some = (replace(y, hit=None, place=None, apart=None, sky=None, rough=None) for y in offsets)
+        now = dr.while_loop((mi.UInt32(0), *some), lambda i, *_: joined & (i < count), join, label="joined paths")[1:]
+        offsets = [
+            replace(y, joined=z.joined, a=z.a, Δ=z.Δ, w2=z.w2, A=z.A, failed=z.failed)
+            for y, z in zip(offsets, now, strict=True)
+        ]
+    if first or plan.replays:
         state = (mi.UInt32(0), *offsets)
-        offsets = dr.while_loop(state, lambda i, *_: apart & (i < len(offsets)), rotate, label="offset paths")[1:]
+        offsets = dr.while_loop(state, lambda i, *_: apart & (i < count), move, label="offset paths")[1:]
     return list(offsets)
 
 

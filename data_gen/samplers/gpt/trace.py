@@ -10,7 +10,7 @@ import mitsuba as mi
 from data_gen.paths import media
 from data_gen.samplers.gpt.base_path import Path, base_step, begin
 from data_gen.samplers.gpt.manifold_shift import Chain
-from data_gen.samplers.gpt.offset_path import Offset, first_steps, later_steps, start
+from data_gen.samplers.gpt.offset_path import Offset, next_steps, start
 from data_gen.samplers.gpt.plan import Plan
 
 
@@ -29,8 +29,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
 
     Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``;
-    ``view`` is the integrator, which knows what hides from it. At the first vertex all offset paths are apart, and few
-    later on: that step stands before the loop.
+    ``view`` is the integrator, which knows what hides from it.
     """
     # --------------------- First vertices ------------------------
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
@@ -57,29 +56,34 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     if plan.limits.max_depth < 2:
         return Traced(L, Le, L_caustic, offsets, path.chain)
 
-    # --------------------- The first step ------------------------
-    step, path = base_step(scene, plan, random, path, offsets)
+    so_far = Traced(L, Le, L_caustic, offsets, path.chain)
+    # Loop optimisation would record each loop twice, and the kernel be no quicker.
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        if not plan.replays:
+            # Without it in the loop, that loop has no paths apart.
+            path, so_far = go_on(scene, plan, random, path, so_far, first=True)
+        return walk(scene, plan, random, path, so_far)
+
+
+def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, first: bool = False) -> tuple[Path, Traced]:
+    """One step of all paths."""
+    # The base path first: an offset path can only join a vertex that is known.
+    step, path = base_step(scene, plan, random, path, so_far.offsets)
     # Two techniques, two terms: they are weighted by m against each other, and shifted separately.
-    L += step.β * step.L_light + step.β1 * step.L_bsdf
+    L, L_caustic = so_far.L + (step.β * step.L_light + step.β1 * step.L_bsdf), so_far.L_caustic
     if plan.caustic:
-        L_caustic = step.β * step.L_caustic
-    offsets = first_steps(scene, plan, step, offsets)
-    return walk(scene, plan, random, path, Traced(L, Le, L_caustic, offsets, path.chain))
+        L_caustic = L_caustic + step.β * step.L_caustic
+    if plan.manifold:
+        L = L + step.β1 * step.L_followed
+    offsets = next_steps(scene, plan, step, so_far.offsets, first)
+    return path, Traced(L, so_far.Le, L_caustic, offsets, path.chain)
 
 
 @dr.syntax
 def walk(scene, plan: Plan, random, path: Path, so_far: Traced) -> Traced:
-    """The rest of all paths past their first step."""
-    L, L_caustic, offsets = so_far.L, so_far.L_caustic, so_far.offsets
-    active = path.goes_on(plan, offsets)
+    """All that is left of all paths."""
+    active = path.goes_on(plan, so_far.offsets)
     while dr.hint(active, label="gpt"):
-        # The base path first: an offset path can only join a vertex that is known.
-        step, path = base_step(scene, plan, random, path, offsets)
-        L += step.β * step.L_light + step.β1 * step.L_bsdf
-        if dr.hint(plan.caustic, mode="scalar"):
-            L_caustic += step.β * step.L_caustic
-        if dr.hint(plan.manifold, mode="scalar"):
-            L += step.β1 * step.L_followed
-        offsets = later_steps(scene, plan, step, offsets)
-        active = path.goes_on(plan, offsets)
-    return Traced(L, so_far.Le, L_caustic, offsets, path.chain)
+        path, so_far = go_on(scene, plan, random, path, so_far)
+        active = path.goes_on(plan, so_far.offsets)
+    return so_far
