@@ -1,66 +1,55 @@
-"""Writes the tables of the main evaluation into the pages that quote it.
+"""Writes the tables of the main evaluation, at one size or several, into the pages that quote it.
 
-    python eval.py --config configs/eval-main.toml --out out/eval ...
-    python -m bench.pages out/eval
+    python eval.py --config configs/eval-main.toml --out out/eval --scenes ...
+    python eval.py --config configs/eval-640.toml --out out/eval-640 --scenes ...
+    python -m bench.pages out/eval out/eval-640
 
 keeps what the tables are made of in bench/results/main.json, and puts each table between its marks: in the README,
-docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards. Without a folder it writes
-them anew from that file.
+docs/lab/RESULTS.md, docs/methods/methods.md, docs/samplers/points.md and the model cards; plots go to docs/images. A
+folder takes the place of what is kept of its size. Without folders the tables are written anew from that file.
 """
 
 import argparse
 import json
+import math
+import shutil
+from collections import Counter
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from bench.common import save, write_page
-from bench.tables import RIVALS, cells_of, heading
-from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from bench.tables import RIVALS, heading, mean
+from ngpt.evaluation.curves import error_at
+from ngpt.evaluation.wholetime import ratio
+from ngpt.evaluation.worth import marked
 
 ROOT = Path(__file__).parents[1]
 RESULT = ROOT / "bench" / "results" / "main.json"
-# What the shipped networks knew of each scene. docs/train/training.md and the model cards say how.
-GROUPS = {
-    "blind": ("classroom",),
-    "rooms": ("living-room", "dining-room", "bedroom"),
-    "watched": ("lamp", "staircase", "glass-of-water"),
-    "other views": ("diffuse", "glossy", "environment", "lens", "cornell-box", "coffee", "veach-mis"),
-}
-COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "nfor", "oidn", "mitsuba")
-PAIRS = (
-    *((method, rival) for rival in RIVALS for method in ("ngpt-combine", "ngpt-primal", "ngpt-fast")),
-    ("ngpt-combine", "ngpt-primal"),
-    ("oidn", "mitsuba"),
-)
-# Better samples and those of before, by columns that differ in nothing else
-BETTER = {
-    "`ngpt-combine`": ("ngpt-combine", "ngpt-combine-before"),
-    "`ngpt-fast`": ("ngpt-fast", "ngpt-fast-before"),
-    "`wcv`": ("wcv", "wcv-before"),
-    "OIDN": ("oidn", "mitsuba"),
-    "`ngpt-primal`": ("ngpt-primal", "ngpt-primal-before"),
-}
-EVERYONE = tuple(scene for scenes in GROUPS.values() for scene in scenes)
-# Among which gradients are judged by scenes that no network was trained on
-KNOWN = {
-    "all but classroom": tuple(scene for scene in EVERYONE if scene != "classroom"),
-    "rooms, watched": GROUPS["rooms"] + GROUPS["watched"],
-    "other views": GROUPS["other views"],
-}
-# No constant of points or lamps was chosen by looking at them
-APART = tuple(s for s in EVERYONE if s not in ("diffuse", "glossy", "coffee", "living-room", "staircase"))
-LISTED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal", "oidn", "mitsuba")
+IMAGES = ROOT / "docs" / "images"
+OURS = ("ngpt-combine", "ngpt-primal", "ngpt-fast")
+COMPARED = ("l1", "wcv", "ngpt-fast", "ngpt-combine", "ngpt-primal")
+# Groups whose frontiers are shown
+DRAWN = ("blind", "all")
+# A constant of points or lamps was chosen by looking at them
+TUNED = ("diffuse", "glossy", "coffee", "living-room", "staircase")
 # Ratios over OIDN from which a loss is listed by name
 LOSS = 1.1
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("folder", type=Path, nargs="?", help="of the evaluation; default: the tables of before")
+    parser.add_argument("folders", type=Path, nargs="*", help="of evaluations; default: the tables of before")
     args = parser.parse_args()
-    if args.folder:
-        save(RESULT, kept(json.loads((args.folder / "results.json").read_text())))
+    if args.folders:
+        before = json.loads(RESULT.read_text()).get("sizes", []) if RESULT.is_file() else []
+        sizes = {tuple(size["size"]): size for size in before}
+        for folder in args.folders:
+            size = kept(json.loads((folder / "results.json").read_text()))
+            sizes[tuple(size["size"])] = size
+            for group in DRAWN:
+                if (plot := folder / "plots" / f"frontier-rivals-{group}.svg").is_file():
+                    shutil.copyfile(plot, IMAGES / picture(size, group))
+        save(RESULT, {"benchmark": "main", "sizes": [sizes[size] for size in sorted(sizes)]})
     for (page, name), text in blocks(json.loads(RESULT.read_text())).items():
         write_page(ROOT / page, text, marks(name))
 
@@ -69,210 +58,226 @@ def marks(name: str) -> tuple[str, str]:
     return f"<!-- python -m bench.pages: {name} -->", f"<!-- {name} ends -->"
 
 
-def kept(results: dict) -> dict:
-    """Of an evaluation what the tables need: medians over seeds, and what gradients are worth."""
-    results["settings"]["groups"] = KNOWN
-    before = {name for pair in BETTER.values() for name in pair[1:]}
-    now = results | {key: [row for row in results[key] if row["method"] not in before] for key in ("summary", "cells")}
-    table = worth_tables(now | {"worth": worth_of_gradients(now)})
+def picture(size: dict[str, Any], group: str) -> str:
+    return f"frontier-{group}-{size['size'][0]}x{size['size'][1]}.svg"
+
+
+def kept(results: dict[str, Any]) -> dict[str, Any]:
+    """Of an evaluation what the tables need: medians over seeds, ratios at equal whole time, and worth over cost."""
     facts = {name: results[name] for name in ("command", "date", "metadata")}
-    return {"benchmark": "main", **facts, "cells": cells_of(results), "worth": list(table.values())}
+    settings = {name: results["settings"][name] for name in ("size", "spp", "groups", "against")}
+    cells = [
+        {name: row[name] for name in ("scene", "spp", "method", "error", "seconds")}
+        | {"FLIP": row["metrics"].get("FLIP", {}).get("median")}
+        for row in results["summary"]
+        if row["scene"]
+    ]
+    tables = {name: {key: results[name][key] for key in ("rows", "means")} for name in ("against", "worth")}
+    settings["rivals"] = settings.pop("against")
+    return facts | settings | {"cells": cells} | tables
 
 
-def blocks(result: dict) -> dict[tuple[str, str], str]:
+def blocks(result: dict[str, Any]) -> dict[tuple[str, str], str]:
     """(page, name of its marks) -> Markdown."""
-    table = Cells(result["cells"])
+    sizes = [Size(kept) for kept in result["sizes"]]
     card = "docs/methods/ngpt-{}.md".format
+    results, readme = "docs/lab/RESULTS.md", "README.md"
     made = {
-        ("docs/lab/RESULTS.md", "groups"): by_group(table),
-        ("docs/lab/RESULTS.md", "eye"): eye(table),
-        ("docs/lab/RESULTS.md", "worth"): worth_by_group(result["worth"][0]),
-        ("docs/lab/RESULTS.md", "worth by scene"): worth_by_scene(result["worth"][1]),
-        ("README.md", "errors"): errors_of_readme(table),
-        ("README.md", "cells"): cells_of_readme(table),
-        ("README.md", "worth"): worth_by_group(result["worth"][0], ("all but classroom", "rooms, watched")),
-        ("docs/methods/methods.md", "errors"): errors_by_method(table),
-        ("docs/samplers/points.md", "better"): better(table),
-        (card("combine"), "over primal"): over_primal(table),
-        (card("combine"), "losses"): losses(table, "ngpt-combine"),
-        (card("primal"), "losses"): losses(table, "ngpt-primal"),
+        (results, "blind"): of_groups(sizes, "blind"),
+        (results, "groups"): of_groups(sizes, *(g for g in sizes[0].groups if g != "blind")),
+        (results, "frontier"): "\n\n".join(frontier(size, group) for size in sizes for group in size.drawn()),
+        (results, "settings"): "\n\n".join(map(settings, sizes)),
+        (results, "scenes"): "\n\n".join(map(by_scene, sizes)),
+        (results, "worth"): worth(sizes),
+        (results, "worth by scene"): "\n\n".join(map(worth_by_scene, sizes)),
+        (readme, "errors"): of_groups(sizes, "blind", "all"),
+        (readme, "worth"): worth(sizes, "blind", "all"),
+        ("docs/methods/methods.md", "errors"): by_method(sizes),
+        ("docs/samplers/points.md", "better"): better(sizes),
+        (card("combine"), "over primal"): over_primal(sizes),
     }
     for name in ("fast", "combine", "primal"):
-        made[card(name), "results"] = over_rivals(table, f"ngpt-{name}")
+        made[card(name), "results"] = of_groups(sizes, *sizes[0].groups, methods=(f"ngpt-{name}",))
+    for name in ("combine", "primal"):
+        made[card(name), "losses"] = losses(sizes[0], f"ngpt-{name}")
     return made
 
 
-class Cells:
-    """Medians of the evaluation, and means and counts over scenes."""
+class Size:
+    """An evaluation at one size: ratios and means by place."""
 
-    def __init__(self, rows: list[dict]):
-        self.rows = {(row["scene"], row["spp"], row["method"]): row for row in rows}
-        self.counts = sorted({spp for _, spp, _ in self.rows})
+    def __init__(self, kept: dict[str, Any]):
+        self.kept = kept
+        self.name = "{}x{}".format(*kept["size"])
+        self.counts: list[int] = kept["spp"]
+        self.rivals = {name: text for name, text in RIVALS.items() if name in kept["rivals"]}
+        keys = ("spp", "method", "rival")
+        self.rows = {(row["scene"], *(row[k] for k in keys)): row for row in kept["against"]["rows"]}
+        self.means = {(row["group"], *(row[k] for k in keys)): row for row in kept["against"]["means"]}
+        self.cells = {(cell["scene"], cell["spp"], cell["method"]): cell for cell in kept["cells"]}
+        self.scenes = list(dict.fromkeys(scene for scene, *_ in self.rows))
+        found = {group for group, *_ in self.means}
+        self.groups = [name for name in (*kept["groups"], "all") if name in found]
 
-    def values(self, key: str) -> dict[tuple[str, int, str], float]:
-        return {cell: row[key] for cell, row in self.rows.items()}
+    def members(self, group: str) -> list[str]:
+        return [scene for scene in self.scenes if group == "all" or scene in self.kept["groups"][group]]
 
-    def mean(self, scenes: tuple[str, ...], spp: int, method: str, key: str = "error") -> float:
-        return float(np.exp(np.mean([np.log(self.rows[scene, spp, method][key]) for scene in scenes])))
+    def both(self, row: dict[str, Any] | None) -> str:
+        """Error and FLIP over a rival's."""
+        return ", ".join(filter(None, (ratio(row, "error"), ratio(row, "FLIP"))))
 
-    def over(self, scenes: tuple[str, ...], spp: int, method: str, rival: str, key: str = "error") -> float:
-        return self.mean(scenes, spp, method, key) / self.mean(scenes, spp, rival, key)
+    def won(self, group: str, method: str, rival: str, key: str = "") -> str:
+        """In how many cells, at all numbers of samples, a method has less error than the rival, or less FLIP."""
+        rows = [row for n in self.counts if (row := self.means.get((group, n, method, rival)))]
+        return f"{sum(row[f'less{key}'] for row in rows)} of {sum(row[f'scenes{key}'] for row in rows)}"
 
-    def below(self, scenes: tuple[str, ...], method: str, rival: str, key: str = "error", spp: int = 0) -> str:
-        """In how many cells, by default at all numbers of samples, one has less than the other: "4 of 12"."""
-        counts = [spp] if spp else self.counts
-        pairs = [(self.rows[s, n, method][key], self.rows[s, n, rival][key]) for s in scenes for n in counts]
-        return f"{sum(a < b for a, b in pairs)} of {len(pairs)}"
+    def drawn(self) -> list[str]:
+        return [group for group in DRAWN if group in self.groups]
 
 
-def by_group(table: Cells) -> str:
-    """Mean errors of each group of scenes, and in how many cells one method has less error than another."""
-    groups = {**GROUPS, "all": EVERYONE}
-    lines = heading("scenes", "spp", *(f"`{method}`" for method in COMPARED))
-    for name, scenes in groups.items():
-        for spp in table.counts:
-            means = [table.mean(scenes, spp, method) for method in COMPARED]
-            texts = [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
-            first = f"{name} ({len(scenes)})" if spp == table.counts[0] else ""
-            lines.append(f"| {first} | {spp} | {' | '.join(texts)} |")
-    between = "In how many cells one has less error than the other:"
-    lines += ["", between, "", *heading("cells", *(f"{name} ({len(scenes)})" for name, scenes in groups.items()))]
-    for method, rival in PAIRS:
-        won = [table.below(scenes, method, rival) for scenes in groups.values()]
-        lines.append(f"| `{method}` than `{rival}` | {' | '.join(won)} |")
+def of_groups(sizes: list[Size], *groups: str, methods: tuple[str, ...] = OURS) -> str:
+    """Error and FLIP over both rivals' for each group and size, and in how many cells they are less."""
+    tables = []
+    for size in sizes:
+        lines = heading(f"{size.name}: error, FLIP", "over", *(f"{n} spp" for n in size.counts), "less error, FLIP")
+        for group in (group for group in groups if group in size.groups):
+            for method in methods:
+                for rival, text in size.rivals.items():
+                    cells = [size.both(size.means.get((group, n, method, rival))) for n in size.counts]
+                    won = ", ".join(size.won(group, method, rival, key) for key in ("", " FLIP"))
+                    first = f"{group} ({len(size.members(group))}): `{method}`"
+                    lines.append(f"| {first} | {text} | {' | '.join(cells)} | {won} |")
+        if len(lines) > 2:
+            tables.append("\n".join(lines))
+    return "\n\n".join(tables) or "Not measured yet."
+
+
+def frontier(size: Size, group: str) -> str:
+    what = f"{group}, {len(size.members(group))} scenes, {size.name}"
+    return f"![Error against whole seconds: {what}](../images/{picture(size.kept, group)})"
+
+
+def settings(size: Size) -> str:
+    """In how many cells of `ngpt-combine` each setting of a rival has the least error at its time."""
+    lines = heading(f"{size.name}: best setting", *(f"{n} spp" for n in size.counts))
+    for rival, columns in size.kept["rivals"].items():
+        chosen = {
+            n: Counter(row["setting"] for (_, *key), row in size.rows.items() if key == [n, OURS[0], rival])
+            for n in size.counts
+        }
+        for column in columns:
+            if any(found[column] for found in chosen.values()):
+                lines.append(f"| `{column}` | {' | '.join(str(chosen[n][column]) for n in size.counts)} |")
     return "\n".join(lines)
 
 
-def over_rivals(table: Cells, method: str) -> str:
-    """Of a model card: errors and FLIP over those of both rivals for each group of scenes."""
-    spp = ", ".join(map(str, table.counts))
-    heads = [(f"less error than {name}", f"error over its at {spp} spp", "FLIP") for name in RIVALS.values()]
-    lines = heading("scenes", *(text for head in heads for text in head))
-    for name, scenes in {**GROUPS, "all": EVERYONE}.items():
-        cells = []
-        for rival in RIVALS:
-            cells.append(table.below(scenes, method, rival))
-            for key in ("error", "FLIP"):
-                cells.append(", ".join(f"{table.over(scenes, n, method, rival, key):.2f}" for n in table.counts))
-        shown = f"{name}: {', '.join(scenes)}" if name != "all" else f"all {len(scenes)}"
-        lines.append(f"| {shown} | {' | '.join(cells)} |")
+def by_scene(size: Size) -> str:
+    """Error and FLIP over both rivals' in each scene; and the seconds of the first of our networks."""
+    heads = [f"`{method}` over {text}" for method in OURS for text in size.rivals.values()]
+    lines = heading(f"{size.name}: scene", "spp", "seconds", *heads)
+    for scene in size.scenes:
+        for n in size.counts:
+            cells = [size.both(size.rows.get((scene, n, m, rival))) for m in OURS for rival in size.rivals]
+            cell = size.cells.get((scene, n, OURS[0]))
+            seconds = f"{cell['seconds']['total']:.3g}" if cell else ""
+            lines.append(f"| {scene if n == size.counts[0] else ''} | {n} | {seconds} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def eye(table: Cells) -> str:
-    """By FLIP: in how many scenes a network has less than each rival, and the mean ratio."""
-    lines = heading("FLIP, all scenes", *(f"{n} spp" for n in table.counts), "all cells")
-    for method, rival in PAIRS[: 3 * len(RIVALS)]:
-        won = [table.below(EVERYONE, method, rival, "FLIP", n) for n in (*table.counts, 0)]
-        ratios = [f", {table.over(EVERYONE, n, method, rival, 'FLIP'):.2f}" for n in table.counts]
-        cells = [f"{count}{ratio}" for count, ratio in zip(won, [*ratios, ""], strict=True)]
-        lines.append(f"| `{method}` less than {RIVALS[rival]}, and mean over its | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def better(table: Cells) -> str:
-    """Better samples over those of before: error and FLIP, all scenes and those apart; the worst scene in brackets."""
-    groups = {f"all {len(EVERYONE)} scenes": EVERYONE, f"the {len(APART)} apart": APART}
-    lines = heading("new over old", "", *(f"{n} spp" for n in table.counts))
-    for name, (now, before) in BETTER.items():
-        for group, scenes in groups.items():
-            cells = []
-            for n in table.counts:
-                worst = max(table.over((scene,), n, now, before) for scene in scenes)
-                error, flip = (table.over(scenes, n, now, before, key) for key in ("error", "FLIP"))
-                cells.append(f"{error:.2f} ({worst:.2f}), FLIP {flip:.2f}")
-            lines.append(f"| {name} | {group} | {' | '.join(cells)} |")
-            name = ""
-    return "\n".join(lines)
-
-
-def over_primal(table: Cells) -> str:
-    lines = heading("error of `ngpt-combine` over `ngpt-primal`", *(f"{n} spp" for n in table.counts))
-    for name, scenes in {**GROUPS, "all": EVERYONE}.items():
-        ratios = [f"{table.over(scenes, n, 'ngpt-combine', 'ngpt-primal'):.2f}" for n in table.counts]
-        lines.append(f"| {name} ({len(scenes)}) | {' | '.join(ratios)} |")
-    return "\n".join(lines)
-
-
-def losses(table: Cells, method: str) -> str:
-    """The scenes in which it has more than ``LOSS`` times OIDN's error somewhere, the worst first."""
-    lines = heading("scene", *(f"{n} spp" for n in table.counts))
-    found = {scene: [table.over((scene,), n, method, "oidn") for n in table.counts] for scene in EVERYONE}
-    for scene, ratios in sorted(found.items(), key=lambda item: -max(item[1])):
-        if max(ratios) > LOSS:
-            lines.append(f"| {scene} | {' | '.join(f'{ratio:.2f}' for ratio in ratios)} |")
-    return "\n".join(lines)
-
-
-def errors_by_method(table: Cells) -> str:
-    lines = heading("method", "relMSE at 4 spp", *(str(n) for n in table.counts[1:]), "seconds")
-    for method in LISTED:
-        means = [f"{table.mean(EVERYONE, n, method):.4f}" for n in table.counts]
-        seconds = table.mean(EVERYONE, table.counts[0], method, "seconds")
-        lines.append(f"| `{method}` | {' | '.join(means)} | {seconds:.2f} |")
-    return "\n".join(lines)
-
-
-def errors_of_readme(table: Cells) -> str:
-    methods = {
-        "mitsuba": RIVALS["mitsuba"],
-        "oidn": RIVALS["oidn"],
-        "ngpt-combine": "`ngpt-combine`",
-        "ngpt-fast": "`ngpt-fast`",
-    }
-    firsts = {"classroom, blind: ": GROUPS["blind"], "all 14 scenes: ": EVERYONE}
-    heads = [f"{first if name == 'mitsuba' else ''}{text}" for first in firsts for name, text in methods.items()]
-    lines = heading("spp of gradients", *heads)
-    for n in table.counts:
-        cells = []
-        for scenes in firsts.values():
-            means = [table.mean(scenes, n, method) for method in methods]
-            cells += [f"**{value:.4f}**" if value == min(means) else f"{value:.4f}" for value in means]
-        lines.append(f"| {n} | {' | '.join(cells)} |")
-    return "\n".join(lines)
-
-
-def cells_of_readme(table: Cells) -> str:
-    told = {
-        "ngpt-combine": "uses OIDN and gradients",
-        "ngpt-primal": "uses OIDN, no gradients",
-        "ngpt-fast": "uses gradients, no OIDN",
-    }
-    groups = {"classroom": GROUPS["blind"], "three other rooms": GROUPS["rooms"], "all scenes": EVERYONE}
-    lines = heading("network", "less than", *(f"error: {name}" for name in groups), "FLIP: all scenes")
-    for method, what in told.items():
-        for rival, text in RIVALS.items():
-            won = [table.below(scenes, method, rival) for scenes in groups.values()]
-            won.append(table.below(EVERYONE, method, rival, "FLIP"))
-            lines.append(f"| `{method}` ({what}) | {text} | {' | '.join(won)} |")
-    return "\n".join(lines)
-
-
-def worth_by_group(rows: list[list[str]], only: tuple[str, ...] = ()) -> str:
-    """W/C of the best pipelines, a line for each group; ``rows`` are those of ``worth_tables``."""
-    place = {name: i for i, name in enumerate(rows[0])}
-    found: dict[str, dict[str, list[str]]] = {}
-    for row in rows[1:]:
-        found.setdefault(row[place["scenes"]], {})[row[place["spp"]]] = row
-    counts = list(next(iter(found.values())))
+def worth(sizes: list[Size], *only: str) -> str:
+    """W/C of the best pipelines, a line for each group and size."""
+    counts = sorted({n for size in sizes for n in size.counts})
     lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
-    for group, by_spp in found.items():
-        if not only or group.rpartition(" (")[0] in only:
-            cells = [by_spp[counts[0]][place["C"]], *(by_spp[n][place["W/C"]] for n in counts)]
-            lines.append(f"| {group} | {' | '.join(cells)} |")
+    for size in sizes:
+        rows = {(row["group"], row["spp"]): row for row in size.kept["worth"]["means"] if row["method"] is None}
+        for group in dict.fromkeys(group for group, _ in rows):
+            here = {n: rows.get((group, n)) for n in counts}
+            first = next(row for row in here.values() if row)
+            if not only or group in only:
+                cells = [marked(first, "C"), *(marked(here[n], "W/C") for n in counts)]
+                lines.append(f"| {group} ({first['scenes']}), {size.name} | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
-def worth_by_scene(rows: list[list[str]]) -> str:
-    place = {name: i for i, name in enumerate(rows[0])}
-    found: dict[str, dict[str, list[str]]] = {}
-    for row in rows[1:]:
-        found.setdefault(row[place["scene"]], {})[row[place["spp"]]] = row
-    counts = list(next(iter(found.values())))
-    lines = heading("scene", "C", *(f"W / C at {n} spp" for n in counts))
-    for scene, by_spp in found.items():
-        cells = [by_spp[counts[0]][place["C"]], *(by_spp[n][place["W/C"]] if n in by_spp else "" for n in counts)]
-        lines.append(f"| {scene} | {' | '.join(cells)} |")
+def worth_by_scene(size: Size) -> str:
+    rows = {(row["scene"], row["spp"]): row for row in size.kept["worth"]["rows"] if row["best"]}
+    lines = heading(f"{size.name}: scene", "C", *(f"W / C at {n} spp" for n in size.counts))
+    for scene in dict.fromkeys(scene for scene, _ in rows):
+        here = [rows.get((scene, n)) for n in size.counts]
+        first = next(row for row in here if row)
+        lines.append(f"| {scene} | {' | '.join([marked(first, 'C'), *(marked(row, 'W/C') for row in here)])} |")
+    return "\n".join(lines)
+
+
+def by_method(sizes: list[Size]) -> str:
+    """Errors over Mitsuba's with OIDN, over all scenes, and what each method takes after the render."""
+    size, rival = sizes[0], "mitsuba"
+    seconds = [f"seconds, {s.name}" for s in sizes]
+    lines = heading(f"{size.name}: method", *(f"{n} spp" for n in size.counts), *seconds)
+    for method in COMPARED:
+        cells = [ratio(size.means.get((size.groups[-1], n, method, rival)), "error") for n in size.counts]
+        times = [
+            [c["seconds"]["reconstruct"] for (_, n, m), c in s.cells.items() if (n, m) == (s.counts[0], method)]
+            for s in sizes
+        ]
+        cells += [f"{mean(found):.2f}" if found else "" for found in times]
+        lines.append(f"| `{method}` | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def better(sizes: list[Size]) -> str:
+    """OIDN on our samples over OIDN on Mitsuba's, each at its best setting: means, and the worst scene in brackets."""
+    size = sizes[0]
+    groups = {"all": size.scenes, "apart": [scene for scene in size.scenes if scene not in TUNED]}
+    lines = heading(f"{size.name}: new over old", *(f"{n} spp" for n in size.counts))
+    for group, scenes in groups.items():
+        cells = []
+        for n in (n for n in size.counts if scenes):
+            found = [[size.rows.get((s, n, c, "mitsuba")) for c in size.kept["rivals"]["oidn"]] for s in scenes]
+            least = {
+                key: [min(row[key] for row in rows if row and row[key]) for rows in found if any(rows)]
+                for key in ("error", "FLIP")
+            }
+            known = least["error"] and least["FLIP"]
+            text = (
+                f"{mean(least['error']):.2f} ({max(least['error']):.2f}), FLIP {mean(least['FLIP']):.2f}"
+                if known
+                else ""
+            )
+            cells.append(text)
+        if cells:
+            lines.append(f"| {group} ({len(scenes)}) | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def over_primal(sizes: list[Size]) -> str:
+    """Error of ngpt-combine over ngpt-primal's at the same whole time."""
+    size = sizes[0]
+    ratios: dict[tuple[str, int], float] = {}
+    for scene in size.scenes:
+        mine = {n: size.cells.get((scene, n, "ngpt-combine")) for n in size.counts}
+        curve = [c for (s, _, m), c in size.cells.items() if (s, m) == (scene, "ngpt-primal") and (c["error"] or 0) > 0]
+        points = [(cell["seconds"]["total"], cell["error"]) for cell in curve]
+        for n, cell in mine.items():
+            if cell and (cell["error"] or 0) > 0 and (theirs := error_at(cell["seconds"]["total"], points)):
+                ratios[scene, n] = cell["error"] / theirs[0]
+    lines = heading("error of `ngpt-combine` over `ngpt-primal`", *(f"{n} spp" for n in size.counts))
+    for group in size.groups:
+        cells = []
+        for n in size.counts:
+            found = [ratios[scene, n] for scene in size.members(group) if (scene, n) in ratios]
+            cells.append(f"{mean(found):.2f}" if found else "")
+        lines.append(f"| {group} ({len(size.members(group))}) | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def losses(size: Size, method: str) -> str:
+    """The scenes in which it has more than ``LOSS`` times OIDN's error somewhere, the worst first."""
+    lines = heading("scene", *(f"{n} spp" for n in size.counts))
+    found = {scene: [size.rows.get((scene, n, method, "oidn")) for n in size.counts] for scene in size.scenes}
+    worst = {scene: max((row["error"] for row in rows if row), default=-math.inf) for scene, rows in found.items()}
+    for scene in sorted((scene for scene in found if worst[scene] > LOSS), key=lambda scene: -worst[scene]):
+        lines.append(f"| {scene} | {' | '.join(ratio(row, 'error') for row in found[scene])} |")
     return "\n".join(lines)
 
 

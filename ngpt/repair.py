@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 
 from ngpt.errors import NgptError
+from ngpt.layers import FEATURE_NOISE
 from ngpt.stack import GradientStack
 from ngpt.system.late import ndimage
 
@@ -29,6 +30,7 @@ class Repaired:
     ``caustic``  (H, W, 3) the light that was taken out of image since gradients hold none of it, finite, to be denoised
                  by itself and added back; None where there is none
     ``caustic_var``  its variance, (H, W, 3), NaN where not known; None where the stack lacks it
+    ``feature_noise``  the variance of albedo or normal, whichever is larger, mean over the image; None: not known
     ``parts``    diffuse and specular light, finite, and their variances as ``diffuse_var`` and ``specular_var``, NaN
                  where not known: those that the stack holds
     """
@@ -45,6 +47,7 @@ class Repaired:
     noise: np.ndarray | None = None
     caustic: np.ndarray | None = None
     caustic_var: np.ndarray | None = None
+    feature_noise: float | None = None
     parts: dict[str, np.ndarray] = field(default_factory=dict)
 
     def known_variances(self) -> dict[str, np.ndarray]:
@@ -86,7 +89,7 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
     known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
-    apart: dict[str, Any] = {"parts": _parts(stack, good)}
+    apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": stack.number(FEATURE_NOISE)}
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
         apart |= {"caustic": caustic, "caustic_var": variance}

@@ -28,17 +28,21 @@ from ngpt.layers import LAYERS
 from ngpt.options import written
 
 
-def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
-    """(sampler, ray, medium, active) -> what the integrator estimates: itself, or ``prb`` where ``path`` is biased.
+def loses_light(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> bool:
+    """Whether the integrator is ``path`` in a scene where that is biased.
 
     ``path`` returns 0 for a path that has escaped after holes alone, were it lit by emitter sampling where the material
     of a mask is there in part; but for scenes with an environment.
     """
-    holes = any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
-    depths = path_depths(integrator) if integrator.class_name() == "PathIntegrator" else {}
-    if holes and depths and not scene.environment() and not integrator.hide_emitters:
-        prb = mi.load_dict({"type": "prb", **depths})
-        return own_estimate(scene, prb)
+    if integrator.class_name() != "PathIntegrator" or scene.environment() or integrator.hide_emitters:
+        return False
+    return any(mi.has_flag(shape.bsdf().flags(), mi.BSDFFlags.Null) for shape in scene.shapes() if shape.bsdf())
+
+
+def radiance(scene: mi.Scene, integrator: mi.SamplingIntegrator) -> Callable[..., mi.Spectrum]:
+    """(sampler, ray, medium, active) -> what the integrator estimates: itself, or ``prb`` where it ``loses_light``."""
+    if loses_light(scene, integrator):
+        integrator = mi.load_dict({"type": "prb", **path_depths(integrator)})
     return own_estimate(scene, integrator)
 
 

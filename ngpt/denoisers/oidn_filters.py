@@ -1,7 +1,8 @@
 """OIDN's devices and filters, which all threads of a process share: one thread uses them at a time.
 
 Two threads that set images of one filter would get each other's pixels. They lose no time by waiting, since OIDN works
-on all cores, or as many as ``ngpt.limit_threads`` allows. To make a filter takes longer than to run it on a small image, so filters are kept.
+on all cores, or as many as ``ngpt.limit_threads`` allows. To make a filter takes longer than to run it on a small
+image, so filters are kept.
 """
 
 from collections.abc import Mapping

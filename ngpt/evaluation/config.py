@@ -236,4 +236,14 @@ def _with_base(path: Path) -> dict[str, Any]:
         return values
     if not isinstance(base, str) or (path.parent / base).resolve() == path.resolve():
         raise NgptError(f"{path}: base = {base!r}: must be the name of another file")
-    return _with_base(path.parent / base) | values
+    return _merged(_with_base(path.parent / base), values)
+
+
+def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:
+    """Tables entry by entry; all else that both have is of ``values``."""
+    tables = {
+        name: _merged(base[name], value)
+        for name, value in values.items()
+        if isinstance(value, dict) and isinstance(base.get(name), dict)
+    }
+    return base | values | tables

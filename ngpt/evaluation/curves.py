@@ -1,8 +1,8 @@
 """Errors over samples or seconds as curves, read off between the measured points and a little outside of them.
 
 A curve is the running minimum of its points, straight between them on logarithmic axes: who has more samples could
-have taken fewer. Outside of the points the nearest slope that falls goes on, for a factor of ``REACH`` at most. Marks
-say which it was:
+have taken fewer. Outside of the points the nearest slope that falls goes on, no steeper than ``STEEPEST`` and for a
+factor of ``REACH`` at most. Marks say which it was:
 
     ""      between measured points
     "~"     outside, by the nearest slope
@@ -16,6 +16,8 @@ from collections.abc import Iterable, Sequence
 from itertools import pairwise
 
 REACH = 4.0  # how far a slope is trusted past the measured points
+# Errors of squares fall by 1/samples. Two short renders may take nearly the same time, and the slope is chance then.
+STEEPEST = -1.0
 
 # (samples or seconds, error)
 Points = Sequence[tuple[float, float]]
@@ -33,10 +35,10 @@ def first_at(error: float, points: Points) -> tuple[float, str] | None:
     target, reach = math.log(error), math.log(REACH)
     (first, highest), (last, lowest) = curve[0], curve[-1]
     if target > highest:
-        x = first + (target - highest) / _slope(falls[0])
+        x = first + (target - highest) / _outside(falls[0])
         return (math.exp(x), "~") if x >= first - reach else (math.exp(first - reach), "<")
     if target < lowest:
-        x = last + (target - lowest) / _slope(falls[-1])
+        x = last + (target - lowest) / _outside(falls[-1])
         return (math.exp(x), "~") if x <= last + reach else (math.exp(last + reach), ">")
     if target == highest:
         return math.exp(first), ""
@@ -55,10 +57,10 @@ def error_at(x: float, points: Points) -> tuple[float, str] | None:
     at, reach = math.log(x), math.log(REACH)
     (first, highest), (last, lowest) = curve[0], curve[-1]
     if at < first:
-        error = highest + (max(at - first, -reach) * _slope(falls[0]) if falls else 0.0)
+        error = highest + (max(at - first, -reach) * _outside(falls[0]) if falls else 0.0)
         return math.exp(error), "~" if at >= first - reach else "<"
     if at > last:
-        error = lowest + (min(at - last, reach) * _slope(falls[-1]) if falls else 0.0)
+        error = lowest + (min(at - last, reach) * _outside(falls[-1]) if falls else 0.0)
         return math.exp(error), "~" if at <= last + reach else ">"
     a, b = next((a, b) for a, b in pairwise(curve) if at <= b[0])
     return math.exp(a[1] + (at - a[0]) * _slope((a, b))), ""
@@ -80,6 +82,11 @@ def _curve(points: Points) -> tuple[list[tuple[float, float]], list[_Segment]]:
             continue  # the least of those at one place came first
         curve.append((math.log(x), lowest))
     return curve, [(a, b) for a, b in pairwise(curve) if b[1] < a[1]]
+
+
+def _outside(segment: _Segment) -> float:
+    """The slope that goes on past a segment."""
+    return max(_slope(segment), STEEPEST)
 
 
 def _slope(segment: _Segment) -> float:

@@ -141,23 +141,27 @@ def as_csv(against: dict[str, Any]) -> str:
 
 
 def against_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
-    """Title -> rows of text, the first is the head: means of the groups, then each scene."""
-    against, tables = results["against"], {}
+    """Title -> rows of text, the first is the head: means of groups, then each scene; of what is no rival's setting."""
+    tables: dict[str, list[list[str]]] = {}
     rivals = list(results["settings"]["against"])
+    settings = {column for columns in results["settings"]["against"].values() for column in columns}
+    means, by_scene = (
+        [row for row in results["against"][key] if row["method"] not in settings] for key in ("means", "rows")
+    )
     heads = [text for rival in rivals for text in (f"error over {rival}", f"FLIP over {rival}")]
     heads += [text for rival in rivals for text in (f"less error than {rival}", f"less FLIP than {rival}")]
-    if against["means"]:
+    if means:
         rows = [["scenes", "spp", "method", "seconds", *heads]]
-        for (group, spp, method), by_rival in _by_place(against["means"], "group").items():
+        for (group, spp, method), by_rival in _by_place(means, "group").items():
             one = next(iter(by_rival.values()))
             found = [by_rival.get(rival) for rival in rivals]
             counts = [text for row in found for text in (_count(row, ""), _count(row, " FLIP"))]
             first = [f"{group} ({one['scenes']})", str(spp), method, f"{one['seconds']:.3g}"]
             rows.append([*first, *_ratios(found), *counts])
         tables["Errors over those of rivals at equal whole time, geometric means"] = rows
-    if against["rows"]:
+    if by_scene:
         rows = [["scene", "spp", "method", "seconds", *heads[: 2 * len(rivals)]]]
-        for (scene, spp, method), by_rival in _by_place(against["rows"], "scene").items():
+        for (scene, spp, method), by_rival in _by_place(by_scene, "scene").items():
             one = next(iter(by_rival.values()))
             first = [scene, str(spp), method, f"{one['seconds']:.3g}"]
             rows.append([*first, *_ratios([by_rival.get(rival) for rival in rivals])])

@@ -139,16 +139,16 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
         for group, spp, method in means:
             if method is None:
                 best = means[group, spp, None]
-                others = [_marked(means.get((group, spp, name)), "W/C") for name in columns]
+                others = [marked(means.get((group, spp, name)), "W/C") for name in columns]
                 name = f"{group} ({best['scenes']})"
-                table.append([name, str(spp), *(_marked(best, key) for key in ("W", "C", "W/C")), *others])
+                table.append([name, str(spp), *(marked(best, key) for key in ("W", "C", "W/C")), *others])
         tables["Worth of gradients, geometric means; best pipelines, then each column with gradients"] = table
     rows = {(row["scene"], row["spp"], row["method"]): row for row in worth["rows"]}
     table = [["scene", "spp", "with gradients", "without", "W", "C", "W/C", "blocks", *heads]]
     for best in worth["rows"]:
         if best["best"]:
-            others = [_marked(rows.get((best["scene"], best["spp"], name)), "W/C") for name in columns]
-            values = [_marked(best, key) for key in ("W", "C", "W/C")]
+            others = [marked(rows.get((best["scene"], best["spp"], name)), "W/C") for name in columns]
+            values = [marked(best, key) for key in ("W", "C", "W/C")]
             blocks = "" if best.get("blocks") is None else f"{best['blocks']:.0%}"
             table.append([best["scene"], str(best["spp"]), best["method"], best["rival"], *values, blocks, *others])
     if len(table) > 1:
@@ -156,7 +156,7 @@ def worth_tables(results: dict[str, Any]) -> dict[str, list[list[str]]]:
     return tables
 
 
-def _marked(row: dict[str, Any] | None, key: str) -> str:
+def marked(row: dict[str, Any] | None, key: str) -> str:
     """A number with its mark; C is measured, whatever W is."""
     if row is None or row[key] is None:
         return ""

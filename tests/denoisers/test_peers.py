@@ -10,6 +10,7 @@ from ngpt.denoisers import nfor as nfor_module
 from ngpt.denoisers import nlm, oidn
 from ngpt.denoisers.nfor import nfor
 from ngpt.errors import NgptError
+from ngpt.layers import FEATURE_NOISE
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network import inputs
 from ngpt.repair import repair
@@ -181,14 +182,19 @@ def test_an_absent_peer_says_what_to_install(room, monkeypatch, name, package):
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
-def test_a_combiner_is_given_oidns_images_with_prefiltered_features():
-    """As `--method oidn` has them, but for features that are filtered once for both, in less time."""
-    data = repair(full_stack(40, 50))
+@pytest.mark.parametrize("noise", [None, inputs.CLEAN, 1.01 * inputs.CLEAN, float("nan")])
+def test_a_combiner_is_given_oidns_images_by_clean_features(noise):
+    """Features are prefiltered unless their noise is known to be little."""
+    stack = full_stack(40, 50)
+    if noise is not None:
+        stack.attributes[FEATURE_NOISE] = noise
+    data = repair(stack)
     base = 0.9 * data.image
-    features = data.features | oidn.prefiltered(data.features, "balanced")
+    clean = noise == inputs.CLEAN
+    features = data.features | ({} if clean else oidn.prefiltered(data.features, "balanced"))
     images = inputs.denoised(inputs.Oidn(data), base, inputs.DENOISED)
-    for name, image in (("denoised", data.image), ("denoised_base", base)):
-        expected = oidn.oidn(replace(data, image=image, features=features), "clean", "high")
+    for name, image, quality in (("denoised", data.image, "high"), ("denoised_base", base, "fast")):
+        expected = oidn.oidn(replace(data, image=image, features=features), "clean", quality)
         assert np.allclose(images[name], expected, rtol=1e-5, atol=1e-6)
     by_oidn = inputs.Oidn(data)
     assert inputs.denoised(by_oidn, base, ("primal",)) == {} == inputs.denoised(by_oidn, None, ("denoised_base",))

@@ -49,6 +49,17 @@ def test_a_host_with_oidn_gives_the_pixels_of_denoise(host, stack, method, memor
     check(read_pfm(tmp_path / "image.pfm"), planes_of(reconstruct(held, method).image))
 
 
+def test_a_host_with_oidn_adds_the_light_that_gradients_do_not_hold(host, stack, tmp_path):
+    layers, held = stack
+    light = np.where(np.random.default_rng(0).random(held["primal"].shape) > 0.9, np.float32(3), np.float32(0))
+    held = held.replace(primal=held["primal"] + light, caustic=light, caustic_var=light)
+    layers = layers | {name: planes_of(held[name]) for name in ("primal", "caustic", "caustic_var")}
+    write_layers(tmp_path / "layers", layers)
+    result = host(WEIGHTS / "ngpt-combine.onnx", tmp_path / "layers", tmp_path / "image.pfm", 0)
+    assert result.returncode == 0, result.stderr
+    agree_but_for_rounding_in_oidn(read_pfm(tmp_path / "image.pfm"), planes_of(reconstruct(held, "ngpt-combine").image))
+
+
 def test_a_host_with_oidn_says_what_is_wrong(host, stack, tmp_path):
     layers, _ = stack
     write_layers(tmp_path / "layers", layers)

@@ -8,6 +8,7 @@ import ngpt
 from ngpt.classical.gradients import forward_differences
 from ngpt.denoisers import oidn
 from ngpt.errors import NgptError
+from ngpt.layers import FEATURE_NOISE
 from ngpt.network import inputs
 from ngpt.network.estimates import with_variances
 from ngpt.repair import repair
@@ -84,12 +85,16 @@ def test_training_never_reads_estimates():
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
+@pytest.mark.parametrize("noise", [None, 0.0, 1.0])
 @pytest.mark.parametrize("absent", [(), VARIANCES])
-def test_features_are_filtered_once_for_a_frame(absent, monkeypatch):
+def test_features_are_filtered_once_for_a_frame_if_they_are_noisy(absent, noise, monkeypatch):
     calls = []
     real = inputs.prefiltered
     monkeypatch.setattr(inputs, "prefiltered", lambda *given: calls.append(1) or real(*given))
     for name in ("ngpt-combine", "ngpt-primal") if not absent else ("ngpt-combine",):
         calls.clear()
-        ngpt.denoise(without(full_stack(24, 28), *absent), name)
-        assert calls == [1], name
+        stack = without(full_stack(24, 28), *absent)
+        if noise is not None:
+            stack.attributes[FEATURE_NOISE] = noise
+        ngpt.denoise(stack, name)
+        assert calls == ([] if noise == 0 else [1]), name

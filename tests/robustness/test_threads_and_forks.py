@@ -172,7 +172,7 @@ def test_a_limit_of_threads_holds_for_everything_that_has_some(limit, monkeypatc
     limit(processors() + 5)
     assert processors() == len(os.sched_getaffinity(0)), "a limit asks for no more than there is"
     for bad in (0, -1, 1.5, True):
-        with pytest.raises(NgptError, match="threads: .* is not allowed; give a whole number, 1 or more"):
+        with pytest.raises(NgptError, match=r"threads: .* is not allowed; give a whole number, 1 or more"):
             limit(bad)
 
 

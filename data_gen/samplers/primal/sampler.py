@@ -12,7 +12,7 @@ from data_gen.paths.camera import CameraSamples
 from data_gen.paths.features import features as feature_layers
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.spectrum import to_rgb
-from data_gen.samplers.common import radiance, recorded
+from data_gen.samplers.common import loses_light, radiance, recorded
 from data_gen.samplers.gpt.integrator import stand_in
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.trace import trace
@@ -26,12 +26,16 @@ def make(scene: mi.Scene, features: bool, places: Places | None = None) -> Sampl
     """The sampler ``primal``; without ``features`` it holds the primal alone. Lamps may be chosen by ``places``."""
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
-    plan, L = radiance_by_place(scene, places) if places and followed else (None, radiance(scene, integrator))
+    ours = followed and (places or loses_light(scene, integrator))
+    plan, L = our_radiance(scene, places) if ours else (None, radiance(scene, integrator))
     return recorded(scene, partial(samples, scene, integrator, L, features), plan)
 
 
-def radiance_by_place(scene: mi.Scene, places: Places) -> tuple[Plan, Callable[..., mi.Spectrum]]:
-    """``radiance()`` by the base paths of ``gpt``, whose plan comes first: others choose a lamp alike everywhere."""
+def our_radiance(scene: mi.Scene, places: Places | None) -> tuple[Plan, Callable[..., mi.Spectrum]]:
+    """``radiance()`` by the base paths of ``gpt``, whose plan comes first.
+
+    Others choose a lamp alike everywhere. Behind holes these paths trace a quarter fewer rays than ``prb``.
+    """
     view = stand_in(scene, places, caustic=False)
     plan = view.plan(scene)
 

@@ -20,21 +20,22 @@ public:
     }
     ~Oidn() { oidnReleaseDevice(device_); }
 
-    // A feature, "albedo" or "normal", denoised by OIDN's own model for it.
+    // A feature, "albedo" or "normal", denoised by OIDN's own model for it. "High" takes more than twice as long, and
+    // gains nothing.
     Layer prefiltered(const char *name, const Layer &feature) {
         const bool empty = std::all_of(feature.pixels.begin(), feature.pixels.end(), [](float x) { return x == 0; });
-        return empty ? feature : filtered({{name, &feature}}, false);
+        return empty ? feature : filtered({{name, &feature}}, false, OIDN_QUALITY_BALANCED);
     }
 
-    // An image with emission seen directly, by features that are prefiltered.
-    Layer denoised(const Layer &color, const Layer &albedo, const Layer &normal) {
-        return filtered({{"color", &color}, {"albedo", &albedo}, {"normal", &normal}}, true);
+    // An image with emission seen directly, by features that count as clean.
+    Layer denoised(const Layer &color, const Layer &albedo, const Layer &normal, OIDNQuality quality) {
+        return filtered({{"color", &color}, {"albedo", &albedo}, {"normal", &normal}}, true, quality);
     }
 
 private:
     OIDNDevice device_;
 
-    Layer filtered(const std::map<const char *, const Layer *> &images, bool is_color) {
+    Layer filtered(const std::map<const char *, const Layer *> &images, bool is_color, OIDNQuality quality) {
         const Layer &first = *images.begin()->second;
         const size_t height = first.height, width = first.width;
         OIDNFilter filter = oidnNewFilter(device_, "RT");
@@ -48,10 +49,8 @@ private:
         if (is_color) {
             oidnSetFilterBool(filter, "hdr", true);
             oidnSetFilterBool(filter, "cleanAux", true);
-        } else {
-            // Of features, "high" takes more than twice as long and gains nothing.
-            oidnSetFilterInt(filter, "quality", OIDN_QUALITY_BALANCED);
         }
+        oidnSetFilterInt(filter, "quality", quality);
         oidnCommitFilter(filter);
         oidnExecuteFilter(filter);
         oidnReleaseFilter(filter);
@@ -80,6 +79,45 @@ private:
     }
 };
 
+float at(const Layer &layer, int c, int y, int x) {
+    return layer.pixels[(size_t(c) * layer.height + y) * layer.width + x];
+}
+
+// The means of 2x2 pixels; sides of odd length have their last pixels twice.
+Layer halved(const Layer &layer) {
+    Layer half(layer.channels, (layer.height + 1) / 2, (layer.width + 1) / 2);
+    float *pixel = half.pixels.data();
+    for (int c = 0; c < half.channels; c++)
+        for (int y = 0; y < layer.height; y += 2)
+            for (int x = 0; x < layer.width; x += 2) {
+                const int below = std::min(y + 1, layer.height - 1), right = std::min(x + 1, layer.width - 1);
+                *pixel++ = (at(layer, c, y, x) + at(layer, c, y, right) + at(layer, c, below, x) +
+                            at(layer, c, below, right)) / 4;
+            }
+    return half;
+}
+
+// Bilinear at twice the size, of which that many rows and columns are wanted.
+Layer doubled(const Layer &half, int height, int width) {
+    Layer layer(half.channels, height, width);
+    float *pixel = layer.pixels.data();
+    for (int c = 0; c < half.channels; c++)
+        for (int y = 0; y < height; y++)
+            for (int x = 0; x < width; x++) {
+                const int v = std::clamp(y / 2 + (y % 2 ? 1 : -1), 0, half.height - 1);
+                const int u = std::clamp(x / 2 + (x % 2 ? 1 : -1), 0, half.width - 1);
+                *pixel++ = 0.75f * (0.75f * at(half, c, y / 2, x / 2) + 0.25f * at(half, c, y / 2, u)) +
+                           0.25f * (0.75f * at(half, c, v, x / 2) + 0.25f * at(half, c, v, u));
+            }
+    return layer;
+}
+
+double sum(const Layer &layer) {
+    double total = 0;
+    for (const float value : layer.pixels) total += value;
+    return total;
+}
+
 int main(int count, char **arguments) try {
     if (count < 4 || count > 5 || (count == 5 && std::string(arguments[4]).find_first_not_of("0123456789") != std::string::npos)) {
         std::fprintf(stderr, "usage: ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [MEMORY]\n");
@@ -103,11 +141,11 @@ int main(int count, char **arguments) try {
 
     Oidn oidn;
     const Layer clean_albedo = oidn.prefiltered("albedo", albedo), clean_normal = oidn.prefiltered("normal", normal);
-    const Layer denoised = oidn.denoised(primal, clean_albedo, clean_normal);
+    const Layer denoised = oidn.denoised(primal, clean_albedo, clean_normal, OIDN_QUALITY_HIGH);
     network.give("denoised", denoised);
     Layer denoised_base;
     if (reads("denoised_base")) {
-        denoised_base = oidn.denoised(base, clean_albedo, clean_normal);
+        denoised_base = oidn.denoised(base, clean_albedo, clean_normal, OIDN_QUALITY_FAST);
         network.give("denoised_base", denoised_base);
         network.give("base", base);
     }
@@ -115,15 +153,14 @@ int main(int count, char **arguments) try {
     network.take("image", image);
     network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
     if (!light.empty()) {
-        // The mean of OIDN's image of the light alone, and of what its image of all has beyond that of the rest
-        const Layer &caustic = light.at("caustic");
-        Layer all = primal;
-        add(all, caustic);
-        const Layer with = oidn.denoised(all, albedo, normal), without = oidn.denoised(primal, albedo, normal);
-        Layer half = oidn.denoised(caustic, albedo, normal);
-        for (size_t i = 0; i < half.pixels.size(); i++)
-            half.pixels[i] = 0.5f * std::max(half.pixels[i] + with.pixels[i] - without.pixels[i], 0.0f);
-        add(image, half);
+        const Layer given = halved(light.at("caustic"));
+        Layer made = oidn.denoised(given, halved(albedo), halved(normal), OIDN_QUALITY_BALANCED);
+        for (float &value : made.pixels) value = std::max(value, 0.0f);
+        // What OIDN took for noise is given back.
+        const double before = sum(given), after = sum(made);
+        if (before > 0 && before < 4 * after)
+            for (float &value : made.pixels) value *= float(before / after);
+        add(image, doubled(made, height, width));
     }
     write_pfm(arguments[3], image);
 } catch (const std::exception &error) {
