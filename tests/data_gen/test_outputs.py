@@ -53,6 +53,18 @@ def test_a_method_goes_before_the_one_that_samples_are_shared_for(renderer, tmp_
     assert header["ngpt:method"] == "l1" and header["ngpt:adaptive"] == "wcv"
 
 
+def test_the_memory_of_a_render_is_free_before_a_method_runs(renderer, tmp_path, monkeypatch):
+    import drjit as dr
+
+    from data_gen import outputs
+
+    order, real = [], outputs.reconstruct
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: order.append("freed"))
+    monkeypatch.setattr(outputs, "reconstruct", lambda *args: order.append("denoised") or real(*args))
+    assert main(["render", "diffuse", *SIZE, "--spp", "2", "--denoise", "l1", "-o", str(tmp_path / "it.png")]) == 0
+    assert order == ["freed", "denoised"]
+
+
 def test_the_error_to_reach_is_that_of_the_image(renderer, tmp_path, capsys):
     words = ["render", "diffuse", *SIZE[:-1], "--error", "0.9", "--spp", "32", "--denoise", "wcv"]
     assert main([*words, "-o", str(tmp_path / "it.png")]) == 0
