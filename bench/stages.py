@@ -77,9 +77,9 @@ def main() -> None:
                     rows = measured(ways, scene, size, args)
                     result["rows"][f"{Path(scene).parent.name or scene} {size}"] = rows
                     show(f"{scene} {size}", rows)
+                    save(args.output, result)
         finally:
             git("worktree", "remove", "--force", str(old))
-    save(args.output, result)
 
 
 def measured(ways: dict[str, tuple[Path, bool]], scene: str, size: str, args: argparse.Namespace) -> dict:

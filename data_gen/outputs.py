@@ -127,4 +127,8 @@ class Output:
     def image(self, stack: GradientStack, overwrite: bool) -> dict[str, Any]:
         """Writes the image of the whole stack."""
         assert self.denoising is not None
+        # Dr.Jit keeps the memory of a render for the next one: at 1920x1080 more than a method takes.
+        import drjit as dr
+
+        dr.flush_malloc_cache()
         return self.denoising.write(self.file, stack, overwrite, keeps=self.kept is not None)

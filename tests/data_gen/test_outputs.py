@@ -53,6 +53,24 @@ def test_a_method_goes_before_the_one_that_samples_are_shared_for(renderer, tmp_
     assert header["ngpt:method"] == "l1" and header["ngpt:adaptive"] == "wcv"
 
 
+def test_the_memory_of_a_render_is_free_before_a_method_runs(renderer, tmp_path, monkeypatch):
+    import drjit as dr
+
+    from data_gen import outputs
+
+    order, real = [], outputs.reconstruct
+    monkeypatch.setattr(dr, "flush_malloc_cache", lambda: order.append("freed"))
+    monkeypatch.setattr(outputs, "reconstruct", lambda *args: order.append("denoised") or real(*args))
+    assert main(["render", "diffuse", *SIZE, "--spp", "2", "--denoise", "l1", "-o", str(tmp_path / "it.png")]) == 0
+    assert order == ["freed", "denoised"]
+
+
+def test_the_error_to_reach_is_that_of_the_image(renderer, tmp_path, capsys):
+    words = ["render", "diffuse", *SIZE[:-1], "--error", "0.9", "--spp", "32", "--denoise", "wcv"]
+    assert main([*words, "-o", str(tmp_path / "it.png")]) == 0
+    assert "'wcv' is expected to have an error of" in capsys.readouterr().err
+
+
 def test_the_method_of_a_pilot_is_run(renderer, tmp_path, monkeypatch, capsys):
     from data_gen.choosing import plans
 
@@ -61,7 +79,7 @@ def test_the_method_of_a_pilot_is_run(renderer, tmp_path, monkeypatch, capsys):
     assert main(["render", "diffuse", "--size", "16x12", "--time", "9", "--for", "auto", "--denoise", "-o", out]) == 0
     assert read_exr(out).parts[0].header["ngpt:method"] == "nfor"
     said = capsys.readouterr().err
-    assert ", nfor 0." in said and "then: ngpt denoise" not in said
+    assert " s, nfor " in said and "then: ngpt denoise" not in said
 
 
 @pytest.mark.parametrize("kept", [False, True])
@@ -207,7 +225,7 @@ def test_standard_output_gets_a_stack_or_its_image(renderer, tmp_path, monkeypat
 def test_frames_are_denoised_one_by_one(renderer, tmp_path, capsys):
     words = ["render", "diffuse", "--frames", "0:2", *SIZE[:-1], "-o"]
     clean = [*words, str(tmp_path / "clean"), "--denoise", "wcv", "--skip-existing"]
-    assert main([*clean, "--spp", "4"]) == 0 and ", wcv 0." in capsys.readouterr().err
+    assert main([*clean, "--spp", "4"]) == 0 and " s, wcv " in capsys.readouterr().err
     assert main([*words, str(tmp_path / "shot"), "--spp", "4"]) == 0
     assert main(["denoise", str(tmp_path / "shot"), "-o", str(tmp_path / "two"), "-m", "wcv"]) == 0
     for name in ("diffuse.0000.exr", "diffuse.0001.exr"):

@@ -8,11 +8,11 @@ from threading import get_ident
 
 import numpy as np
 import pytest
+import scipy.fft
 from full_stack import full_stack
 from processes import complete, in_a_child, needs_forks, no_warning_of_forks
 
 import ngpt
-from ngpt.classical import arrays
 from ngpt.denoisers import oidn_filters
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import METRICS, scores
@@ -163,9 +163,9 @@ def test_a_limit_of_threads_holds_for_everything_that_has_some(limit, monkeypatc
     assert len({get_ident() for _ in range(9)} | set(map_parts(lambda _: get_ident(), range(64)))) == 2
     assert run_onnx.Network(WEIGHTS / "ngpt-fast.onnx").session.get_session_options().intra_op_num_threads == 1
     workers = []
-    real = arrays.scipy.fft.dctn
+    real = scipy.fft.dctn
     monkeypatch.setattr(
-        arrays.scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given)
+        scipy.fft, "dctn", lambda *args, **given: workers.append(given["workers"]) or real(*args, **given)
     )
     ngpt.denoise(stack(0), "l2")
     assert workers and set(workers) == {1}
