@@ -29,10 +29,18 @@ from ngpt.system.console import brief
 # of a render, where no method is measured but the quickest
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
-# Seconds for an image below which a pilot costs more than it could gain
-LEAST_SECONDS = 45.0
-# What a method takes that no pilot has measured: for its process to begin, and for a million pixels
-_METHOD_BEGINS, _METHOD_SECONDS = 1.0, 3.0
+# Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
+# images take 3.0, 5.5, 5.6 and 13.5 processor seconds (diffuse, glossy, coffee, dining-room), and their methods 3.5 and
+# 4.4. Two idle cores do that of a room in a fifth of this time; where it does not fit, the time is lost.
+LEAST_SECONDS = 40.0
+# What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
+# write a million pixels, read them and write the image
+_BEGINS, _FILES = 0.8, 3.7
+# The power of the pixels by which the seconds of methods grow: from 4,080 to 230,400 pixels 0.84 (ngpt-combine), 0.86
+# (oidn, ngpt-primal) to 0.96 (ngpt-fast), from 57,600 on 0.89 to 1.1. A call takes some time whatever the size.
+_GROWS = 0.9
+# Seconds for a million pixels, on two cores, of methods that no pilot has measured; of those that are not listed
+_METHOD_SECONDS, _OTHERS = {"auto": 18.0, "ngpt-combine": 18.0, "ngpt-primal": 7.0, "oidn": 8.0}, 3.0
 # Seconds from which on the pilot's images are as large as they ever are, and the least share of that
 LONG, LEAST_PIXELS = 200.0, 1 / 16
 # Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
@@ -82,15 +90,20 @@ def explore(
     clock: Callable[[], float] = time.perf_counter,
     said: Said = silent,
     stop: Stop = never,
+    patient: bool = False,
 ) -> list[Pipeline]:
     """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
-    into the time."""
+    into the time; ``patient``, the first sampler has a trial and a method however long they take.
+
+    ``after`` of them is all that follows the render: its file, a process that reads it, the method, the image's file.
+    """
     start = clock()
     able = _able(scene, method)
     _check_memory(scene, able[0], None, memory)
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
-        trials = try_all(scene, able, lambda _: SHARE * seconds, SHARE * seconds, clock=clock, said=said, stop=stop)
+        first = math.inf if patient else SHARE * seconds
+        trials = try_all(scene, able, lambda _: SHARE * seconds, first, clock=clock, said=said, stop=stop)
     if not trials or stop():
         return []
     found = measure(
@@ -99,7 +112,20 @@ def explore(
         lambda sampler: methods_for(sampler, method),
         goes_on=lambda: clock() - start < SHARE_WITH_METHODS * seconds and not stop(),
     )
-    return [replace(p, seconds=p.seconds * scale, after=p.after * scale, choosing=p.choosing * scale) for p in found]
+    return [
+        replace(
+            p,
+            seconds=p.seconds * scale,
+            after=p.after * scale**_GROWS + _beside(scene),
+            choosing=p.choosing * scale**_GROWS,
+        )
+        for p in found
+    ]
+
+
+def _beside(scene: mi.Scene) -> float:
+    """Seconds that a method takes beside its own: for processes and files."""
+    return _BEGINS + _FILES * _pixels(scene) / 1e6
 
 
 def _able(scene: mi.Scene, method: str) -> list[str]:
@@ -139,9 +165,10 @@ def plan(
     if ranked := choose(whole, left):
         first = ranked[0]
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
-    after = _METHOD_BEGINS + _METHOD_SECONDS * _pixels(scene) / 1e6
+    after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
     why = f"{samplers.choose(scene_facts(scene))[1]}; there is no time for a pilot"
-    return Plan(able[0], method, False, max(left - after, 1e-3), why)
+    # However slow the method may be here, half of the time is rendered.
+    return Plan(able[0], method, False, max(left - after, left / 2, 1e-3), why)
 
 
 def plan_sampler(

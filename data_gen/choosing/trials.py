@@ -4,6 +4,11 @@ The error of an image x, which a bias may be part of, is the mean of (x - a)(x -
 independent images that had no part in x: their noise has no mean, as in ``ngpt.measure.metrics``. They are primals of
 the sampler's other stacks and of all other unbiased samplers. The difference of two reconstructions would not do: light
 that a sampler finds in one pixel of a thousand is an outlier, which a method takes out of both.
+
+What a sample takes is measured in processor seconds, which other work on the machine hardly changes, so a busy moment
+moves no sampler against another. A user gives seconds of the wall. One factor for all trials turns the one into the
+other: their wall seconds over their processor seconds, both of further samples. On an idle machine that is what the
+cores do in parallel; on a busy one also what others leave, which the render will have to live with as well.
 """
 
 from __future__ import annotations
@@ -13,7 +18,7 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import mitsuba as mi
 import numpy as np
@@ -39,10 +44,14 @@ SEED = 0x9E3779B9
 
 @dataclass(frozen=True)
 class Trial:
-    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image."""
+    """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image.
+
+    ``processor``  those of all cores together; 0 where nobody measured them
+    """
 
     stacks: list[GradientStack]
     seconds: float
+    processor: float = 0.0
 
 
 def candidates(scene: mi.Scene, biased: bool = False) -> list[str]:
@@ -91,7 +100,15 @@ def try_all(
         slow = max(slow, (compiled - begins) / compiles)
         if trial is not None:
             trials[name] = trial
-    return trials
+    return by_processor(trials)
+
+
+def by_processor(trials: dict[str, Trial]) -> dict[str, Trial]:
+    """Trials whose wall seconds are to each other as their processor seconds are, and the same in sum."""
+    if not trials or not all(trial.processor for trial in trials.values()):
+        return trials
+    wall = sum(trial.seconds for trial in trials.values()) / sum(trial.processor for trial in trials.values())
+    return {name: replace(trial, seconds=trial.processor * wall) for name, trial in trials.items()}
 
 
 def try_out(
@@ -120,22 +137,27 @@ def try_out(
         # Each of the stacks takes a good part of that again.
         return None, compiled
 
-    def timed(n: int, seed: int) -> tuple[GradientStack, float]:
-        start = clock()
-        return render_stack(scene, n, seed, sampler), clock() - start
+    def timed(n: int, seed: int) -> tuple[GradientStack, tuple[float, float]]:
+        start, busy = clock(), time.process_time()
+        stack = render_stack(scene, n, seed, sampler)
+        return stack, (clock() - start, time.process_time() - busy)
 
-    made, others = [], []
+    made: list[tuple[GradientStack, tuple[float, float]]] = []
+    others: list[tuple[float, float]] = []
     for i in range(4):
         if stop():
             return None, compiled
         made.append(timed(spp, seed + i))
-        if i == 0 and (4 + 2 * other / spp) * made[0][1] > limit - (compiled - begins):
+        if i == 0 and (4 + 2 * other / spp) * made[0][1][0] > limit - (compiled - begins):
             return None, compiled
         if i % 2:
             others.append(timed(other, seed + 4 + i)[1])
-    seconds = statistics.median(took for _, took in made)
-    each = (statistics.median(others) - seconds) / (other - spp)
-    return Trial([stack for stack, _ in made], max(each, 0.2 * seconds / spp)), compiled
+    each = []
+    for i in range(2):
+        seconds = statistics.median(took[i] for _, took in made)
+        further = (statistics.median(took[i] for took in others) - seconds) / (other - spp)
+        each.append(max(further, 0.2 * seconds / spp))
+    return Trial([stack for stack, _ in made], *each), compiled
 
 
 @dataclass(frozen=True)

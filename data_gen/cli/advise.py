@@ -20,8 +20,6 @@ if TYPE_CHECKING:
 
 # More are not advised.
 LARGEST_SPP = 1 << 20
-# The pilot plans for a render of at least so many seconds: in less time a busy machine compiles no kernels.
-LEAST_WHOLE = 60.0
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -61,19 +59,17 @@ def run(args: argparse.Namespace, console: Console) -> int:
     from data_gen.backend import DEFAULT_VARIANT, use_variant
 
     use_variant(args.variant or DEFAULT_VARIANT)
-    from data_gen.choosing.plans import LONG, SHARE, SHARE_WITH_METHODS, explore
+    from data_gen.choosing.plans import LEAST_SECONDS, LONG, SHARE_WITH_METHODS, explore
     from data_gen.scenes.load import load_scene
 
     start = time.perf_counter()
     scene = load_scene(args.scene, args.size, dict(args.define), sensor=args.sensor)
-    # Its own time is not part of the time that it advises on, but no more than that.
-    whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_WHOLE), LONG)
-    seen = explore(scene, whole, said=console.say)
-    if not seen and whole < LONG:
-        console.say(f"pilot: no trial ended within {SHARE * whole:.0f} s; once more with {SHARE * LONG:.0f} s")
-        seen = explore(scene, LONG, said=console.say)  # with the kernels that are there by now
+    # Its own time is not part of the time that it advises on, but no more than that. On a machine that is too busy for
+    # it the first sampler is tried all the same, on a small image, and no other.
+    whole = LONG if args.seconds is None else min(max(args.seconds / SHARE_WITH_METHODS, LEAST_SECONDS), LONG)
+    seen = explore(scene, whole, said=console.say, patient=True)
     if not seen:
-        raise NgptError(f"{args.scene}: no sampler ended its trial within {SHARE * LONG:g} s; give a smaller --size")
+        raise NgptError(f"{args.scene}: no sampler can render it; `ngpt info` says what it holds")
     found = rows_of(seen, args.seconds, args.error)
     console.say(f"{args.scene}: pilot of {time.perf_counter() - start:.1f} s with compilation")
     if args.json:

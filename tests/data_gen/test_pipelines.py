@@ -165,7 +165,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
         return None, compiled
 
     monkeypatch.setattr(trials, "try_out", try_out)
-    cases = ((30.0, 0, None), (50.0, 1, (6, 4)), (100.0, 2, (12, 8)), (250.0, 3, (24, 16)), (500.0, 4, (24, 16)))
+    cases = ((35.0, 0, None), (50.0, 1, (6, 4)), (100.0, 2, (12, 8)), (250.0, 3, (24, 16)), (500.0, 4, (24, 16)))
     for seconds, names, size in cases:
         tried.clear()
         found = plans.plan(scene, seconds, clock=ticking(1.0))
@@ -173,6 +173,40 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
         assert [name for name, _ in tried] == ["gpt", "primal", "bdpt", "gbdpt"][:names]
         assert (sizes or [None])[-1] == size
         assert all(0 < limit < 0.2 * seconds for _, limit in tried)
+
+
+def test_a_busy_moment_moves_no_sampler_against_another(rng):
+    """Samples are compared by processor seconds, and cost in sum what the wall says."""
+    from data_gen.choosing.trials import Trial, by_processor
+
+    found = by_processor({"gpt": Trial([], 0.9, 0.6), "primal": Trial([], 0.1, 0.4)})
+    assert [trial.seconds for trial in found.values()] == pytest.approx([0.6, 0.4])
+    unknown = {"gpt": Trial([], 0.9, 0.6), "primal": Trial([], 0.1)}
+    assert by_processor(unknown) == unknown and by_processor({}) == {}
+
+
+def test_a_trial_measures_both_clocks(renderer):
+    from data_gen.choosing.trials import try_out
+
+    trial, _ = try_out(load(renderer, "diffuse", (16, 12)), "primal")
+    assert trial.seconds > 0 and trial.processor > 0
+
+
+def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch):
+    """Methods are measured on small images: they grow a little slower than the pixels, and files and a process come
+    on top."""
+    from data_gen.choosing import plans
+
+    scene = load(renderer, "diffuse", (96, 64))
+    monkeypatch.setattr(plans, "PIXELS", 48 * 32)
+    monkeypatch.setattr(plans, "try_all", lambda *args, **options: {"gpt": None})
+    monkeypatch.setattr(plans, "measure", lambda *args, **options: [pipeline(seconds=0.01, after=0.5)])
+    (found,) = plans.explore(scene, 1e4)
+    assert found.seconds == pytest.approx(0.04)
+    assert found.after == pytest.approx(0.5 * 4**0.9 + 0.8 + 3.7 * 96 * 64 / 1e6)
+    # Where no pilot measured it, at most half of the time is kept for the method.
+    assert plans.plan(scene, 0.2, clock=lambda: 0.0).render == pytest.approx(0.1)
+    assert plans.plan(scene, 20.0, "wcv", clock=lambda: 0.0).render == pytest.approx(20 - 0.8 - 6.7 * 96 * 64 / 1e6)
 
 
 def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
