@@ -37,8 +37,8 @@ _STRAND_BYTES = 10 * 8 + (26 + 21) * 8 + (8 + 6 * 8)
 _HALVES_BYTES = 2 * 21 * 4 + 7 * 3 * 4
 # Per pixel, of a pass that is one batch: the mean over the batch, splats and their sums, of one name.
 _BATCH_BYTES = 3 * 8 + 3 * SPLAT_BYTES + 4 + 3 * 8
-# Pixels that tell the mean noise of features within 1 or 2 %
-_ENOUGH = 1 << 16
+# Pixels that tell the mean noise of features well enough
+_ENOUGH = 1 << 13
 # With fewer pixels than this, several strands of samples share a pixel: a few long loops would leave cores idle.
 _STRANDS = 1 << 15
 
@@ -268,6 +268,7 @@ class GradientFilm:
         for name in _FEATURES:
             if name in self.moments:
                 moments = taken(self.moments[name], place) if len(some) < self.pixels else self.moments[name]
+                dr.eval(moments)
                 variance = statistics(moments, self.strands, self.batch)[2]
                 if self.net:
                     seen = contrast(moments, self.strands, self._numbers[some])
