@@ -1,6 +1,7 @@
 """Fixtures that several tests of rendering share."""
 
 import gc
+import logging
 from collections import Counter
 from functools import wraps
 
@@ -35,3 +36,21 @@ def recordings(renderer, monkeypatch):
 
     monkeypatch.setattr(Frozen, "__call__", call)
     return seen
+
+
+@pytest.fixture(autouse=True)
+def kernels_are_recorded_once(request):
+    """A sampler that is recorded anew in each pass costs a second of each. Only tests marked ``recorded_anew`` may."""
+    lines: list[str] = []
+
+    class Kept(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            lines.append(record.getMessage())
+
+    # By name: most tests here import no renderer.
+    log, handler = logging.getLogger("ngpt.data_gen.paths.frozen"), Kept()
+    log.addHandler(handler)
+    yield
+    log.removeHandler(handler)
+    if lines and "recorded_anew" not in request.keywords:
+        pytest.fail("; ".join(lines))

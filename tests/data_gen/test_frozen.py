@@ -127,6 +127,7 @@ def test_scenes_that_come_meanwhile_change_no_bit(renderer, recordings, caplog):
         assert np.array_equal(alone[name], among[name], equal_nan=True), name
 
 
+@pytest.mark.recorded_anew
 def test_what_cannot_be_recorded_says_so_once(renderer, recordings, caplog, monkeypatch):
     import drjit as dr
 
