@@ -7,7 +7,7 @@ import pytest
 from full_stack import full_stack
 
 import ngpt
-from ngpt.denoisers import caustic, oidn
+from ngpt.denoisers import caustic, diffusion, oidn
 from ngpt.io.exr import read, read_exr, write
 from ngpt.io.resolution import resolve
 from ngpt.layers import FEATURE_NOISE
@@ -242,6 +242,41 @@ def test_any_size_and_brightness(size, scale):
     image = caustic.denoised(repair(stack))
     assert np.isfinite(image).all()
     assert image.sum(dtype=np.float64) == pytest.approx(light.sum(dtype=np.float64), rel=1e-4)
+
+
+def exchanged(light, variance, surfaces, distance, floor):
+    """By the formula, pixel by pixel, in double precision."""
+    height, width = variance.shape
+    change, kept, taken = np.zeros_like(light), np.ones_like(variance), np.zeros_like(variance)
+    for y, x, down, right in np.ndindex(height, width, 3, 3):
+        there = y + distance * (down - 1), x + distance * (right - 1)
+        if (down, right) == (1, 1) or not (0 <= there[0] < height and 0 <= there[1] < width):
+            continue
+        step = light[:, *there] - light[:, y, x]
+        noise = variance[y, x] + variance[there]
+        apart = max(np.mean(step**2) - noise, 0) / (diffusion.SIGNIFICANT**2 * noise + floor)
+        apart += np.sum((surfaces[:, *there] - surfaces[:, y, x]) ** 2)
+        share = (1 / 8 if 1 in (down, right) else 1 / 16) * np.exp(-apart)
+        change[:, y, x] += share * step
+        kept[y, x] -= share
+        taken[y, x] += share**2 * variance[there]
+    return light + change, kept**2 * variance + taken
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (37, 2), (9, 13)])
+@pytest.mark.parametrize("count", [0, 1, 4])
+@pytest.mark.parametrize("pixels", [10, 1 << 20])
+def test_the_diffusion_is_the_formula(monkeypatch, rng, size, count, pixels):
+    """Whatever number of pixels is worked on at a time, with surfaces or without."""
+    monkeypatch.setattr(diffusion, "_PIXELS", pixels)
+    light = rng.gamma(0.3, 1, (3, *size)).astype(np.float32)
+    variance = rng.gamma(0.3, 0.1, size).astype(np.float32)
+    surfaces = 0.4 * rng.normal(size=(count, *size)).astype(np.float32)
+    expected = [np.float64(layer) for layer in (light, variance)]
+    floor = 1e-12 * np.mean(light**2)
+    for distance in diffusion.DISTANCES:
+        expected = exchanged(*expected, surfaces, distance, floor)
+    assert np.abs(diffusion.diffused(light, variance, surfaces) - expected[0]).max() < 1e-5 * expected[0].max()
 
 
 @pytest.mark.parametrize("size", [(1, 1), (2, 3), (7, 6), (8, 10)])
