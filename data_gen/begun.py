@@ -217,9 +217,17 @@ def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> Gra
     try:
         return joined(begun, rest)
     except NgptError as error:
-        other = path.with_name(f"{path.stem}.rest.exr")
-        save(other, lambda path, overwrite: write(path, rest, overwrite=overwrite))
-        raise NgptError(f"{error}; what was rendered now is in {other}") from error
+        raise kept_apart(error, rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
+
+
+def kept_apart(error: BaseException, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
+    """Writes a stack that something failed with to ``path``, or elsewhere; returns the error that says both."""
+    text = str(error) or "out of memory"
+    try:
+        save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite))
+    except NgptError as other:
+        return NgptError(f"{text}; {other}")
+    return NgptError(f"{text}; what {what} is in {path}")
 
 
 def write_part(path: Path, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None) -> GradientStack:

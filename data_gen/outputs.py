@@ -10,16 +10,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from data_gen.begun import Asked, joined_or_kept, write_part
+from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.cli.picture import check_image
 from ngpt.errors import NgptError, WrongUse
-from ngpt.io.exr import write
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
 from ngpt.stack import GradientStack
-from ngpt.system.files import save
+from ngpt.system.text import by_names
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,9 @@ class Denoising:
         except (NgptError, MemoryError) as error:
             if keeps:
                 raise
-            other = file.with_name(f"{file.stem}.stack.exr")
-            save(other, lambda path, overwrite: write(path, stack, overwrite=overwrite))
-            raise NgptError(f"{error or 'out of memory'}; what was rendered is in {other}") from error
+            # What stands for standard output goes when the command ends.
+            lasting = file if by_names(str(file)) == str(file) else Path(file.name)
+            raise kept_apart(error, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
         frame = Frame(Path(stack.path), file, stack, result)
         write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
         return result.attributes
@@ -90,6 +89,8 @@ class Output:
                 raise WrongUse(
                     f"{path}: stacks are OpenEXR; let the name end in .exr, or for an image in .png .jpg .webp"
                 )
+        if self.kept is not None and self.kept.resolve() == self.file.resolve():
+            raise WrongUse(f"--keep {self.kept}: is the file of the image; give another name, or leave --keep out")
 
     def check_skipping(self) -> None:
         """Raises WrongUse where nothing could tell what is there of a render."""
@@ -103,7 +104,9 @@ class Output:
         if not asked.done(self.stack):
             return False
         if self.kept is not None:
-            return finished(self.file) if self.file.suffix.lower() == ".exr" else self.file.exists()
+            there = finished(self.file) if self.file.suffix.lower() == ".exr" else self.file.exists()
+            # A stack that has grown since then has another image.
+            return there and self.file.stat().st_mtime_ns >= self.kept.stat().st_mtime_ns
         if self.denoising is not None and "ngpt:method" not in read_header(self.file)[0]:
             raise NgptError(
                 f"{self.file}: has all samples, and no image: it is a stack; `ngpt denoise` makes one of it, or give "

@@ -89,7 +89,8 @@ def repair(stack: GradientStack, gradients: bool = True) -> Repaired:
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
     known = good & ~direct.any(axis=-1) if direct.any() else good
     noise = _where(known, variance_of_primal(stack, gradients)) if "primal_var" in stack else None
-    apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": stack.number(FEATURE_NOISE)}
+    said = stack.number(FEATURE_NOISE)
+    apart: dict[str, Any] = {"parts": _parts(stack, good), "feature_noise": said if said is None or said >= 0 else None}
     if caustic is not None and gradients:
         variance = _where(good, stack["caustic_var"]) if "caustic_var" in stack else None
         apart |= {"caustic": caustic, "caustic_var": variance}

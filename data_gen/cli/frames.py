@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 from data_gen.frames.pattern import filled, varies
+from ngpt.cli.picture import IMAGES
 from ngpt.errors import WrongUse
 from ngpt.system.files import make_folder
 
@@ -52,9 +53,9 @@ def targets(output: str | None, scene: str, numbers: list[int]) -> dict[int, Pat
     pattern = output if output is not None else f"{stem}.{{frame:04d}}.exr"
     if not varies(pattern):
         folder = Path(pattern)
-        if folder.suffix.lower() == ".exr" and not folder.is_dir():
+        if folder.suffix.lower() in IMAGES and not folder.is_dir():
             if len(numbers) > 1:
-                named = f"{folder.with_suffix('')}.{{frame:04d}}.exr"
+                named = f"{folder.with_suffix('')}.{{frame:04d}}{folder.suffix}"
                 raise WrongUse(f"{folder}: is one file for {len(numbers)} frames; write -o '{named}', or a folder")
             return {numbers[0]: folder}
         pattern = str(make_folder(folder) / f"{stem}.{{frame:04d}}.exr")

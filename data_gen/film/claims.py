@@ -86,6 +86,8 @@ def box_means(image: np.ndarray, size: int) -> np.ndarray:
 
     To the bit; but SciPy takes longer to import than the rest of a small render takes for all of its variances.
     """
+    if not image.size:  # the differences within a single row or column of pixels
+        return image
     before = size // 2
     for axis in (0, 1):
         lines = np.moveaxis(image, axis, 0).astype(np.float64)

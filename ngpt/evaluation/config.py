@@ -129,6 +129,8 @@ class Config:
                 if not isinstance(listed, list) or not all(isinstance(item, str) for item in listed):
                     raise NgptError(f"evaluation: {entry}.{name} = {listed!r}: must be a list of {what}' names")
         for name, listed in self.against.items():
+            if not listed:
+                raise NgptError(f"evaluation: against.{name} is empty: name its columns, or leave it out")
             if unknown := [item for item in listed if item not in columns]:
                 raise NgptError(
                     f"evaluation: against.{name}: there is no column '{unknown[0]}' among: {', '.join(columns)}"
@@ -228,15 +230,16 @@ def read_config(path: str | Path) -> Config:
     return from_table(Config, values, str(path))
 
 
-def _with_base(path: Path) -> dict[str, Any]:
-    """The entries of a file, and those of its base."""
+def _with_base(path: Path, above: tuple[Path, ...] = ()) -> dict[str, Any]:
+    """The entries of a file, and those of its base; ``above`` are the files whose base it is."""
     values = read_toml(path)
     base = values.pop("base", None)
     if base is None:
         return values
-    if not isinstance(base, str) or (path.parent / base).resolve() == path.resolve():
-        raise NgptError(f"{path}: base = {base!r}: must be the name of another file")
-    return _merged(_with_base(path.parent / base), values)
+    above = (*above, path.resolve())
+    if not isinstance(base, str) or (path.parent / base).resolve() in above:
+        raise NgptError(f"{path}: base = {base!r}: must be the name of another file, which is not built on this one")
+    return _merged(_with_base(path.parent / base, above), values)
 
 
 def _merged(base: dict[str, Any], values: dict[str, Any]) -> dict[str, Any]:

@@ -112,16 +112,18 @@ def _mean(rows: list[dict[str, Any]]) -> dict[str, Any]:
 def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tuple[float, float]]:
     """What to draw of a rival: (seconds, error) from its quickest to its slowest cell, geometric means over the scenes.
 
-    Each point is at the same share of the way between these two in each scene, on a logarithmic axis.
+    Each point is at the same share of the way between these two in each scene, on a logarithmic axis. Nothing is drawn
+    of a rival that was not measured on all of them.
     """
     parts = []
     for scene in scenes:
         here = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
         settings = _curves(results, here, rival).get(results["primary"], {})
         times = [math.log(seconds) for points in settings.values() for seconds, _ in points]
-        if times:
-            at = [math.exp(min(times) + i / (_STEPS - 1) * (max(times) - min(times))) for i in range(_STEPS)]
-            parts.append([(seconds, _least(seconds, settings)) for seconds in at])
+        if not times:  # a mean over the others would be one over other scenes than all else that is drawn
+            return []
+        at = [math.exp(min(times) + i / (_STEPS - 1) * (max(times) - min(times))) for i in range(_STEPS)]
+        parts.append([(seconds, _least(seconds, settings)) for seconds in at])
     if not parts or any(least is None for part in parts for _, least in part):
         return []
     return [

@@ -10,6 +10,7 @@ import pytest
 import ngpt
 from data_gen import begun
 from ngpt.cli import main
+from ngpt.errors import NgptError
 from ngpt.io.exr import read_exr
 from ngpt.methods import METHODS
 from ngpt.system.interrupts import Interrupt
@@ -134,6 +135,8 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, tmp_path, capsys,
         (["-o", "a.png", "--keep", "there.exr"], "there.exr: exists already; pass --force"),
         (["-o", "a.png", "--keep", "b.png"], "b.png: stacks are OpenEXR"),
         (["-o", "a.exr", "--keep", "b.exr"], "the output is the stack; add --denoise"),
+        (["-o", "a.exr", "--denoise", "--keep", "./a.exr"], "--keep a.exr: is the file of the image"),
+        (["-o", "a.png", "--frames", "0:2"], "is one file for 2 frames; write -o 'a.{frame:04d}.png'"),
         (["-o", "a.png", "--skip-existing"], "keep the stack too: --keep FILE.exr"),
         (["-o", "{frame}.png", "--frames", "0:2", "--skip-existing"], "keep the stack too"),
         (["-o", "{frame}.png", "--frames", "0:2", "--keep", "b.exr"], "--keep is for single images"),
@@ -175,7 +178,6 @@ def test_a_sampler_that_a_pilot_takes_is_judged_before_its_render(renderer, tmp_
 
 def test_a_method_that_fails_loses_no_sample(renderer, tmp_path, monkeypatch, capsys):
     from data_gen import outputs
-    from ngpt.errors import NgptError
 
     def fails(stack, method):
         raise NgptError("no luck")
@@ -187,6 +189,44 @@ def test_a_method_that_fails_loses_no_sample(renderer, tmp_path, monkeypatch, ca
     assert ngpt.read(tmp_path / "it.stack.exr").attributes["ngpt:spp"] == 4 and not (tmp_path / "it.png").exists()
     assert main([*words, "--keep", str(tmp_path / "kept.exr")]) == 1
     assert "what was rendered" not in capsys.readouterr().err and (tmp_path / "kept.exr").exists()
+
+
+@pytest.mark.parametrize("error", [NgptError("no luck"), MemoryError()])
+def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_name(
+    renderer, tmp_path, monkeypatch, capsys, error
+):
+    from data_gen import outputs
+
+    def fails(stack, method):
+        raise error
+
+    monkeypatch.setattr(outputs, "reconstruct", fails)
+    monkeypatch.chdir(tmp_path)
+    words = ["render", "diffuse", *SIZE, "--spp", "4", "--denoise", "-o"]
+    why = str(error) or "out of memory"
+    assert main([*words, "-"]) == 1
+    assert f"{why}; what was rendered is in standard-output.stack.exr" in capsys.readouterr().err
+    assert ngpt.read("standard-output.stack.exr").attributes["ngpt:spp"] == 4
+    (tmp_path / "it.stack.exr").write_text("precious")
+    assert main([*words, "it.exr"]) == 1
+    printed = capsys.readouterr().err
+    assert f"error: {why}; it.stack.exr: exists already" in printed and "is kept in it.stack.kept.exr" in printed
+    assert (tmp_path / "it.stack.exr").read_text() == "precious"
+    assert ngpt.read("it.stack.kept.exr").attributes["ngpt:spp"] == 4
+
+
+def test_a_picture_that_is_older_than_its_stack_is_made_anew(renderer, tmp_path, capsys):
+    """The stack may have grown by itself, or the process may have ended between both."""
+    words = ["render", "diffuse", *SIZE[:-1], "--skip-existing", "-o"]
+    stack, picture = str(tmp_path / "stack.exr"), tmp_path / "it.png"
+    both = [*words, str(picture), "--keep", stack, "--denoise", "l1"]
+    assert main([*both, "--spp", "2"]) == 0
+    before = picture.read_bytes()
+    assert main([*words, stack, "--spp", "8"]) == 0
+    capsys.readouterr()
+    assert main([*both, "--spp", "8"]) == 0 and "the stack was there" in capsys.readouterr().err
+    assert picture.read_bytes() != before
+    assert main([*both, "--spp", "8"]) == 0 and "the image is there" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("name", ["it.png", "it.exr"])

@@ -195,7 +195,20 @@ def test_claims_of_independent_samples_stay(renderer, rng):
     assert np.allclose(claimed[1].mean(), 1 / 32, rtol=0.02)
 
 
-@pytest.mark.parametrize("shape", [(36, 64), (5, 4), (1, 7), (1, 1)])
+def test_images_of_one_row_or_column_have_no_differences_in_them(renderer, rng):
+    from data_gen.film.gradient_film import GradientFilm
+
+    for width, height in ((1, 1), (2, 1), (1, 2)):
+        film = GradientFilm(width, height, net=2)
+        for _ in range(2):
+            for name in ("primal", "dx+", "dx-", "dy+", "dy-"):
+                film.put(name, renderer.Color3f(*rng.random((3, width * height), np.float32)))
+            film.end_pass(1)
+        layers = film.develop()
+        assert np.isfinite(layers["dx_var"]).all() and layers["dx"].shape == (height, width, 3)
+
+
+@pytest.mark.parametrize("shape", [(36, 64), (5, 4), (1, 7), (1, 1), (0, 7), (1, 0)])
 @pytest.mark.parametrize("kind", [np.float32, np.float64])
 def test_box_means_are_those_of_scipy_to_the_bit(renderer, rng, shape, kind):
     from scipy.ndimage import uniform_filter

@@ -63,8 +63,11 @@ def test_targets_are_patterns_and_folders(tmp_path):
         targets(str(tmp_path / "a.exr"), "box", [1, 2])
     with pytest.raises(NgptError, match="would be frame 1 and frame 2"):
         targets("{frame // 9}.exr", "box", [1, 2])
-    with pytest.raises(NgptError, match="let the name end"):
-        targets("{frame}.png", "box", [1])
+    assert targets(str(tmp_path / "{frame}.png"), "box", [1]) == {1: tmp_path / "1.png"}
+    assert targets(str(tmp_path / "a.PNG"), "box", [1]) == {1: tmp_path / "a.PNG"}
+    with pytest.raises(NgptError, match=r"one file for 2 frames; write -o '.*a\.\{frame:04d\}\.PNG'"):
+        targets(str(tmp_path / "a.PNG"), "box", [1, 2])
+    assert not (tmp_path / "a.PNG").exists()
 
 
 def test_what_belongs_to_shots_is_refused_without(tmp_path, capsys):

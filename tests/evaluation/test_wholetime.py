@@ -117,6 +117,9 @@ def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():
     best = [min(q, 8 / t) if t >= 16 else q for q, (t, _) in zip(quick, points, strict=True)]
     assert [error for _, error in points] == pytest.approx(best)
     assert envelope(made({"ours": [(4, 0.7, 0.9)]}), "oidn", ["a"]) == []
+    # A mean over one scene is no rival of means over two.
+    results["summary"] = [row for row in results["summary"] if row["scene"] == "a" or row["method"] == "ours"]
+    assert envelope(results, "oidn", ["a", "b"]) == [] != envelope(results, "oidn", ["a"])
 
 
 CONFIG = """
@@ -181,6 +184,8 @@ def test_processor_seconds_of_a_reconstruction_are_those_of_all_threads(tmp_path
 def test_a_rival_that_is_no_column_is_refused(tmp_path):
     with pytest.raises(NgptError, match=r"against\.oidn: there is no column 'oidm' among: primal, l1, wcv"):
         read('scenes = ["diffuse"]\n[against]\noidn = ["oidm"]\n', tmp_path)
+    with pytest.raises(NgptError, match=r"against\.oidn is empty"):
+        read('scenes = ["diffuse"]\n[against]\noidn = []\n', tmp_path)
     with pytest.raises(NgptError, match=r"against\.oidn = 'oidn': must be a list of columns' names"):
         read('scenes = ["diffuse"]\n[against]\noidn = "oidn"\n', tmp_path)
 
@@ -196,6 +201,9 @@ def test_a_configuration_may_build_on_another(tmp_path):
         read('base = "none.toml"\n', tmp_path)
     with pytest.raises(NgptError, match=r"config\.toml: base = 'config\.toml': must be the name of another file"):
         read('base = "config.toml"\n', tmp_path)
+    (tmp_path / "main.toml").write_text('base = "config.toml"\n')
+    with pytest.raises(NgptError, match=r"main\.toml: base = 'config\.toml': .* which is not built on this one"):
+        read('base = "main.toml"\n', tmp_path)
 
 
 def test_the_main_configurations_differ_in_size_alone():

@@ -85,7 +85,7 @@ def test_training_never_reads_estimates():
 
 
 @pytest.mark.skipif(bool(oidn.missing()), reason=oidn.missing())
-@pytest.mark.parametrize("noise", [None, 0.0, 1.0])
+@pytest.mark.parametrize("noise", [None, 0.0, 1.0, -1.0, "0"])
 @pytest.mark.parametrize("absent", [(), VARIANCES])
 def test_features_are_filtered_once_for_a_frame_if_they_are_noisy(absent, noise, monkeypatch):
     calls = []
