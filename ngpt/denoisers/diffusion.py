@@ -22,7 +22,7 @@ _NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
 _PIXELS = 16384
 # What gaps hold for a surface.
-_FAR = np.finfo(np.float32).max
+_FAR = float(np.finfo(np.float32).max)
 # The largest negative logarithm of a share, and the share beside it.
 _SMALLEST = np.float32(20)
 _LEAST = np.exp(np.full(1, -_SMALLEST))
@@ -48,8 +48,9 @@ def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> n
             shares[1 - down, 1 - right, : layout.offset(down, right, distance)] = 0
 
         def share(first: int, distance: int = distance, around: list = around) -> None:
-            part = [layer[..., first : first + _PIXELS] for layer in around]
-            for (down, right, _), found in zip(_NEIGHBOURS, _shares(*part, floor), strict=True):
+            light, variance, surface = (layer[..., first : first + _PIXELS] for layer in around)
+            found_shares = _shares(light, variance, surface, floor)
+            for (down, right, _), found in zip(_NEIGHBOURS, found_shares, strict=True):
                 other = first + layout.offset(down, right, distance)
                 shares[1 + down, 1 + right, first : first + len(found)] = found
                 shares[1 - down, 1 - right, other : other + len(found)] = found
