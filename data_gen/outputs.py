@@ -25,7 +25,7 @@ from ngpt.system.text import by_names
 class Denoising:
     """``method`` is a name, or "auto": the one that a pilot has chosen (``ngpt:for``), else the best for the layers.
 
-    ``transform`` and ``exposure`` are those of a picture, as of `ngpt denoise`.
+    ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
     """
 
     method: str = "auto"
@@ -96,7 +96,7 @@ class Output:
         """Raises WrongUse where nothing could tell what is there of a render."""
         if self.stack.suffix.lower() != ".exr":
             raise WrongUse(
-                f"{self.file}: --skip-existing knows whole files of OpenEXR alone; keep the stack too: --keep FILE.exr"
+                f"{self.file}: --skip-existing checks only OpenEXR files; keep the stack too: --keep FILE.exr"
             )
 
     def done(self, asked: Asked) -> bool:

@@ -127,7 +127,7 @@ def check_picture(target: Path, args: argparse.Namespace) -> None:
         if given:
             raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:
-        raise WrongUse(f"--skip-existing knows whole files of OpenEXR alone; leave it out for {target}")
+        raise WrongUse(f"--skip-existing checks only OpenEXR files; leave it out for {target}")
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:

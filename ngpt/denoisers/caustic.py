@@ -27,7 +27,8 @@ DISTANCES = (1, 2, 4, 8, 16, 32, 1, 2)
 SIGNIFICANT = 3.0
 # The neighbours of one half plane at distance 1, and their weights in the binomial filter of 3x3 pixels.
 _NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
-# How many times brighter OIDN's image becomes at most, to hold the light that there was.
+# OIDN's image becomes brighter by less than this factor, to hold the light that there was. Where it would take more,
+# OIDN has taken nearly all of the light for outliers, and nothing is given back.
 MOST = 4.0
 _FARTHEST = 1e-6  # depths below this share of the largest one are alike
 
