@@ -12,11 +12,12 @@ from typing import Any
 
 from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-from ngpt.cli.picture import check_image
+from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
+from ngpt.report.pictures import check_size
 from ngpt.stack import GradientStack
 from ngpt.system.text import by_names
 
@@ -55,6 +56,8 @@ class Denoising:
 
         name = stack.attributes.get("ngpt:for", "auto") if self.method == "auto" else self.method
         try:
+            pixels = seen(stack.place)
+            check_size(file, pixels.width, pixels.height)
             result = reconstruct(stack, str(name))
         except (NgptError, MemoryError) as error:
             if keeps:
@@ -83,7 +86,7 @@ class Output:
     def check(self) -> None:
         """Raises WrongUse for files that cannot be such."""
         if self.denoising is not None:
-            check_image(self.file)
+            check_image(self.file, self.denoising.transform)
         for path in (self.kept, None if self.denoising else self.file):
             if path is not None and path.suffix.lower() != ".exr":
                 raise WrongUse(

@@ -13,6 +13,7 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_exr
 from ngpt.methods import METHODS
+from ngpt.report import pictures, transforms
 from ngpt.system.interrupts import Interrupt
 
 SIZE = ["--size", "16x12", "--sampler", "gpt", "-q"]
@@ -129,6 +130,7 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, tmp_path, capsys,
         ),
         (["-o", "a.png", "--denoise", "ngpt-primal", "--spp", "1"], "needs variances"),
         (["-o", "a.png", "--denoise", "nlm"], "method 'nlm' cannot be used: none here; name another"),
+        (["-o", "a.png", "--transform", "aces"], "--transform aces needs OpenColorIO"),
         (["-o", "a.tga"], "stacks are OpenEXR; let the name end in .exr, or for an image in .png"),
         (["-o", "a.tga", "--denoise"], "results are OpenEXR, PFM or pictures"),
         (["-o", "there.png"], "there.png: exists already; pass --force"),
@@ -154,6 +156,8 @@ def test_what_would_fail_afterwards_is_refused_before(renderer, tmp_path, monkey
     monkeypatch.setattr(render, "render_stack", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setattr(shot, "render_shot", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setitem(METHODS, "nlm", replace(METHODS["nlm"], missing=lambda: "none here"))
+    monkeypatch.setattr(transforms, "find_spec", lambda name: None)
+    transforms._aces.cache_clear()
     monkeypatch.chdir(tmp_path)
     for name in ("there.png", "there.exr"):
         (tmp_path / name).write_text("precious")
@@ -213,6 +217,14 @@ def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_n
     assert f"error: {why}; it.stack.exr: exists already" in printed and "is kept in it.stack.kept.exr" in printed
     assert (tmp_path / "it.stack.exr").read_text() == "precious"
     assert ngpt.read("it.stack.kept.exr").attributes["ngpt:spp"] == 4
+
+
+def test_a_render_too_wide_for_its_picture_is_kept(renderer, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(pictures._LONGEST, ".png", 15)
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", "diffuse", *SIZE, "--spp", "2", "-o", "it.png"]) == 1
+    assert "16x12 pixels are too many for .png" in (said := capsys.readouterr().err) and said.count("\n") == 1
+    assert ngpt.read("it.stack.exr").attributes["ngpt:spp"] == 2 and not (tmp_path / "it.png").exists()
 
 
 def test_a_picture_that_is_older_than_its_stack_is_made_anew(renderer, tmp_path, capsys):
