@@ -59,12 +59,17 @@ class Denoising:
             pixels = seen(stack.place)
             check_size(file, pixels.width, pixels.height)
             result = reconstruct(stack, str(name))
-        except (NgptError, MemoryError) as error:
+        except (
+            Exception
+        ) as error:  # methods may come from other packages, and an hour of rendering is not theirs to lose
             if keeps:
                 raise
+            why = str(error)
+            if not isinstance(error, NgptError):
+                why = f"method '{name}' failed: {type(error).__name__}: {error}".rstrip(": ")
             # What stands for standard output goes when the command ends.
             lasting = file if by_names(str(file)) == str(file) else Path(file.name)
-            raise kept_apart(error, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
+            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
         frame = Frame(Path(stack.path), file, stack, result)
         write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
         return result.attributes

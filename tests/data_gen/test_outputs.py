@@ -195,7 +195,7 @@ def test_a_method_that_fails_loses_no_sample(renderer, tmp_path, monkeypatch, ca
     assert "what was rendered" not in capsys.readouterr().err and (tmp_path / "kept.exr").exists()
 
 
-@pytest.mark.parametrize("error", [NgptError("no luck"), MemoryError()])
+@pytest.mark.parametrize("error", [NgptError("no luck"), MemoryError(), ValueError("shapes")])
 def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_name(
     renderer, tmp_path, monkeypatch, capsys, error
 ):
@@ -207,7 +207,9 @@ def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_n
     monkeypatch.setattr(outputs, "reconstruct", fails)
     monkeypatch.chdir(tmp_path)
     words = ["render", "diffuse", *SIZE, "--spp", "4", "--denoise", "-o"]
-    why = str(error) or "out of memory"
+    why = "no luck"
+    if not isinstance(error, NgptError):
+        why = f"method 'auto' failed: {type(error).__name__}" + (f": {error}" if str(error) else "")
     assert main([*words, "-"]) == 1
     assert f"{why}; what was rendered is in standard-output.stack.exr" in capsys.readouterr().err
     assert ngpt.read("standard-output.stack.exr").attributes["ngpt:spp"] == 4
