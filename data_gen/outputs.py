@@ -59,9 +59,7 @@ class Denoising:
             pixels = seen(stack.place)
             check_size(file, pixels.width, pixels.height)
             result = reconstruct(stack, str(name))
-        except (
-            Exception
-        ) as error:  # methods may come from other packages, and an hour of rendering is not theirs to lose
+        except Exception as error:  # methods may come from other packages, and fail in any way
             if keeps:
                 raise
             why = str(error)
