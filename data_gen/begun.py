@@ -217,17 +217,16 @@ def joined_or_kept(path: Path, rest: GradientStack, begun: GradientStack) -> Gra
     try:
         return joined(begun, rest)
     except NgptError as error:
-        raise kept_apart(error, rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
+        raise kept_apart(str(error), rest, path.with_name(f"{path.stem}.rest.exr"), "was rendered now") from error
 
 
-def kept_apart(error: BaseException, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
-    """Writes a stack that something failed with to ``path``, or elsewhere; returns the error that says both."""
-    text = str(error) or "out of memory"
+def kept_apart(why: str, stack: GradientStack, path: Path, what: str = "was rendered") -> NgptError:
+    """Writes a stack to ``path``, or elsewhere, after a failure; returns the error that says why, and where it is."""
     try:
         save(path, lambda path, overwrite: write(path, stack, overwrite=overwrite))
     except NgptError as other:
-        return NgptError(f"{text}; {other}")
-    return NgptError(f"{text}; what {what} is in {path}")
+        return NgptError(f"{why}; {other}")
+    return NgptError(f"{why}; what {what} is in {path}")
 
 
 def write_part(path: Path, stack: GradientStack, overwrite: bool, begun: GradientStack | None = None) -> GradientStack:

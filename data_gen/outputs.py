@@ -12,11 +12,12 @@ from typing import Any
 
 from data_gen.begun import Asked, joined_or_kept, kept_apart, write_part
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
-from ngpt.cli.picture import check_image
+from ngpt.cli.picture import check_image, seen
 from ngpt.errors import NgptError, WrongUse
 from ngpt.io.openexr import read_header
 from ngpt.io.whole import finished
 from ngpt.methods import reconstruct, runnable
+from ngpt.report.pictures import check_size
 from ngpt.stack import GradientStack
 from ngpt.system.text import by_names
 
@@ -25,7 +26,7 @@ from ngpt.system.text import by_names
 class Denoising:
     """``method`` is a name, or "auto": the one that a pilot has chosen (``ngpt:for``), else the best for the layers.
 
-    ``transform`` and ``exposure`` are those of a picture, as of `ngpt denoise`.
+    ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
     """
 
     method: str = "auto"
@@ -55,13 +56,18 @@ class Denoising:
 
         name = stack.attributes.get("ngpt:for", "auto") if self.method == "auto" else self.method
         try:
+            pixels = seen(stack.place)
+            check_size(file, pixels.width, pixels.height)
             result = reconstruct(stack, str(name))
-        except (NgptError, MemoryError) as error:
+        except Exception as error:  # methods may come from other packages, and fail in any way
             if keeps:
                 raise
+            why = str(error)
+            if not isinstance(error, NgptError):
+                why = f"method '{name}' failed: {type(error).__name__}: {error}".rstrip(": ")
             # What stands for standard output goes when the command ends.
             lasting = file if by_names(str(file)) == str(file) else Path(file.name)
-            raise kept_apart(error, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
+            raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error
         frame = Frame(Path(stack.path), file, stack, result)
         write_frame(frame, overwrite, self.transform, self.exposure, keep=True)
         return result.attributes
@@ -83,7 +89,7 @@ class Output:
     def check(self) -> None:
         """Raises WrongUse for files that cannot be such."""
         if self.denoising is not None:
-            check_image(self.file)
+            check_image(self.file, self.denoising.transform)
         for path in (self.kept, None if self.denoising else self.file):
             if path is not None and path.suffix.lower() != ".exr":
                 raise WrongUse(
@@ -96,7 +102,7 @@ class Output:
         """Raises WrongUse where nothing could tell what is there of a render."""
         if self.stack.suffix.lower() != ".exr":
             raise WrongUse(
-                f"{self.file}: --skip-existing knows whole files of OpenEXR alone; keep the stack too: --keep FILE.exr"
+                f"{self.file}: --skip-existing checks only OpenEXR files; keep the stack too: --keep FILE.exr"
             )
 
     def done(self, asked: Asked) -> bool:

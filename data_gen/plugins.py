@@ -85,9 +85,10 @@ def _construct(entry: Any, props: Any) -> Any:
 
 
 def make_classes() -> None:
-    """Has samplers be those of the current variant, to which Mitsuba's classes belong, and so those derived from them.
+    """Has samplers derive from the classes of the current variant: Mitsuba has classes of their own for each.
 
-    Their modules are imported when they are first used; here those that are there of another variant are made anew.
+    Their modules are imported when they are first used. Here modules that were imported for another variant are
+    reloaded.
     Raises NgptError for a variant that cannot vectorise.
     """
     global _made_for

@@ -154,7 +154,7 @@ def asked_of(
 def report_of(stack: GradientStack, file: Path, made: Mapping[str, Any]) -> dict[str, Any]:
     """What ``ngpt render --json`` says of a stack: its file, its size, and the attributes of ours, by short names.
 
-    ``made`` are those of its image, if any.
+    ``made`` are the attributes of its image, if any.
     """
     attributes = {**stack.attributes, **made}
     ours = {name.removeprefix("ngpt:"): value for name, value in attributes.items() if "ngpt:" in name}

@@ -54,7 +54,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="METHOD",
         help="what --adaptive or --error go by (default: what `auto` takes; with --adaptive and gradients, wcv). With "
         "--time alone: what a pilot chooses sampler and samples for, by the error it expects; with `auto` the method "
-        "too. --time is then that of pilot, render and method",
+        "too. --time then holds pilot, render and method",
     )
     parser.add_argument("--size", type=size, metavar="WxH", help="pixels of the film (default: the scene's own)")
     parser.add_argument("--sensor", metavar="NAME|N", help="by id, or by number from 0 (default: the first)")

@@ -29,11 +29,13 @@ def add_force(parser: argparse._ActionsContainer) -> None:
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
     """The path of a file to write, whose folder is made; raises NgptError where that cannot be, and for what exists.
 
-    ``args`` has ``force``, and ``skip_existing`` where the verb knows it.
+    ``args`` has ``force``, and ``skip_existing`` where the verb knows it, which is of use for OpenEXR.
     """
     skip = getattr(args, "skip_existing", None)
     make_folder(Path(path).parent)
-    return check_output(path, args.force or bool(skip), may_skip=skip is not None)
+    return check_output(
+        path, args.force or bool(skip), may_skip=skip is not None and Path(path).suffix.lower() == ".exr"
+    )
 
 
 def add_config(parser: argparse.ArgumentParser, kind: str, what: str) -> None:

@@ -14,10 +14,10 @@ from ngpt.io.framenames import named, number_of, varies
 from ngpt.io.frames import is_shot, remarks, shot_files
 from ngpt.report.display import auto_exposure
 from ngpt.report.pictures import PICTURES, SHOTS, check_kind, write_picture, write_shot
-from ngpt.report.transforms import TRANSFORMS, shown
+from ngpt.report.transforms import TRANSFORMS, check_transform, shown
 from ngpt.system.console import Console
 from ngpt.system.files import make_folder
-from ngpt.windows import Place, put
+from ngpt.windows import Place, Window, put
 
 # Kinds of files that hold results
 IMAGES = (".exr", ".pfm", *PICTURES)
@@ -107,27 +107,32 @@ def write_each(folder: Path, pictures, overwrite: bool) -> None:
 
 def in_picture(image: np.ndarray, place: Place) -> np.ndarray:
     """What the display window shows of an image (H, W, 3): all but overscan. An image beside it is shown whole."""
-    seen = place.data.common(place.display) or place.data
-    return image[seen.within(place.data)]
+    return image[seen(place).within(place.data)]
 
 
-def check_image(target: Path) -> None:
+def seen(place: Place) -> Window:
+    """The pixels that a picture has."""
+    return place.data.common(place.display) or place.data
+
+
+def check_image(target: Path, transform: str) -> None:
     """Raises an error for what cannot be the file of a result, or of one that this machine cannot make."""
     kind = target.suffix.lower()
     if kind not in IMAGES:
         raise WrongUse(f"{target}: results are OpenEXR, PFM or pictures; let the name end in {' '.join(IMAGES)}")
     if kind in PICTURES:
         check_kind(target, PICTURES)
+        check_transform(transform)
 
 
 def check_picture(target: Path, args: argparse.Namespace) -> None:
     """For ``ngpt denoise``: raises an error for what is no picture, and for options that no picture has room for."""
-    check_image(target)
+    check_image(target, args.transform)
     for option, given in (("--error", args.error), ("--groups", args.groups or args.group)):
         if given:
             raise WrongUse(f"{option} makes layers, and {target} can have none; let it end in .exr")
     if args.skip_existing:
-        raise WrongUse(f"--skip-existing knows whole files of OpenEXR alone; leave it out for {target}")
+        raise WrongUse(f"--skip-existing checks only OpenEXR files; leave it out for {target}")
 
 
 def add_look(parser: argparse.ArgumentParser) -> None:

@@ -22,7 +22,8 @@ from ngpt.denoisers.diffusion import diffused
 from ngpt.denoisers.oidn import oidn
 from ngpt.repair import Repaired
 
-# How many times brighter OIDN's image becomes at most, to hold the light that there was.
+# OIDN's image becomes brighter by less than this factor, to hold the light that there was. Where it would take more,
+# OIDN has taken nearly all of the light for outliers, and nothing is given back.
 MOST = 4.0
 _LOUDEST = np.float32(1e30)  # variances of light of at most 1 are less, or as good as that
 _FARTHEST = 1e-6  # depths below this share of the largest one are alike

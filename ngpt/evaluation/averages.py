@@ -27,7 +27,7 @@ def mean(values: Sequence[float], geometric: bool) -> float:
 
 
 def groups_of(results: dict[str, Any], scenes: Iterable[str]) -> dict[str, list[str]]:
-    """Those of the ``scenes`` that are in each group of the configuration, and if they are several "all"."""
+    """The ``scenes`` of each group of the configuration, and all of them as "all" if they are several."""
     found = list(dict.fromkeys(scenes))
     groups = {name: [s for s in found if s in listed] for name, listed in results["settings"]["groups"].items()}
     return groups | ({"all": found} if len(found) > 1 else {})

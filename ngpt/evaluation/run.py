@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -173,7 +172,7 @@ def _scene(
 
 def _seconds(render: float | None, reconstruct: dict[str, float], clock: str) -> dict[str, float | None]:
     """Of a cell by the ``clock``: to render, features, film and what recording takes included, to reconstruct, and the
-    whole; and those of the wall to reconstruct. Kernels are compiled and weights are read before."""
+    whole; and the wall seconds to reconstruct. Kernels are compiled and weights are read before."""
     total = None if render is None else render + reconstruct[clock]
     seconds = {"render": render, "reconstruct": reconstruct[clock], "total": total}
     return seconds | {"reconstruct wall": reconstruct["wall"]}
@@ -231,12 +230,3 @@ def picture_path(scene: str, spp: int, method: str, seed: int) -> str:
 def _absent(scene: str, spp: int, method: str, seed: int, why: str) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": scene, "spp": spp, "method": method, "seed": seed, "spp used": None}
     return row | {"seconds": None, "metrics": {}, "image": None, "absent": why}
-
-
-def _number(value: Any) -> float | None:
-    """A header attribute as a number that JSON knows."""
-    try:
-        number = float(value)
-    except (TypeError, ValueError):
-        return None
-    return number if math.isfinite(number) else None

@@ -5,11 +5,11 @@
     T'      the whole time after which a pipeline without gradients first has the error e, and m its samples then
     W / C   T' / T of the pipeline without gradients that is first: gradients pay above 1
     W       m / n, by how many times more samples that pipeline needs
-    C       the seconds of a further sample with gradients over those of one of that pipeline
+    C       the seconds of a further sample with gradients over the seconds of one of that pipeline
 
 W / C is more than W over C where a rival's reconstruction takes longer, and less where ours does. T' and m are read off
-curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has that of W / C). C is by the renders with
-the least and the most samples, so that what a render takes to begin is no part of it.
+curves of errors (``ngpt.evaluation.curves``, which explains the marks; W has the mark of W / C). C compares the renders
+with the least and the most samples, so that what a render takes to begin is no part of it.
 """
 
 from __future__ import annotations

@@ -22,6 +22,8 @@ from ngpt.system.install import package_command
 
 PICTURES = (".png", ".jpg", ".jpeg", ".webp")
 SHOTS = (".webp", ".mp4")
+# The longest side of a picture in pixels, where the format has a limit
+_LONGEST = {".jpg": 65500, ".jpeg": 65500, ".webp": 16383}
 _QUALITY = 95  # of JPEG; no colour is stored at half the size
 
 
@@ -36,9 +38,20 @@ def check_kind(path: Path, kinds: tuple[str, ...]) -> None:
         _ffmpeg(path)
 
 
+def check_size(path: Path, width: int, height: int) -> None:
+    """Raises NgptError for more pixels than the format has room for."""
+    most = _LONGEST.get(path.suffix.lower(), max(width, height))
+    if max(width, height) > most:
+        raise NgptError(
+            f"{path}: {width}x{height} pixels are too many for {path.suffix}, which has {most} a side at most; let the "
+            "name end in .png or .exr"
+        )
+
+
 def write_picture(path: Path, pixels: np.ndarray, overwrite: bool = False) -> None:
     """Writes (H, W, 3) uint8 of sRGB as PNG, JPEG or WebP (without loss), by the name's end."""
     check_kind(path, PICTURES)
+    check_size(path, pixels.shape[1], pixels.shape[0])
     with atomic_output(path, overwrite) as temporary:
         if path.suffix.lower() == ".png":
             temporary.write_bytes(encode_png(pixels))
@@ -55,6 +68,7 @@ def write_shot(path: Path, frames: Iterable[np.ndarray], fps: float, overwrite: 
     check_kind(path, SHOTS)
     one_size = _of_one_size(path, frames)
     first = next(one_size)
+    check_size(path, first.shape[1], first.shape[0])
     with atomic_output(path, overwrite) as temporary:
         if path.suffix.lower() == ".mp4":
             _write_mp4(path, temporary, chain([first], one_size), first.shape[1::-1], fps)

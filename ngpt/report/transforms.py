@@ -44,13 +44,24 @@ def aces(light: np.ndarray) -> np.ndarray:
     return image
 
 
+def check_transform(name: str) -> None:
+    """Raises NgptError for a transform that this machine cannot do."""
+    if name == "aces":
+        _aces()
+
+
 @lru_cache(maxsize=1)
 def _aces() -> Any:
     if find_spec("PyOpenColorIO") is None:
         raise NgptError(f"--transform aces needs OpenColorIO: {package_command('opencolorio>=2.3')}")
     import PyOpenColorIO as ocio
 
-    config = ocio.Config.CreateFromFile(_CONFIGURATION)
+    try:
+        config = ocio.Config.CreateFromFile(_CONFIGURATION)
+    except ocio.Exception as error:
+        raise NgptError(
+            f"--transform aces: OpenColorIO {ocio.__version__} has no ACES 1.3 in it; take 2.3 or newer"
+        ) from error
     view = ("Linear Rec.709 (sRGB)", "sRGB - Display", "ACES 1.0 - SDR Video", ocio.TRANSFORM_DIR_FORWARD)
     return config.getProcessor(*view).getDefaultCPUProcessor()
 

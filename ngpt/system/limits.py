@@ -23,7 +23,7 @@ _ASSUMED = 2**34
 
 
 def processors() -> int:
-    """Processors that this process may run on, at most ``limit_threads``; those of the machine where no system tells.
+    """Processors that this process may run on, at most ``limit_threads``; the machine's where the system does not say.
 
     So many threads work at once: NumPy's, SciPy's, ONNX Runtime's, OIDN's and OpenEXR's.
     """

@@ -13,6 +13,7 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.io.exr import read_exr
 from ngpt.methods import METHODS
+from ngpt.report import pictures, transforms
 from ngpt.system.interrupts import Interrupt
 
 SIZE = ["--size", "16x12", "--sampler", "gpt", "-q"]
@@ -129,9 +130,10 @@ def test_a_render_goes_on_and_its_image_is_made_anew(renderer, tmp_path, capsys,
         ),
         (["-o", "a.png", "--denoise", "ngpt-primal", "--spp", "1"], "needs variances"),
         (["-o", "a.png", "--denoise", "nlm"], "method 'nlm' cannot be used: none here; name another"),
+        (["-o", "a.png", "--transform", "aces"], "--transform aces needs OpenColorIO"),
         (["-o", "a.tga"], "stacks are OpenEXR; let the name end in .exr, or for an image in .png"),
         (["-o", "a.tga", "--denoise"], "results are OpenEXR, PFM or pictures"),
-        (["-o", "there.png"], "there.png: exists already; pass --force"),
+        (["-o", "there.png"], "there.png: exists already; pass --force (overwrite=True) to replace it\n"),
         (["-o", "a.png", "--keep", "there.exr"], "there.exr: exists already; pass --force"),
         (["-o", "a.png", "--keep", "b.png"], "b.png: stacks are OpenEXR"),
         (["-o", "a.exr", "--keep", "b.exr"], "the output is the stack; add --denoise"),
@@ -154,6 +156,8 @@ def test_what_would_fail_afterwards_is_refused_before(renderer, tmp_path, monkey
     monkeypatch.setattr(render, "render_stack", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setattr(shot, "render_shot", lambda *_, **__: pytest.fail("rendered"))
     monkeypatch.setitem(METHODS, "nlm", replace(METHODS["nlm"], missing=lambda: "none here"))
+    monkeypatch.setattr(transforms, "find_spec", lambda name: None)
+    transforms._aces.cache_clear()
     monkeypatch.chdir(tmp_path)
     for name in ("there.png", "there.exr"):
         (tmp_path / name).write_text("precious")
@@ -191,7 +195,7 @@ def test_a_method_that_fails_loses_no_sample(renderer, tmp_path, monkeypatch, ca
     assert "what was rendered" not in capsys.readouterr().err and (tmp_path / "kept.exr").exists()
 
 
-@pytest.mark.parametrize("error", [NgptError("no luck"), MemoryError()])
+@pytest.mark.parametrize("error", [NgptError("no luck"), MemoryError(), ValueError("shapes")])
 def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_name(
     renderer, tmp_path, monkeypatch, capsys, error
 ):
@@ -203,7 +207,9 @@ def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_n
     monkeypatch.setattr(outputs, "reconstruct", fails)
     monkeypatch.chdir(tmp_path)
     words = ["render", "diffuse", *SIZE, "--spp", "4", "--denoise", "-o"]
-    why = str(error) or "out of memory"
+    why = "no luck"
+    if not isinstance(error, NgptError):
+        why = f"method 'auto' failed: {type(error).__name__}" + (f": {error}" if str(error) else "")
     assert main([*words, "-"]) == 1
     assert f"{why}; what was rendered is in standard-output.stack.exr" in capsys.readouterr().err
     assert ngpt.read("standard-output.stack.exr").attributes["ngpt:spp"] == 4
@@ -213,6 +219,14 @@ def test_what_a_failed_method_leaves_outlives_standard_output_and_takes_a_free_n
     assert f"error: {why}; it.stack.exr: exists already" in printed and "is kept in it.stack.kept.exr" in printed
     assert (tmp_path / "it.stack.exr").read_text() == "precious"
     assert ngpt.read("it.stack.kept.exr").attributes["ngpt:spp"] == 4
+
+
+def test_a_render_too_wide_for_its_picture_is_kept(renderer, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(pictures._LONGEST, ".png", 15)
+    monkeypatch.chdir(tmp_path)
+    assert main(["render", "diffuse", *SIZE, "--spp", "2", "-o", "it.png"]) == 1
+    assert "16x12 pixels are too many for .png" in (said := capsys.readouterr().err) and said.count("\n") == 1
+    assert ngpt.read("it.stack.exr").attributes["ngpt:spp"] == 2 and not (tmp_path / "it.png").exists()
 
 
 def test_a_picture_that_is_older_than_its_stack_is_made_anew(renderer, tmp_path, capsys):

@@ -2,6 +2,7 @@
 
 import itertools
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -185,11 +186,15 @@ def test_a_busy_moment_moves_no_sampler_against_another(rng):
     assert by_processor(unknown) == unknown and by_processor({}) == {}
 
 
-def test_a_trial_measures_both_clocks(renderer):
-    from data_gen.choosing.trials import try_out
+def test_a_trial_measures_both_clocks_on_a_processor(renderer, monkeypatch):
+    from data_gen.choosing import trials
 
-    trial, _ = try_out(load(renderer, "diffuse", (16, 12)), "primal")
+    scene = load(renderer, "diffuse", (16, 12))
+    trial, _ = trials.try_out(scene, "primal")
     assert trial.seconds > 0 and trial.processor > 0
+    monkeypatch.setattr(trials, "mi", SimpleNamespace(variant=lambda: "cuda_ad_rgb"))
+    trial, _ = trials.try_out(scene, "primal")
+    assert trial.seconds > 0 and trial.processor == 0
 
 
 def test_all_that_follows_a_render_is_counted_at_its_size(renderer, monkeypatch):

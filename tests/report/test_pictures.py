@@ -13,7 +13,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.io.primaries import ACES_AP1, converted, to_rec709
 from ngpt.report import display
-from ngpt.report.pictures import write_shot
+from ngpt.report.pictures import write_picture, write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.stack import GradientStack
 
@@ -160,6 +160,14 @@ def test_an_mp4_of_a_shot(tmp_path):
     raw = subprocess.run(command, check=True, capture_output=True).stdout
     found = np.frombuffer(raw, np.uint8).reshape(3, 26, 34, 3)[:, :20, :30].mean(axis=(1, 2, 3))
     assert np.abs(found - levels).max() < 4
+
+
+@pytest.mark.parametrize(("kind", "most"), [("webp", 16383), ("jpg", 65500)])
+def test_a_picture_is_as_long_as_its_format_allows(tmp_path, kind, most):
+    pytest.importorskip("PIL")
+    write_picture(tmp_path / f"a.{kind}", np.zeros((1, most, 3), np.uint8))
+    with pytest.raises(NgptError, match=f"a.{kind}: {most + 1}x1 pixels are too many for .{kind}, which has {most} a"):
+        write_picture(tmp_path / f"b.{kind}", np.zeros((1, most + 1, 3), np.uint8))
 
 
 def test_what_cannot_be_made_is_refused_in_one_line(tmp_path, frames, image, capfd, monkeypatch):
