@@ -198,6 +198,15 @@ def test_by_oidn_the_light_stays():
         assert np.allclose(image, images[0], rtol=0.01, atol=0.01 * images[0].max())
 
 
+@pytest.mark.parametrize(("kept", "factor"), [(0.5, 2), (0.3, 1 / 0.3), (0.2, caustic.MOST), (0.01, caustic.MOST)])
+def test_what_oidn_takes_for_outliers_is_given_back_up_to_a_limit(monkeypatch, kept, factor):
+    """Without a step, which would flicker."""
+    monkeypatch.setattr(caustic, "oidn", lambda data, *settings: np.float32(kept) * data.image)
+    data = repair(with_caustic(full_stack(16, 20)))
+    whole = caustic.doubled(caustic.halved(data.caustic))
+    assert np.allclose(caustic.denoised(data, by_oidn=True), factor * kept * whole, rtol=1e-4, atol=1e-6)
+
+
 def test_denoising_keeps_the_light_and_spreads_it():
     stack = with_caustic(full_stack(*SIZE))
     data = repair(stack)

@@ -22,8 +22,8 @@ from ngpt.denoisers.diffusion import diffused
 from ngpt.denoisers.oidn import oidn
 from ngpt.repair import Repaired
 
-# OIDN's image becomes brighter by less than this factor, to hold the light that there was. Where it would take more,
-# OIDN has taken nearly all of the light for outliers, and nothing is given back.
+# OIDN's image becomes brighter by at most this factor, to hold the light that there was. A larger one would make
+# blotches of the little that OIDN has not taken for outliers.
 MOST = 4.0
 _LOUDEST = np.float32(1e30)  # variances of light of at most 1 are less, or as good as that
 _FARTHEST = 1e-6  # depths below this share of the largest one are alike
@@ -56,8 +56,8 @@ def _by_oidn(data: Repaired) -> np.ndarray:
     # OIDN may go below zero; there is no negative light.
     light = np.maximum(found, 0)
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)
-    if 0 < before < MOST * after:
-        light *= np.float32(before / after)
+    if before > 0 and after > 0:
+        light *= np.float32(min(before / after, MOST))
     height, width = data.caustic.shape[:2]
     return doubled(light)[:height, :width]
 

@@ -9,6 +9,7 @@
 
 #include <OpenImageDenoise/oidn.h>
 
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 
@@ -156,8 +157,8 @@ int main(int count, char **arguments) try {
         for (float &value : made.pixels) value = std::max(value, 0.0f);
         // What OIDN took for noise is given back.
         const double before = sum(given), after = sum(made);
-        if (before > 0 && before < 4 * after)
-            for (float &value : made.pixels) value *= float(before / after);
+        if (before > 0 && after > 0)
+            for (float &value : made.pixels) value *= float(std::min(before / after, 4.0));
         add(image, doubled(made, height, width));
     }
     write_pfm(arguments[3], image);
