@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Callable
 from datetime import UTC, datetime
 from pathlib import Path
@@ -87,8 +88,15 @@ def evaluate(
                 progress(done + n, total)
 
             try:
-                stacks = SceneStacks(name, source, config, cache, renderer, say=console.say)
-                _scene(stacks, columns, lacks, scorer, results, out, advance)
+                _scene(
+                    SceneStacks(name, source, config, cache, renderer, say=console.say),
+                    columns,
+                    lacks,
+                    scorer,
+                    results,
+                    out,
+                    advance,
+                )
             except NgptError as error:
                 console.error(f"{name}: {error}")
                 results["scenes"].setdefault(name, {"file": source})["absent"] = str(error)
@@ -99,6 +107,8 @@ def evaluate(
                 ]
             # After each scene, so that a long run can be looked at.
             write_results(results, out)
+            # Kernels cannot be recorded once while another scene is in the process, which takes seconds of each pass.
+            gc.collect()
         progress(total, total)
     return results
 
