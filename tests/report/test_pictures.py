@@ -166,7 +166,7 @@ def test_an_mp4_of_a_shot(tmp_path):
 def test_a_picture_is_as_long_as_its_format_allows(tmp_path, kind, most):
     pytest.importorskip("PIL")
     write_picture(tmp_path / f"a.{kind}", np.zeros((1, most, 3), np.uint8))
-    with pytest.raises(NgptError, match=f"a.{kind}: {most + 1}x1 pixels are too many for .{kind}, which has {most} a"):
+    with pytest.raises(NgptError, match=f"b.{kind}: {most + 1}x1 pixels are too many for .{kind}, which has {most} a"):
         write_picture(tmp_path / f"b.{kind}", np.zeros((1, most + 1, 3), np.uint8))
 
 
