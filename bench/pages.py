@@ -63,7 +63,7 @@ def picture(size: dict[str, Any], group: str) -> str:
 
 
 def kept(results: dict[str, Any]) -> dict[str, Any]:
-    """Of an evaluation what the tables need: medians over seeds, ratios at equal whole time, and worth over cost."""
+    """What the tables need of an evaluation: medians over seeds, ratios at equal whole time, and worth over cost."""
     facts = {name: results[name] for name in ("command", "date", "metadata")}
     settings = {name: results["settings"][name] for name in ("size", "spp", "groups", "against")}
     cells = [
@@ -118,6 +118,8 @@ class Size:
         self.scenes = list(dict.fromkeys(scene for scene, *_ in self.rows))
         found = {group for group, *_ in self.means}
         self.groups = [name for name in (*kept["groups"], "all") if name in found]
+        if "blind" in self.groups and self.members("blind") == self.scenes:
+            self.groups.remove("all")  # it would say the same once more
 
     def members(self, group: str) -> list[str]:
         return [scene for scene in self.scenes if group == "all" or scene in self.kept["groups"][group]]
@@ -190,7 +192,7 @@ def worth(sizes: list[Size], *only: str) -> str:
     lines = heading("W / C, geometric means", "C", *(f"{n} spp" for n in counts))
     for size in sizes:
         rows = {(row["group"], row["spp"]): row for row in size.kept["worth"]["means"] if row["method"] is None}
-        for group in dict.fromkeys(group for group, _ in rows):
+        for group in (group for group in dict.fromkeys(group for group, _ in rows) if group in size.groups):
             here = {n: rows.get((group, n)) for n in counts}
             first = next(row for row in here.values() if row)
             if not only or group in only:

@@ -29,7 +29,7 @@ from typing import Any
 from bench.common import metadata, save, summary
 
 WORKER = "--worker"
-# What is run, by method, of which of the stacks.
+# Row -> the method that runs, and the kind of stack that it runs on.
 ROWS = {
     "wcv": ("", "caustic"),
     "ngpt-fast": ("", "caustic"),

@@ -7,9 +7,9 @@
     one command    `ngpt render SCENE -o RESULT --denoise`, here
 
 Each runs once in a turn: first with an empty cache of kernels, "cold", then with that cache, "warm". A command is
-watched from within: the functions of ``STAGES`` are wrapped as their modules are imported, and a stage has the seconds
-of its functions without those of other stages in them. Seconds by the clock and of processors; the latter, all threads
-together, are what counts on a busy machine. The totals are those of the processes.
+watched from within: the functions of ``STAGES`` are wrapped as their modules are imported. A stage has the seconds of
+its functions; a stage that runs inside another is taken off the outer one. Seconds are by the clock and of processors.
+On a busy machine only processor seconds, of all threads together, mean anything. The totals are of whole processes.
 """
 
 import argparse
@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 WORKER = "--worker"
-# Stage -> functions, as "module:name". Those of BLOCKS are contexts, each of them a pass.
+# Stage -> functions, as "module:name". BLOCKS names a context manager; each use of it is a pass.
 STAGES = {
     "variant": ["data_gen.backend:use_variant"],
     "load scene": ["data_gen.scenes.load:load_scene"],
@@ -224,7 +224,7 @@ class Watcher:
 
 
 def work(file: str, start: str, words: list[str]) -> int:
-    """A command of ngpt, of which each stage's seconds go into the file."""
+    """Runs a command of ngpt, and writes the seconds of each stage into the file."""
     watch = Stopwatch(float(start))
     sys.meta_path.insert(0, Watcher(watch))
     builtins.__import__ = watch.importing(builtins.__import__)

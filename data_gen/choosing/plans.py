@@ -30,8 +30,9 @@ from ngpt.system.console import brief
 SHARE, SHARE_WITH_METHODS = 0.2, 0.3
 _SHARE_OF_RENDER = 0.15
 # Seconds for an image below which a pilot costs more than it could gain. The trials of gpt and primal on the smallest
-# images take 3.0, 5.5, 5.6 and 13.5 processor seconds (diffuse, glossy, coffee, dining-room), and their methods 3.5 and
-# 4.4. Two idle cores do that of a room in a fifth of this time; where it does not fit, the time is lost.
+# images take 3.0, 5.5, 5.6 and 13.5 processor seconds (diffuse, glossy, coffee, dining-room), and the methods of the
+# first two 3.5 and 4.4. Two idle cores finish the trials of a room within a fifth of this time. On a slower machine
+# they do not fit, and their time is lost.
 LEAST_SECONDS = 40.0
 # What `ngpt denoise` takes beside the method, and `ngpt render` to write the stack: for the process to begin, and to
 # write a million pixels, read them and write the image

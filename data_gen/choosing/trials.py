@@ -46,7 +46,7 @@ SEED = 0x9E3779B9
 class Trial:
     """Four stacks of as many samples by one sampler, and the seconds of one sample of the whole image.
 
-    ``processor``  those of all cores together; 0 where they are not known, or a graphics card renders
+    ``processor``  the same in processor seconds of all cores together; 0 if not known, or where a graphics card renders
     """
 
     stacks: list[GradientStack]

@@ -5,7 +5,18 @@ import argparse
 from data_gen.cli.frames import frames
 from data_gen.samplers import by_standing
 from data_gen.session import DEFAULT_SPP
-from ngpt.cli.arguments import Names, add_force, add_json, assignment, duration, natural, part, positive, size
+from ngpt.cli.arguments import (
+    Names,
+    add_force,
+    add_json,
+    add_options,
+    assignment,
+    duration,
+    natural,
+    part,
+    positive,
+    size,
+)
 from ngpt.cli.picture import IMAGES, add_look
 from ngpt.methods import METHODS
 
@@ -66,15 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME",
         help=f"auto: by the scene and a pilot (default); {first}; for some scenes: {others}. See `ngpt info`",
     )
-    parser.add_argument(
-        "-O",
-        "--option",
-        action="append",
-        default=[],
-        type=assignment,
-        metavar="NAME=VALUE",
-        help="of the sampler; may be repeated. See `ngpt info NAME`",
-    )
+    add_options(parser, "sampler", "SAMPLER")
     parser.add_argument("--seed", type=natural, default=0, help="the same seed gives the same stack (default: 0)")
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
     parser.add_argument("--threads", type=positive, metavar="N", help="that work at once (default: all processors)")

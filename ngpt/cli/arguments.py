@@ -26,6 +26,19 @@ def add_force(parser: argparse._ActionsContainer) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files that exist")
 
 
+def add_options(parser: argparse._ActionsContainer, owner: str, name: str) -> None:
+    """``-O NAME=VALUE``, an option of the ``owner``; `ngpt info` describes it by the owner's ``name``."""
+    parser.add_argument(
+        "-O",
+        "--option",
+        action="append",
+        default=[],
+        type=assignment,
+        metavar="NAME=VALUE",
+        help=f"an option of the {owner}; may be repeated. See `ngpt info {name}`",
+    )
+
+
 def output_file(path: str | Path, args: argparse.Namespace) -> Path:
     """The path of a file to write, whose folder is made; raises NgptError where that cannot be, and for what exists.
 

@@ -18,9 +18,9 @@ from ngpt.cli.arguments import (
     add_force,
     add_json,
     add_layers,
+    add_options,
     add_untrusted,
     add_view,
-    assignment,
     given_files,
     output_file,
     print_json,
@@ -83,15 +83,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory", type=int, metavar="MIB", help=f"that networks may use (default: {MEMORY}); in tiles"
     )
     parser.add_argument("--threads", type=int, metavar="N", help="that work at once (default: as many as processors)")
-    parser.add_argument(
-        "-O",
-        "--option",
-        action="append",
-        default=[],
-        type=assignment,
-        metavar="NAME=VALUE",
-        help="an option of the method; may be repeated. See `ngpt info METHOD`",
-    )
+    add_options(parser, "method", "METHOD")
     parser.add_argument(
         "--error",
         action="store_true",

@@ -32,7 +32,7 @@ def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
     """
     rows = []
     for scene in results["scenes"]:
-        here = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
+        here = _timed(results, scene)
         curves = {name: _curves(results, here, name) for name in results["settings"]["against"]}
         for row in here:
             if row["spp"] in results["settings"]["spp"] and (row["error"] or 0) > 0:
@@ -42,6 +42,11 @@ def against_rivals(results: dict[str, Any]) -> dict[str, Any]:
                         place = {name: row[name] for name in ("scene", "spp", "method")}
                         rows.append(place | {"seconds": row["seconds"]["total"], "rival": rival} | found)
     return {"rows": rows, "means": _means(results, rows)}
+
+
+def _timed(results: dict[str, Any], scene: str) -> list[dict[str, Any]]:
+    """The rows of a scene whose whole time is known."""
+    return [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
 
 
 def _curves(results: dict[str, Any], rows: list[dict[str, Any]], rival: str) -> dict[str, dict[str, Points]]:
@@ -117,8 +122,7 @@ def envelope(results: dict[str, Any], rival: str, scenes: list[str]) -> list[tup
     """
     parts = []
     for scene in scenes:
-        here = [row for row in results["summary"] if row["scene"] == scene and row["seconds"]["total"]]
-        settings = _curves(results, here, rival).get(results["primary"], {})
+        settings = _curves(results, _timed(results, scene), rival).get(results["primary"], {})
         times = [math.log(seconds) for points in settings.values() for seconds, _ in points]
         if not times:  # a mean over the others would be one over other scenes than all else that is drawn
             return []
