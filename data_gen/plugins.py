@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import sys
 from importlib.abc import MetaPathFinder
+from types import ModuleType
 from typing import Any
 
 _made_for = ""
@@ -94,7 +95,6 @@ def make_classes() -> None:
     global _made_for
     import mitsuba as mi
 
-    from data_gen.samplers import SAMPLERS
     from ngpt.errors import NgptError
 
     variant = mi.variant()
@@ -103,7 +103,19 @@ def make_classes() -> None:
         raise NgptError(f"variant '{variant}' is not one that our integrators can vectorise; choose one of: {able}")
     if variant == _made_for:
         return
-    for module in ("data_gen.samplers.common", *(entry.module for entry in SAMPLERS.values() if entry.module)):
-        if module in sys.modules:
-            importlib.reload(sys.modules[module])
+    for module in _modules_with_classes():
+        importlib.reload(module)
     _made_for = variant
+
+
+def _modules_with_classes() -> list[ModuleType]:
+    """The modules imported so far that define an integrator, those of base classes first."""
+    common = sys.modules.get("data_gen.samplers.common")
+    if not common:
+        return []
+    depth = {}
+    for name, module in list(sys.modules.items()):
+        for value in vars(module).values() if name.startswith("data_gen.") else ():
+            if isinstance(value, type) and value.__module__ == name and issubclass(value, common.GradientIntegrator):
+                depth[name] = len(value.__mro__)
+    return [sys.modules[name] for name in sorted(depth, key=lambda name: depth[name])]

@@ -1,5 +1,7 @@
 """Fixtures that several tests share."""
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -32,6 +34,14 @@ def one_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture(autouse=True)
+def handlers_of_signals_stay():
+    """One that is left behind would end other tests."""
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    yield
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
 @pytest.fixture(scope="session")

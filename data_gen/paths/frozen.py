@@ -29,7 +29,7 @@ class Frozen:
 
     def __init__(self, scene: mi.Scene, *owners: Any):
         # Not bound to ``self``: what is in no circle goes when the render does.
-        self.scene, state = scene, [scene, *map(arrays, owners)]
+        self.scene, state = scene, [scene, *map(arrays, owners), *_of_each_kind()]
         # Maps of as many vertices as there are pixels, and the like, are recorded once more: no reason to warn.
         self.options = {"state_fn": lambda *_: state, "warn_after": 1 << 30, "auto_opaque": False}
         self.functions: dict[Callable, Callable] = {}
@@ -65,6 +65,15 @@ class Frozen:
             result = tried(self.functions[f])
             _say(f, " ".join(str(error.__cause__ or error).split()))
             return result
+
+
+def _of_each_kind() -> list:
+    """A pointer of each type. A call goes through all objects of its kind in the process.
+
+    Dr.Jit looks at these objects only if the function is given a pointer of that type. The objects of this scene do
+    without, but a material that no shape has, in this scene or another, would keep the function from being recorded.
+    """
+    return [dr.zeros(getattr(mi, name)) for name in dir(mi) if name.endswith("Ptr")]
 
 
 # Functions that a warning has been given for

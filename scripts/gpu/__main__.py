@@ -196,7 +196,6 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"scripts.gpu: {error}", file=sys.stderr)
         return 2
     status, before = 0, steps(work)
-    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     try:
         window.run()
     except BaseException as error:  # what there is by then is worth a report, whatever this was
@@ -222,4 +221,6 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
+    # Not in main(): whoever calls that keeps their own handlers.
+    signal.signal(signal.SIGTERM, lambda number, frame: sys.exit(128 + number))
     sys.exit(main())

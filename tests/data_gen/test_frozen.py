@@ -46,6 +46,27 @@ def test_passes_of_any_size_are_recorded_once(renderer, recordings, sampler):
     assert len(others) == 2 and recordings.of == {"samples": 1}
 
 
+def spares():
+    """A material, a texture and a medium that no shape has: calls go through them nevertheless."""
+    import mitsuba as mi
+
+    from data_gen.scenes import builtin
+
+    texels = mi.Bitmap(np.random.default_rng(1).random((4, 4, 3)).astype(np.float32))
+    return builtin.diffuse() | {
+        "spare material": {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": {"type": "rgb", "value": 0.2}},
+        "spare texture": {"type": "bitmap", "bitmap": texels, "raw": True},
+        "spare medium": {"type": "homogeneous", "albedo": 0.3, "phase": {"type": "hg", "g": 0.4}},
+    }
+
+
+@pytest.mark.parametrize("own", ["diffuse", spares])
+def test_parts_that_no_shape_has_do_not_matter(renderer, recordings, caplog, own):
+    others = [load(renderer, spares, (4, 4))]
+    render(renderer, load(renderer, own, (9, 7)), "gpt", [16, 48, 16])
+    assert len(others) == 1 and recordings.of == {"samples": 1} and not caplog.records
+
+
 def test_steps_of_gpt_are_recorded_in_one_place(renderer, monkeypatch):
     """Recording goes through all materials of the scene at each step: unrolled and repeated steps made it long."""
     from data_gen.samplers.gpt import offset_path, trace

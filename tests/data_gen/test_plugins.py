@@ -84,6 +84,21 @@ def test_each_renders_what_its_sampler_does(renderer):
     assert set(none) == {"primal", "gmlt", "split"}
 
 
+def test_all_are_made_anew_with_another_variant():
+    """Those that share a base class beside the one of all as well. A process of its own: classes change for good."""
+    told = run(
+        """import mitsuba as mi, data_gen
+from data_gen.samplers import SAMPLERS
+for variant in ("llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_rgb"):
+    data_gen.use_variant(variant)
+    for name in ("gpt", "gpt-basic", "ppm", "gpm", "vpm", "gvpm", "beams", "gbeams", "planes", "gplanes"):
+        assert name in SAMPLERS and isinstance(mi.load_dict({"type": name.replace("-", "_")}), mi.Integrator), name
+print("all")
+"""
+    )
+    assert told.stdout == "all\n", told.stderr
+
+
 def test_a_tensor_that_is_no_stack_is_told_why():
     names = ["primal.R", "primal.G", "primal.B", "depth.Z"]
     stack = ngpt.GradientStack.from_aovs(np.arange(24.0).reshape(2, 3, 4), names, {"ngpt:spp": 4})
