@@ -24,7 +24,7 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.passes import DEFAULT_MEMORY, Look, Progress, SamplePass
+from data_gen.passes import DEFAULT_MEMORY, Look, Progress, SamplePass, rounds_of
 from data_gen.samplers import LANE_BYTES, SAMPLERS, Sampler
 from data_gen.uneven import BLOCK, UnevenRender
 from ngpt.api.uncertainty import FACTOR, FACTORS, change, noisier
@@ -137,6 +137,8 @@ def render_adaptive(
         points=points,
     )
     report()
+    rounds = rounds_of(sample)
+    rounds.begin(sensor, seed, 0, None)
     work.add(np.ones(pixels, int), whole=True)
     attributes: dict = {}
     took = 0.0
@@ -162,6 +164,7 @@ def render_adaptive(
             if spp is None:
                 total = max(total, math.ceil(needed))
             more = min(more, max(_MARGIN * needed - n.mean(), _SMALLEST * n.mean()))
+        rounds.begin(sensor, seed, int(n.mean()), None)
         work.add(share_out(found.relative * np.sqrt(n), n, more * pixels))
     if seconds is not None:
         progress(math.ceil(seconds), math.ceil(seconds))

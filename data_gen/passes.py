@@ -8,6 +8,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import Protocol, runtime_checkable
 
 import drjit as dr
 import mitsuba as mi
@@ -47,6 +48,38 @@ FIRST_LANES = 1 << 20
 PASS_SECONDS = 2.0
 
 
+@runtime_checkable
+class Rounds(Protocol):
+    """What a ``SamplePass`` is as well whose samples depend on those of earlier rounds.
+
+    ``shares``  whether they do, in the render that has begun
+    """
+
+    shares: bool
+
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
+        """To be called before each pass, with the number of its first sample, and that of all, if it is known."""
+
+    def end_of_round(self, sample: int) -> int | None:
+        """Where a pass has to end at the latest that begins with this sample; None: anywhere."""
+
+
+class _OneRound:
+    """Of samples that are independent of each other."""
+
+    shares = False
+
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
+        pass
+
+    def end_of_round(self, sample: int) -> int | None:
+        return None
+
+
+def rounds_of(sample: SamplePass) -> Rounds:
+    return sample if isinstance(sample, Rounds) else _OneRound()
+
+
 def _nothing(left: int) -> str:
     """Of what would fit into so many bytes for a lane."""
     return ""
@@ -83,9 +116,12 @@ def render_passes(
     on each other: each pass is one block of so many samples per pixel, and the film's variances are over passes. Such a
     ``sample`` may keep a state from pass to pass; ``CameraSamples.first`` tells it where it is.
 
+    A ``sample`` may come in ``Rounds``, which no pass goes beyond.
+
     Raises NgptError where one block of samples does not fit into ``memory``.
     """
     total = spp if spp is not None else 1 << 31
+    rounds = rounds_of(sample)
     lane_bytes = getattr(sample, "lane_bytes", lane_bytes)
     instead = getattr(sample, "instead", _nothing)
     net = first_round(points, spp)
@@ -107,7 +143,7 @@ def render_passes(
         # What is left over at the end is a block of its own.
         if left < size and seconds is None:
             return left
-        blocks = min(most, max(left // size, 1)) if size == block else 1
+        blocks = min(most, max(min(left, until) // size, 1)) if size == block else 1
         if not done:
             return min(left, size * (1 if seconds else max(1, min(blocks, FIRST_LANES // (film.pixels * size)))))
         begin, each = foretold(done)
@@ -124,7 +160,10 @@ def render_passes(
 
     report()
     while True:
+        rounds.begin(sensor, seed, film.samples, spp)
         size = growing_block(film.pixels, film.samples, block) if grows else block
+        until = (rounds.end_of_round(film.samples) or total) - film.samples
+        size = min(size, until)
         n = next_pass(size)
         if n == 0:
             break

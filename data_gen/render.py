@@ -13,9 +13,10 @@ from data_gen.adaptive import Adaptive, check_adaptive, render_adaptive
 from data_gen.begun import Unfinished
 from data_gen.film import GradientFilm
 from data_gen.made import Made
-from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes
+from data_gen.passes import DEFAULT_MEMORY, Progress, render_passes, rounds_of
 from data_gen.samplers import SAMPLERS, choose, find
 from data_gen.samplers.registry import Entry, own
+from data_gen.samplers.shared import why_not_shared
 from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
@@ -48,6 +49,7 @@ def render_stack(
     with_features: bool = True,
     adaptive: Adaptive | None = None,
     made: Made | None = None,
+    unbiased: bool = True,
     **options: Any,
 ) -> GradientStack:
     """Renders a stack from the scene's first sensor.
@@ -63,6 +65,9 @@ def render_stack(
 
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
+
+    Unless it is to be ``unbiased``, paths of samplers with the option ``tails`` share what they find, where that works
+    and pays (``data_gen.tails``). ``ngpt:samplerOptions`` says which it was.
 
     Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
@@ -84,6 +89,12 @@ def render_stack(
             raise NgptError(f"sampler '{sampler}' always renders features; only '{without}' can leave them out")
         options["features"] = False
     settings = entry.settings(options)
+    if "tails" in settings:
+        why_not = why_not_shared(facts, settings, mi.variant())
+        if why_not and options.get("tails") == "shared":
+            raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
+        if not unbiased and not why_not and "tails" not in options:
+            settings["tails"] = "shared"
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
@@ -122,6 +133,8 @@ def render_stack(
             film.forget_pass()
         else:
             made.keep(entry, scene, more, sample)
+    if "tails" in settings and not rounds_of(sample).shares:
+        settings["tails"] = "paths"
     done = round(float(film.samples_each.mean()))
     chosen = chosen | {"ngpt:spp": done} | options_as_attribute(entry, settings)
     if failed or (stop() and (spp is None or done < spp)):

@@ -43,7 +43,7 @@ ngpt.cli
 data_gen.llvm data_gen.scenes.grids
 data_gen.scenes data_gen.scenes.procedural
 data_gen.film data_gen.paths data_gen.samplers.registry
-data_gen.passes
+data_gen.passes data_gen.tails
 data_gen.uneven
 data_gen.samplers
 data_gen.made

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 
 from data_gen.samplers.registry import Option
 
@@ -91,6 +91,27 @@ def photons_in_media(name: str, grids: bool = True) -> Refusal:
 # Options that several samplers have
 CONNECTABLE = Option(0.05, "the microfacet roughness above which materials are connectable", range=(0, math.inf))
 GATHERING = Option(0.05, "the microfacet roughness above which photons are gathered at materials", range=(0, math.inf))
+
+
+TAILS = Option(
+    "paths",
+    "how a path finds light behind its first steps: by itself, or in a cache of what others have found (biased)",
+    choices=("paths", "shared"),
+)
+
+
+def why_not_shared(facts: Facts, settings: Mapping[str, Any], variant: str) -> str:
+    """Why paths of a sampler with the option ``tails`` cannot share what they find; "" where they can."""
+    if facts.integrator != "path":
+        return f"the integrator is '{facts.integrator}', and only paths of 'path' do"
+    if facts.media:
+        return f"there are media ({', '.join(facts.media)})"
+    if "rgb" not in variant or facts.polarised:
+        return f"variant '{variant}' renders other colours than RGB"
+    unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}
+    return next(
+        (f"{name} needs whole paths" for key, (value, name) in unable.items() if settings.get(key) == value), ""
+    )
 
 
 def joined_depth(default: int) -> Option:

@@ -54,7 +54,11 @@ def spares():
 
     texels = mi.Bitmap(np.random.default_rng(1).random((4, 4, 3)).astype(np.float32))
     return builtin.diffuse() | {
-        "spare material": {"type": "roughconductor", "alpha": 0.3, "specular_reflectance": {"type": "rgb", "value": 0.2}},
+        "spare material": {
+            "type": "roughconductor",
+            "alpha": 0.3,
+            "specular_reflectance": {"type": "rgb", "value": 0.2},
+        },
         "spare texture": {"type": "bitmap", "bitmap": texels, "raw": True},
         "spare medium": {"type": "homogeneous", "albedo": 0.3, "phase": {"type": "hg", "g": 0.4}},
     }

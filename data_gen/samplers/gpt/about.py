@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from data_gen.samplers.registry import Option, Sampler, register
-from data_gen.samplers.shared import CONNECTABLE, VOLUMETRIC, refused_if_polarised
+from data_gen.samplers.shared import CONNECTABLE, TAILS, VOLUMETRIC, refused_if_polarised
 
 if TYPE_CHECKING:
     from data_gen.scenes.facts import Facts
@@ -46,6 +46,7 @@ register(
             ),
             "reuse": Option(False, "the primal is the mean over base paths and the offset paths of neighbours"),
             "roughness_threshold": CONNECTABLE,
+            "tails": TAILS,
             "caustic": Option(
                 True, "light over rough surfaces and then mirrors or glass has a layer; else it is in the gradients"
             ),

@@ -17,6 +17,7 @@ from data_gen.paths.walk import Sky, roulette
 from data_gen.samplers.gpt.manifold_shift import Chain, advance, no_chain
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.scenes.places import Chosen
+from data_gen.tails.cells import Trail
 
 
 @dataclass
@@ -34,6 +35,7 @@ class Path:
     late: mi.Bool  # and has later left a vertex by a mirror, glass or sharp gloss
     chain: Chain | None  # see data_gen.samplers.gpt.manifold_shift; None without that shift
     walks: mi.Bool  # some path of the five may go on from x
+    trail: Trail | None = None  # where paths may end in the cache
 
     def goes_on(self, plan: Plan, offsets: list) -> mi.Bool:
         """Whether there is another step: as long as the base path lives, or a ghost has company."""
@@ -215,6 +217,7 @@ def base_step(scene, plan: Plan, random, path: Path, offsets: list) -> tuple[Ste
         late=late,
         chain=chain,
         walks=walks,
+        trail=path.trail and path.trail.on(x1, kind == SMOOTH, sample.pdf, goes_on),
     )
     return step, behind
 

@@ -45,7 +45,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS, GradientFilm
+from data_gen.film import SHIFTS
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features
@@ -54,10 +54,12 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.manifold_shift import add_followed
 from data_gen.samplers.gpt.plan import Plan, make_plan
+from data_gen.samplers.gpt.rounds import SharedTails
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name, media_of
 from data_gen.scenes.places import Places
+from data_gen.tails.cache import Known
 from ngpt.errors import NgptError
 
 
@@ -92,7 +94,7 @@ class GPT(GradientIntegrator):
         super().__init__(props)
         self.roughness_threshold, self.shift = self.options["roughness_threshold"], self.options["shift"]
         self.reuse, self.caustic = self.options["reuse"], self.options["caustic"]
-        self.volumes = props.get("volumes", False)
+        self.volumes, self.shared = props.get("volumes", False), self.options["tails"] == "shared"
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
@@ -103,7 +105,9 @@ class GPT(GradientIntegrator):
 
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         plan = self.plan(scene)
-        return partial(self.sample_pass, Frozen(scene, plan), plan)
+        frozen = Frozen(scene, plan)
+        take = partial(self.sample_pass, frozen, plan)
+        return SharedTails(self, plan, frozen, take) if plan.matt else partial(take, None)
 
     def plan(self, scene) -> Plan:
         """What the kernel contains for a scene. Raises NgptError for polarised variants."""
@@ -113,12 +117,12 @@ class GPT(GradientIntegrator):
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
         volumes = self.volumes and bool(media_of(scene))
-        more = {"caustic": self.caustic, "volumes": volumes, "places": self.places}
+        more = {"caustic": self.caustic, "volumes": volumes, "places": self.places, "shared": self.shared}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
-    def sample_pass(self, frozen: Frozen, plan: Plan, camera: CameraSamples, film: GradientFilm) -> None:
-        """Takes one base path and its four offset paths for each camera sample."""
-        values, Δ, inside, rest = frozen(self.samples, plan, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
+    def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film) -> None:
+        """Takes one base path and its four offset paths for each camera sample; paths end in what is ``known``."""
+        values, Δ, inside, rest = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:
             values["primal"] = reused(camera, rest, Δ, inside) + values["direct"]
         if plan.manifold:
@@ -126,14 +130,14 @@ class GPT(GradientIntegrator):
             Δ = add_followed(plan, first_hit, camera, list(SHIFTS.values()), rest, Δ)
         film.put_all(values | dict(zip(SHIFTS, zip(Δ, inside, strict=True), strict=True)))
 
-    def samples(self, plan: Plan, camera: CameraSamples) -> tuple[dict, list, list, Any]:
+    def samples(self, plan: Plan, known: Known | None, camera: CameraSamples) -> tuple[dict, list, list, Any]:
         """Layers, Δ in the order of SHIFTS, where it is on the film, and what options need: A of Δ, or a chain."""
         # ------------------------- Paths -----------------------------
         scene, (ray, importance, _) = plan.space.scene, camera.rays()
         within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within)
+        paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within, known)
         Le = self.emission_in_pixel(scene, camera, paths.Le, plan.space.media, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (paths.L, Le, paths.L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in paths.offsets]

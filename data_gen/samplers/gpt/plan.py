@@ -11,6 +11,7 @@ from data_gen.paths.space import Filled, Space
 from data_gen.paths.vertex import Materials
 from data_gen.paths.walk import Limits
 from data_gen.scenes.places import Places
+from data_gen.tails.matt import Matt
 from ngpt.errors import NgptError
 
 
@@ -23,6 +24,7 @@ class Plan:
     ``half_vectors``  smooth events that cannot be reconnected are shifted by half-vector copy, else by replay
     ``caustic``       light that no shift can follow goes into a layer of its own, see ``data_gen.paths.caustic``
     ``manifold``      some of that light is followed all the same, see ``data_gen.samplers.gpt.manifold_shift``
+    ``matt``          where paths may end in the cache of ``data_gen.tails``; None: nowhere
     ``hides``         the environment hides from the camera, so that a path must know whether it has seen a surface
     """
 
@@ -34,6 +36,7 @@ class Plan:
     half_vectors: bool
     caustic: bool
     manifold: bool
+    matt: Matt | None = None
 
     @property
     def hides(self) -> bool:
@@ -49,6 +52,7 @@ def make_plan(
     caustic: bool = True,
     volumes: bool = False,
     places: Places | None = None,
+    shared: bool = False,
 ) -> Plan:
     """Inspects the scene; the parameters are those of ``gpt``. Without ``volumes`` its media are not seen.
 
@@ -71,4 +75,5 @@ def make_plan(
         half_vectors=replays and shift == "half-vector",
         caustic=caustic and replays,
         manifold=caustic and replays and shift == "manifold",
+        matt=Matt(scene) if shared else None,
     )

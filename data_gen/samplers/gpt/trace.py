@@ -12,6 +12,8 @@ from data_gen.samplers.gpt.base_path import Path, base_step, begin
 from data_gen.samplers.gpt.manifold_shift import Chain
 from data_gen.samplers.gpt.offset_path import Offset, next_steps, start
 from data_gen.samplers.gpt.plan import Plan
+from data_gen.samplers.gpt.tails import end
+from data_gen.tails.cells import Trail
 
 
 @dataclass
@@ -25,11 +27,11 @@ class Traced:
     chain: Chain | None  # what the shift "manifold" has recorded
 
 
-def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None) -> Traced:
+def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, known=None) -> Traced:
     """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
 
     Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``;
-    ``view`` is the integrator, which knows what hides from it.
+    ``view`` is the integrator, which knows what hides from it. Paths may end in what is ``known`` of the cache.
     """
     # --------------------- First vertices ------------------------
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
@@ -37,6 +39,7 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     first = space.first(view, ray, within, drawn)
     x, β = media.vertex(mi.Ray3f(first.ray), first.hit, first.place), importance * first.weight
     path = begin(plan, x, first.place, drawn.channel if drawn else None, β)
+    path.trail = Trail.to(x) if known else None
     # Kept out of the gradients: it has little noise, but its edges would be the strongest of the image.
     if space.media:
         Le = importance * view.lamps_in_fog(scene, space.media, ray, within, drawn.channel)
@@ -61,11 +64,11 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         if not plan.replays:
             # Without it in the loop, that loop has no paths apart.
-            path, so_far = go_on(scene, plan, random, path, so_far, first=True)
-        return walk(scene, plan, random, path, so_far)
+            path, so_far = go_on(scene, plan, random, path, so_far, known, first=True)
+        return walk(scene, plan, random, path, so_far, known)
 
 
-def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, first: bool = False) -> tuple[Path, Traced]:
+def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, known, first: bool = False) -> tuple[Path, Traced]:
     """One step of all paths."""
     # The base path first: an offset path can only join a vertex that is known.
     step, path = base_step(scene, plan, random, path, so_far.offsets)
@@ -76,14 +79,17 @@ def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, first: bool = F
     if plan.manifold:
         L = L + step.β1 * step.L_followed
     offsets = next_steps(scene, plan, step, so_far.offsets, first)
+    if known:
+        path, tail, caustic_tail = end(plan, known, path, offsets)
+        L, L_caustic = L + tail, L_caustic + caustic_tail
     return path, Traced(L, so_far.Le, L_caustic, offsets, path.chain)
 
 
 @dr.syntax
-def walk(scene, plan: Plan, random, path: Path, so_far: Traced) -> Traced:
+def walk(scene, plan: Plan, random, path: Path, so_far: Traced, known) -> Traced:
     """All that is left of all paths."""
     active = path.goes_on(plan, so_far.offsets)
-    while dr.hint(active, label="gpt"):
-        path, so_far = go_on(scene, plan, random, path, so_far)
+    while dr.hint(active, label="gpt", exclude=[known]):
+        path, so_far = go_on(scene, plan, random, path, so_far, known)
         active = path.goes_on(plan, so_far.offsets)
     return so_far

@@ -1,6 +1,7 @@
 """The entry of ``primal``."""
 
 from data_gen.samplers.registry import Option, Sampler, register
+from data_gen.samplers.shared import TAILS
 
 register(
     Sampler(
@@ -8,7 +9,7 @@ register(
         "the scene's own integrator without gradients (references, primal denoisers)",
         "data_gen.samplers.primal.sampler",
         standing="use",
-        options={"features": Option(True, "albedo, normal, depth and emission seen directly")},
+        options={"features": Option(True, "albedo, normal, depth and emission seen directly"), "tails": TAILS},
         gradients=False,
         tried=True,
         compiles=1.0,

@@ -8,13 +8,15 @@ from functools import partial
 import mitsuba as mi
 
 from data_gen.passes import SamplePass
-from data_gen.paths.camera import CameraSamples
+from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features as feature_layers
+from data_gen.paths.frozen import Frozen
 from data_gen.paths.lights import emission_in_pixel, emission_seen
 from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import loses_light, radiance, recorded
 from data_gen.samplers.gpt.integrator import stand_in
 from data_gen.samplers.gpt.plan import Plan
+from data_gen.samplers.gpt.rounds import SharedTails
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
@@ -22,10 +24,16 @@ from data_gen.scenes.load import reference_integrator
 from data_gen.scenes.places import Places
 
 
-def make(scene: mi.Scene, features: bool, places: Places | None = None) -> SamplePass:
-    """The sampler ``primal``; without ``features`` it holds the primal alone. Lamps may be chosen by ``places``."""
+def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
+    """The sampler ``primal``; without ``features`` it holds the primal alone. Lamps may be chosen by ``places``.
+
+    With ``tails`` "shared" the tails of paths are found in a cache, see ``data_gen.tails``.
+    """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
+    shared = tails == "shared"
+    if shared:
+        return shared_tails(scene, integrator, features, places)
     ours = followed and (places or loses_light(scene, integrator))
     plan, L = our_radiance(scene, places) if ours else (None, radiance(scene, integrator))
     return recorded(scene, partial(samples, scene, integrator, L, features), plan)
@@ -45,6 +53,25 @@ def our_radiance(scene: mi.Scene, places: Places | None) -> tuple[Plan, Callable
         return paths.L + paths.Le
 
     return plan, L
+
+
+def shared_tails(scene, integrator, features: bool, places: Places | None) -> SharedTails:
+    """Passes of base paths of ``gpt`` that end in a cache."""
+    view = stand_in(scene, places, caustic=False, tails="shared")
+    plan = view.plan(scene)
+    frozen = Frozen(scene, plan)
+
+    def known_samples(known, camera):
+        def L(random, ray, medium, active):
+            paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], None, known)
+            return paths.L + paths.Le
+
+        return samples(scene, integrator, L, features, camera)
+
+    def take(known, camera, film) -> None:
+        film.put_all(frozen(known_samples, known, camera.look((0, 0), *QUARTERS)))
+
+    return SharedTails(view, plan, frozen, take)
 
 
 def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:

@@ -1,0 +1,99 @@
+"""Passes whose paths end in a cache, which is fed between rounds of samples."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import drjit as dr
+import mitsuba as mi
+import numpy as np
+
+from data_gen.film import GradientFilm
+from data_gen.passes import recording
+from data_gen.paths.camera import CameraSamples
+from data_gen.paths.frozen import Frozen
+from data_gen.samplers.gpt.plan import Plan
+from data_gen.samplers.gpt.tails import feed
+from data_gen.tails import schedule
+from data_gen.tails.cache import Cache, Known
+from data_gen.tails.cells import Place
+
+# Paths that feed the cache have random numbers of their own: "TAILS".
+_SEED = 0x5441494C53
+# Such paths of the first round at least, however small the image is
+_LEAST = 1 << 13
+# The first round comes in two parts, since paths of the second may end in what those of the first have found.
+_FIRST_PART = 1 / 4
+# Where fewer of the first paths come by a place to end than this share of them, none end: it would cost more than it
+# gains.
+_PAYS = 0.25
+
+Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
+
+
+class SharedTails:
+    """A ``data_gen.passes.SamplePass`` whose paths may end in a cache; what they read depends on the round alone.
+
+    ``take`` puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view``
+    is the integrator. ``cache`` is None before the first pass, and where it does not pay.
+    """
+
+    def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
+        self.view, self.plan, self.frozen, self.take = view, plan, frozen, take
+        self.cache: Cache | None = None
+        self.fed = 0
+
+    def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
+        self.take(self.cache and self.cache.known, camera, film)
+
+    @property
+    def shares(self) -> bool:
+        return self.cache is not None
+
+    def end_of_round(self, sample: int) -> int | None:
+        """Where a pass has to end at the latest that begins with this sample of each pixel; None: anywhere."""
+        return schedule.end_of_round(sample) if self.cache else None
+
+    def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
+        """To be called before a pass that begins with this ``sample``: feeds the cache where that begins a round.
+
+        ``spp`` is the number of all samples, if it is known.
+        """
+        if sample == 0:
+            self.cache, self.fed = Cache(schedule.fineness(0)) if self.plan.matt.any else None, 0
+        if self.cache is None:
+            return
+        pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
+        wanted = max(round(schedule.paths_before(sample, spp) * pixels), _LEAST)
+        for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
+            while self.fed < part:
+                first = self.fed == 0
+                with recording():
+                    able = self.feed(sensor, seed, pixels, min(part - self.fed, max(pixels, _LEAST)))
+                if first and able < _PAYS:
+                    self.cache = None
+                    return
+                self.cache.settle(schedule.fineness(sample))
+
+    def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
+        """Has so many paths feed the cache; returns the share of them that come by a place to end."""
+        # Spread over the image, row by row: rays side by side are quick.
+        number = np.arange(n, dtype=np.int64)
+        some, first = number * pixels // n, self.fed + number % -(-n // pixels)
+        camera = CameraSamples(sensor, seed ^ _SEED, 1, mi.UInt32(first), 1, mi.UInt32(some))
+        count, records = self.frozen(self.paths, self.cache.known, camera.look((0, 0)))
+        self.fed += n
+        lanes = [dr.compress(count > i) for i in range(len(records))]
+        there = [(which, record) for which, record in zip(lanes, records, strict=True) if dr.width(which)]
+        if there:
+            # One by one, the kernels that add them would take longer to begin than to run.
+            fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
+            x, y, z, code, level, *value = (dr.concat(list(parts)) for parts in fields)
+            self.cache.add(Place(mi.Point3f(x, y, z), code, level), mi.Color3f(*value))
+        return dr.width(lanes[0]) / n
+
+    def paths(self, known: Known, camera: CameraSamples) -> tuple[mi.UInt32, list[list]]:
+        """How many records each path has, and these: place, and light over reflectance, a number each."""
+        ray, importance, _ = camera.rays()
+        count, records = feed(self.view, self.plan, known, camera.random.clone(), (ray, importance))
+        return count, [[*r.place.p, r.place.code, r.place.level, *(mi.Color3f(r.L) / r.ρ)] for r in records]

@@ -1,0 +1,114 @@
+"""Paths of ``gpt`` and ``primal`` that end in the cache (``data_gen.tails``), and those that feed it.
+
+A path may end at the first vertex from the second on where the material is matt, the path's spread is large, and the
+cell is trusted; of ``gpt``, where no offset path is apart any more. What it would have found behind the vertex is then
+
+    ρ C,
+
+the vertex's reflectance times the light over reflectance of the cell; an offset path adds a ρ C to its difference, with
+the factor ``a`` that it would have had for all that follows (``offset_path.settle``). Emission at the vertex itself is
+found by the step before, and weighted as ever.
+
+A path that feeds the cache opens a record at its first such vertex, and at those behind it, as many as there is room
+for; from the second on it may end in the cache itself. So light of many bounces comes together one by one. [Müller et
+al. 2021, "Real-time neural radiance caching for path tracing", section 4]
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.paths import caustic, media, shift
+from data_gen.paths.walk import UNLIMITED
+from data_gen.samplers.gpt.base_path import Path, base_step, begin
+from data_gen.samplers.gpt.plan import Plan
+from data_gen.tails.cache import Known
+from data_gen.tails.cells import Place, Trail, place_of
+from data_gen.tails.schedule import NEAR
+
+# Records that a path may have
+RECORDS = 3
+# Light of so many more bounces is all there is: cells of shorter paths are kept apart by how many are left.
+_ALL = 16
+
+
+def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
+    """Where a path is in the cache, and whether it may end there, or open a record."""
+    x, trail = path.x, path.trail
+    able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
+    able = plan.matt.at(x, able)
+    most = plan.limits.max_depth
+    late = mi.UInt32(0) if most == UNLIMITED else path.depth - dr.minimum(path.depth, max(most - _ALL, 0))
+    return place_of(x, trail.spread, known.fineness, late), able
+
+
+def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum]:
+    """Ends paths where the cache knows what follows; returns them, and that, in the layer ``caustic`` or not.
+
+    Differences get theirs, but for what is in that layer.
+    """
+    where, able = place(plan, known, path)
+    for y in offsets:
+        able &= ~y.apart
+    C, ends = known.look(where, able)
+    found, caustic_found = caustic.split(path.late, dr.select(ends, plan.matt.reflectance(path.x, ends) * C, 0))
+    for y in offsets:
+        # Of a joined path, what it would settle with at this vertex, which scatters alike in all directions
+        joined = shift.gradient_weight(y.r, True) * (y.β - path.β)
+        y.Δ = y.Δ + dr.select(y.joined, joined, y.a) * found
+    path.walks = path.walks & ~ends
+    return path, path.β * found, path.β * caustic_found
+
+
+@dataclass
+class Record:
+    """A vertex where a path has come by, and what it has found from there on."""
+
+    place: Place
+    ρ: mi.Color3f
+    T: mi.Spectrum  # throughput from there on
+    L: mi.Spectrum
+
+
+def feed(view, plan: Plan, known: Known, random, camera_ray: tuple) -> tuple[mi.UInt32, list[Record]]:
+    """Paths that feed the cache, from the ``camera_ray``, a ray and its importance: how many records each has, and these."""
+    (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
+    first = space.first(view, ray, None, space.begin(random))
+    x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
+    path = begin(plan, x, first.place, None, importance * first.weight)
+    path.trail, lanes = Trail.to(x), dr.width(x.t)
+    blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
+    none = [Record(blank, mi.Color3f(1), mi.Spectrum(0), dr.zeros(mi.Spectrum, lanes)) for _ in range(RECORDS)]
+    with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
+        return walk(scene, plan, known, random, path, none)
+
+
+@dr.syntax
+def walk(scene, plan: Plan, known: Known, random, path: Path, records: list) -> tuple:
+    count, active = mi.UInt32(0), path.goes_on(plan, [])
+    while dr.hint(active, label="feed", exclude=[known]):
+        step, path = base_step(scene, plan, random, path, [])
+        found = step.L_light + step.f_p * step.L_bsdf + step.L_caustic
+        for r in records:
+            r.L = r.L + r.T * found
+            r.T = r.T * step.f_p
+        where, able = place(plan, known, path)
+        C, ends = known.look(where, able)
+        ρ = plan.matt.reflectance(path.x, able)
+        # The first vertex is where others will end: it has a record in any case.
+        ends &= count > 0
+        behind = dr.select(ends, ρ * C, 0)
+        opens = able & ~ends & (count < RECORDS)
+        for i in range(RECORDS):
+            r, this = records[i], opens & (count == i)
+            r.L = r.L + r.T * behind
+            r.T = dr.select(this, 1, r.T)
+            r.ρ = dr.select(this, ρ, r.ρ)
+            r.place = dr.select(this, where, r.place)
+        count = dr.select(opens, count + 1, count)
+        path.trail.spread = dr.select(opens, 0, path.trail.spread)
+        active = path.goes_on(plan, []) & ~ends
+    return count, records

@@ -1,0 +1,155 @@
+"""The cache: for each cell the sum of the light that paths have found there, divided by the reflectance.
+
+Sums are integers, so that they do not depend on the order of additions. What paths read, ``Known``, is made of them
+between two rounds: within a round nothing changes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import drjit as dr
+import mitsuba as mi
+
+from data_gen.tails.cells import Place, coarser, key
+
+# Cells that there is room for, and the share of them that may be taken
+CELLS, _FULL = 1 << 20, 0.7
+# Places beside each other in the table, in which a cell may be
+_PLACES = 32
+# Sizes of cells that a record goes into, each of twice the side of the one before
+LEVELS = 3
+# A cell is trusted once it has so many records, and as many that count (see ``Cache``) may be expected of it.
+LEAST, EVIDENCE = 8, 2.0
+# The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
+# both as powers of two
+_BITS, _MOST_BITS = 30, 40
+
+
+@dataclass
+class Known:
+    """What paths may read: light over reflectance by cell, RGB, and 1 where it is trusted, 0 where not."""
+
+    keys: mi.UInt32
+    values: mi.Float
+    fineness: mi.Float
+
+    def look(self, place: Place, active: mi.Bool) -> tuple[mi.Color3f, mi.Bool]:
+        """The light at a place, and whether it is trusted: that of the smallest cell around it that is."""
+        value = self._of(place, active)
+        for _ in range(LEVELS - 1):
+            place, more = coarser(place), active & (value.w == 0)
+            value = dr.select(more, self._of(place, more), value)
+        return mi.Color3f(value.x, value.y, value.z), active & (value.w > 0)
+
+    def _of(self, place: Place, active: mi.Bool) -> mi.Vector4f:
+        h, name = key(place)
+        last = dr.width(self.keys) - 1
+        i, open, slot, found = mi.UInt32(0), mi.Bool(active), mi.UInt32(0), mi.Bool(False)
+
+        def body(i, open, slot, found):
+            at = (h + i) & last
+            there = dr.gather(mi.UInt32, self.keys, at, open)
+            hit = open & (there == name)
+            return i + 1, open & ~hit & (there != 0) & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
+
+        _, _, slot, found = dr.while_loop(
+            (i, open, slot, found), lambda i, open, slot, found: open, body, label="look up"
+        )
+        return dr.gather(mi.Vector4f, self.values, slot, found)
+
+
+class Cache:
+    """Sums by cell, which grow, and what is known of them.
+
+    How far the mean of a cell is to be relied on depends on the number of records that count,
+
+        n' = (Σ x)² / Σ x²,
+
+    which is 1 where a single one has all the light. Cells without such a record look certain, and are too dark: were
+    each judged by its own records, the light of the others would be lost. So the cell around them, of twice the side,
+    judges all of them together.
+    """
+
+    def __init__(self, fineness: float):
+        self.keys, self.count, self.around = (dr.zeros(mi.UInt32, CELLS) for _ in range(3))
+        # Of red, green and blue, and of squares
+        self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(4)]
+        self.unit, self.cells, self.full = 0.0, 0, False
+        self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
+        dr.make_opaque(self.keys, self.count, self.around, self.sums, self.known.values)
+
+    def add(self, place: Place, value: mi.Color3f) -> None:
+        """Adds records, ``value`` each, to their cells and to those around."""
+        good = dr.isfinite(dr.sum(value)) & (dr.min(value) >= 0)
+        if not self.unit:
+            most = dr.max(dr.select(good, dr.max(value), 0))[0]
+            if not most > 0:
+                return
+            self.unit = 2.0 ** (math.ceil(math.log2(most)) - _BITS)
+        # Opaque: it would be compiled into the kernel, a new one for every scene.
+        light = mi.Color3f(dr.minimum(value * dr.opaque(mi.Float, 1 / self.unit), 2.0**_MOST_BITS))
+        square = dr.square(dr.mean(light) * 2.0**-_BITS) * 2.0**_BITS
+        counts = [mi.Int64(each + 0.5) for each in (*light, square)]
+        # All levels at once, from the coarsest: fewer kernels
+        places = [place]
+        for _ in range(LEVELS - 1):
+            places.insert(0, coarser(places[0]))
+        h, name = (dr.concat(parts) for parts in zip(*map(key, places), strict=True))
+        n, lanes = dr.width(value), dr.arange(mi.UInt32, dr.width(h))
+        record = lanes % dr.opaque(mi.UInt32, n)
+        dr.eval(h, name, good, counts)
+        slot, placed = self._slots(h, name, dr.gather(mi.Bool, good, record))
+        direct = {"mode": dr.ReduceMode.Direct}
+        for sum, count in zip(self.sums, counts, strict=True):
+            dr.scatter_add(sum, dr.gather(mi.Int64, count, record), slot, placed, **direct)
+        dr.scatter_add(self.count, mi.UInt32(1), slot, placed, **direct)
+        # The coarsest cells have none around them.
+        within = placed & (lanes >= dr.opaque(mi.UInt32, n))
+        around = lanes - dr.opaque(mi.UInt32, n)
+        within &= dr.gather(mi.Bool, placed, around, within)
+        dr.scatter(self.around, dr.gather(mi.UInt32, slot, around, within) + 1, slot, within)
+        dr.eval(self.keys, self.count, self.around, self.sums)
+
+    def _slots(self, h: mi.UInt32, name: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
+        """Where the cells are, once there is one for each record; there are no new ones where the table is full."""
+        last, keys, fill = CELLS - 1, self.keys, not self.full
+
+        def body(i, open, slot, placed):
+            at = (h + i) & last
+            if fill:
+                there, made = dr.scatter_cas(keys, mi.UInt32(0), name, at, open)
+                hit, over = open & (made | (there == name)), mi.Bool(False)
+            else:
+                there = dr.gather(mi.UInt32, keys, at, open)
+                hit, over = open & (there == name), there == 0
+            return i + 1, open & ~hit & ~over & (i < _PLACES - 1), dr.select(hit, at, slot), placed | hit
+
+        state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, dr.width(h)))
+        _, _, slot, placed = dr.while_loop(
+            state, lambda i, open, slot, placed: open, body, label="find cells", mode="symbolic"
+        )
+        dr.eval(slot, placed, keys)
+        return slot, placed
+
+    def settle(self, fineness: float) -> None:
+        """Makes what is known anew, of all records so far; from here on cells have this ``fineness``."""
+        self.cells = int(dr.count(self.keys != 0)[0])
+        self.full = self.cells > _FULL * CELLS
+        n = mi.Float(dr.maximum(self.count, 1))
+        light = [mi.Float(sum) for sum in self.sums[:3]]
+        total = (light[0] + light[1] + light[2]) / 3
+        # The squares have the unit 2^_BITS. Where they are nothing beside it there is next to no light.
+        evidence = dr.select(self.sums[3] > 0, dr.square(total * 2.0**-_BITS) * 2.0**_BITS / mi.Float(self.sums[3]), n)
+        dr.eval(evidence)
+        # Of four cells of a surface, one is expected to have a quarter of it.
+        within = self.around > 0
+        expected = dr.gather(mi.Float, evidence, self.around - 1, within) / 4
+        trusted = (self.count >= LEAST) & (~within | (expected >= EVIDENCE))
+        unit = dr.opaque(mi.Float, self.unit)
+        values = mi.Vector4f(*(unit * each / n for each in light), dr.select(trusted, mi.Float(1), 0))
+        flat = dr.zeros(mi.Float, 4 * CELLS)
+        dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
+        self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
+        dr.eval(self.known.keys, self.known.values)
