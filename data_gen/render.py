@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable
 from typing import Any
@@ -21,6 +22,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
+from data_gen.tails.schedule import FIRST, LEAST_PATHS
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import FEATURE_NOISE
@@ -93,7 +95,9 @@ def render_stack(
         why_not = why_not_shared(facts, settings, mi.variant())
         if why_not and options.get("tails") == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        if not unbiased and not why_not and "tails" not in options:
+        pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+        enough = pixels * (spp or FIRST) >= LEAST_PATHS
+        if enough and not unbiased and not why_not and "tails" not in options:
             settings["tails"] = "shared"
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)

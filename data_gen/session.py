@@ -55,6 +55,7 @@ def render_scene(
     method: str | None = None,
     memory: int | None = None,
     diagnostics: bool = False,
+    unbiased: bool = False,
     variant: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
@@ -76,6 +77,8 @@ def render_scene(
     ``sampler``     "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own
     ``memory``      MiB for paths and film, beside the scene (6144)
     ``diagnostics`` adds rates of failed shifts and discarded values as channels
+    ``unbiased``    no path ends in a cache of what others have found, which most renders are better with and a little
+                    biased by: see docs/samplers/tails.md
     ``variant``     of Mitsuba; by default the current one, or llvm_ad_rgb where none is set
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
@@ -107,7 +110,7 @@ def render_scene(
     pilot = sharing is None and sampler == "auto"
     plan = None
     if pilot:
-        plan = _plan(scene, spp, seconds, method, memory, said=said, stop=stop)
+        plan = _plan(scene, spp, seconds, method, memory, said=said, stop=stop, unbiased=unbiased)
         _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
@@ -124,6 +127,7 @@ def render_scene(
         newest=newest,
         diagnostics=diagnostics,
         adaptive=sharing,
+        unbiased=unbiased,
         **options,
     )
     if plan is None:
@@ -151,6 +155,7 @@ def render_frames(
     seconds: float | None = None,
     memory: int | None = None,
     diagnostics: bool = False,
+    unbiased: bool = False,
     variant: str | None = None,
     skip: Callable[[int], bool] = lambda frame: False,
     stop: Callable[[], bool] = lambda: False,
@@ -201,6 +206,8 @@ def render_frames(
         animated = Path(camera).suffix.lower() in (".glb", ".gltf")
         camera = read_gltf_camera(camera, fps) if animated else read_camera_path(camera)
     options |= {"seconds": seconds, "memory": memory, "stop": stop, "diagnostics": diagnostics}
+    if not remembers:
+        options["unbiased"] = unbiased
     found = render_shot(
         Shot(describe, size, camera, sensor=sensor), frames, spp, seed, dt, skip=skip, sampler=sampler, **options
     )

@@ -92,6 +92,7 @@ def explore(
     said: Said = silent,
     stop: Stop = never,
     patient: bool = False,
+    unbiased: bool = False,
 ) -> list[Pipeline]:
     """The pipelines of a scene, for an image of its size; see ``plan``, which chooses of them. None where no trial fits
     into the time; ``patient``, the first sampler has a trial and a method however long they take.
@@ -104,7 +105,8 @@ def explore(
     pixels = round(PIXELS * min(1.0, max((seconds / LONG) ** 2, LEAST_PIXELS)))
     with at_most(scene, pixels) as scale:
         first = math.inf if patient else SHARE * seconds
-        trials = try_all(scene, able, lambda _: SHARE * seconds, first, clock=clock, said=said, stop=stop)
+        told = {"clock": clock, "said": said, "stop": stop, "unbiased": unbiased}
+        trials = try_all(scene, able, lambda _: SHARE * seconds, first, **told)
     if not trials or stop():
         return []
     found = measure(
@@ -147,6 +149,7 @@ def plan(
     clock: Callable[[], float] = time.perf_counter,
     said: Said = silent,
     stop: Stop = never,
+    unbiased: bool = False,
 ) -> Plan:
     """How to use so many ``seconds`` of the ``clock``, those of the pilot and of the method included.
 
@@ -154,14 +157,14 @@ def plan(
     then ``primal``, then all unbiased others that ``--sampler auto`` compares, as far as they fit into a fifth of the
     time, compilation included. The less time, the smaller are its images. Where there is no time for a pilot, and where
     it finds that nothing fits, the description decides, and what is left of the time is rendered. ``said`` is told what
-    is tried; ``stop`` ends the pilot. What it measures changes from run to run. Raises NgptError for a method that does
-    not run here or cannot use any of the stacks.
+    is tried; ``stop`` ends the pilot; ``unbiased`` is that of ``data_gen.render.render_stack``. What it measures
+    changes from run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
     start = clock()
     able = _able(scene, method)
     whole: list[Pipeline] = []
     if seconds >= LEAST_SECONDS and not stop():
-        whole = explore(scene, seconds, method, memory, clock=clock, said=said, stop=stop)
+        whole = explore(scene, seconds, method, memory, clock=clock, said=said, stop=stop, unbiased=unbiased)
     left = seconds - (clock() - start)
     if ranked := choose(whole, left):
         first = ranked[0]
@@ -180,6 +183,7 @@ def plan_sampler(
     *,
     said: Said = silent,
     stop: Stop = never,
+    unbiased: bool = False,
 ) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
@@ -208,7 +212,8 @@ def plan_sampler(
             return min(math.inf if spp is None else trials[sampler].seconds * spp * scale, longest)
 
         share = _SHARE_OF_RENDER
-        trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, said=said, stop=stop)
+        told = {"said": said, "stop": stop, "unbiased": unbiased}
+        trials = try_all(scene, names, lambda trials: share * whole(trials), share * longest, **told)
     found = (sampler, reason)
     if sampler in trials and not stop():
         found = best_of(measure(trials, methods=lambda name: [simple(name)], shared=False), whole(trials) / scale)

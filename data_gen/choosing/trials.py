@@ -76,13 +76,14 @@ def try_all(
     clock: Callable[[], float] = time.perf_counter,
     said: Callable[[str], None] = lambda line: None,
     stop: Callable[[], bool] = lambda: False,
+    unbiased: bool = False,
 ) -> dict[str, Trial]:
     """Trials of those that can render the scene, by name.
 
     All of them together may take as many seconds of the ``clock`` as the ``budget`` says, which is asked with the
     trials that there are: one that would not fit into the rest is left out, by what it takes to compile and to render.
     The ``first`` has a budget of its own, and is compiled in any case. ``said`` is told what is tried, and ``stop``
-    asked whether to end there.
+    asked whether to end there. ``unbiased`` is that of ``data_gen.render.render_stack``.
     """
     start, slow, trials = clock(), 1.0, {}
     for i, name in enumerate(samplers):
@@ -92,7 +93,7 @@ def try_all(
             continue
         said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
         begins = clock()
-        trial, compiled = try_out(scene, name, clock, rest, stop)
+        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased)
         if stop():
             break
         # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from
@@ -117,6 +118,7 @@ def try_out(
     clock: Callable[[], float] = time.perf_counter,
     limit: float = math.inf,
     stop: Callable[[], bool] = lambda: False,
+    unbiased: bool = False,
 ) -> tuple[Trial | None, float]:
     """Four small stacks by a sampler, and when its kernels were compiled.
 
@@ -129,7 +131,7 @@ def try_out(
     # What a render takes to begin is no part of what a sample takes; a render of another length tells the two apart.
     other = batch or 2 * SPP
     try:
-        render_stack(scene, 1, seed, sampler)
+        render_stack(scene, 1, seed, sampler, unbiased=unbiased)
     except NgptError:
         return None, clock()
     compiled = clock()
@@ -139,7 +141,7 @@ def try_out(
 
     def timed(n: int, seed: int) -> tuple[GradientStack, tuple[float, float]]:
         start, busy = clock(), time.process_time()
-        stack = render_stack(scene, n, seed, sampler)
+        stack = render_stack(scene, n, seed, sampler, unbiased=unbiased)
         # Of a graphics card, the seconds of the processor are not those of the samples.
         return stack, (clock() - start, time.process_time() - busy if mi.variant().startswith("llvm") else 0.0)
 

@@ -57,7 +57,7 @@ def denoising_of(args: argparse.Namespace) -> Denoising | None:
 
 def asked(args: argparse.Namespace) -> dict[str, Any]:
     """What ``render_scene`` and ``render_frames`` both take, by their names."""
-    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "variant")
+    names = ("spp", "seed", "sampler", "sensor", "size", "memory", "diagnostics", "unbiased", "variant")
     options = dict(args.option)
     check_options(args.sampler, options)  # so that none of them goes by another's name
     given = {name: getattr(args, name) for name in names}

@@ -82,6 +82,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--memory", type=positive, metavar="MIB", help="for paths and film (default: 6144)")
     parser.add_argument("--threads", type=positive, metavar="N", help="that work at once (default: all processors)")
     parser.add_argument(
+        "--unbiased",
+        action="store_true",
+        help="no path ends in a cache of what others have found: as the integrator of the scene, and noisier",
+    )
+    parser.add_argument(
         "--diagnostics",
         action="store_true",
         help="write rates of failed shifts and of lost values too",

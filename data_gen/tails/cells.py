@@ -45,7 +45,7 @@ class Trail:
         return cls(mi.Float(x.t), dr.zeros(mi.Float, dr.width(x.t)))
 
     def on(self, x: mi.SurfaceInteraction3f, smooth: mi.Bool, p: mi.Float, active: mi.Bool) -> Trail:
-        """At the next vertex ``x``, if there is one, behind an event that was ``smooth``, with density ``p``, or not."""
+        """At the next vertex ``x``, if there is one, behind an event of density ``p`` that was ``smooth``, or not."""
         there = active & x.is_valid()
         wider = x.t * dr.rsqrt(dr.maximum(p * dr.abs(x.wi.z), 1e-6))
         further = there & ~smooth & (self.spread == 0)

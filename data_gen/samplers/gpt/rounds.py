@@ -20,8 +20,6 @@ from data_gen.tails.cells import Place
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
 _SEED = 0x5441494C53
-# Such paths of the first round at least, however small the image is
-_LEAST = 1 << 13
 # The first round comes in two parts, since paths of the second may end in what those of the first have found.
 _FIRST_PART = 1 / 4
 # Where fewer of the first paths come by a place to end than this share of them, none end: it would cost more than it
@@ -64,12 +62,12 @@ class SharedTails:
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
-        wanted = max(round(schedule.paths_before(sample, spp) * pixels), _LEAST)
+        wanted = max(round(schedule.paths_before(sample, spp) * pixels), schedule.FEWEST)
         for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
             while self.fed < part:
                 first = self.fed == 0
                 with recording():
-                    able = self.feed(sensor, seed, pixels, min(part - self.fed, max(pixels, _LEAST)))
+                    able = self.feed(sensor, seed, pixels, min(part - self.fed, max(pixels, schedule.FEWEST)))
                 if first and able < _PAYS:
                     self.cache = None
                     return

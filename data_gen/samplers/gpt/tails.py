@@ -74,7 +74,7 @@ class Record:
 
 
 def feed(view, plan: Plan, known: Known, random, camera_ray: tuple) -> tuple[mi.UInt32, list[Record]]:
-    """Paths that feed the cache, from the ``camera_ray``, a ray and its importance: how many records each has, and these."""
+    """Paths that feed the cache, from a camera ray and its importance: how many records each has, and these."""
     (ray, importance), space, scene = camera_ray, plan.space, plan.space.scene
     first = space.first(view, ray, None, space.begin(random))
     x = media.vertex(mi.Ray3f(first.ray), first.hit, first.place)
