@@ -166,6 +166,7 @@ def main() -> None:
     parser.add_argument("scenes", nargs="+")
     parser.add_argument("--sampler", default="gpt")
     parser.add_argument("--points", default="sobol")
+    parser.add_argument("--tails", default="paths", help="shared: paths end in a cache, docs/samplers/tails.md")
     parser.add_argument("--spp", type=int, nargs="+", default=[16, 64])
     parser.add_argument("--every", type=int, nargs=2, metavar=("FIRST", "LAST"))
     parser.add_argument("--seeds", type=int, default=SEEDS)
@@ -188,7 +189,8 @@ def main() -> None:
     for name in args.scenes:
         scene = load_scene(os.fspath(name), size)
         for spp in args.spp:
-            stacks = [render_stack(scene, spp, s, args.sampler, points=args.points) for s in range(args.seeds)]
+            options = {"points": args.points, "tails": args.tails}
+            stacks = [render_stack(scene, spp, s, args.sampler, **options) for s in range(args.seeds)]
             found = real_over_claimed([stack.layers for stack in stacks])
             texts = [f"{found[layer][0]:.2f}, {found[layer][1]:.2f}" if layer in found else "-" for layer in LAYERS]
             print(f"| `{scene_name(name)}`, {spp} | {' | '.join(texts)} |", flush=True)

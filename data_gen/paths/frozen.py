@@ -24,7 +24,7 @@ class Frozen:
 
     All arrays that f uses are among its arguments, or belong to the ``scene``, or to attributes of the ``owners``. All
     else that f uses does not change while this object lives. Within f no width is a number. Where f cannot be recorded
-    it is called as it is, and a warning says so.
+    it is called as it is, and a warning says so; in spectral variants it always is.
     """
 
     def __init__(self, scene: mi.Scene, *owners: Any):
@@ -45,6 +45,9 @@ class Frozen:
         def tried(f: Callable) -> Any:
             return f(*args, *([sums()] if sums else []))
 
+        if mi.is_spectral:
+            # Dr.Jit does not find Mitsuba's tables of colours, and would be asked three times in vain.
+            return tried(evaluated(f))
         try:
             if f not in self.functions:
                 self.functions[f] = dr.freeze(as_wide_as_arguments(f), **self.options)

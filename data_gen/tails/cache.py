@@ -6,6 +6,7 @@ between two rounds: within a round nothing changes.
 
 from __future__ import annotations
 
+import logging
 import math
 from dataclasses import dataclass
 
@@ -13,6 +14,8 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.tails.cells import Place, coarser, key
+
+_LOG = logging.getLogger(f"ngpt.{__name__}")
 
 # Cells that there is room for, and the share of them that may be taken
 CELLS, _FULL = 1 << 20, 0.7
@@ -76,7 +79,7 @@ class Cache:
         self.keys, self.count, self.around = (dr.zeros(mi.UInt32, CELLS) for _ in range(3))
         # Of red, green and blue, and of squares
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(4)]
-        self.unit, self.cells, self.full = 0.0, 0, False
+        self.unit, self.full = 0.0, False
         self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
         dr.make_opaque(self.keys, self.count, self.around, self.sums, self.known.values)
 
@@ -135,8 +138,14 @@ class Cache:
 
     def settle(self, fineness: float) -> None:
         """Makes what is known anew, of all records so far; from here on cells have this ``fineness``."""
-        self.cells = int(dr.count(self.keys != 0)[0])
-        self.full = self.cells > _FULL * CELLS
+        cells = int(dr.count(self.keys != 0)[0])
+        if cells > _FULL * CELLS and not self.full:
+            self.full = True
+            _LOG.warning(
+                "the cache of tails is full (%d cells): light that comes to other places is found by single paths; "
+                "--unbiased does without the cache",
+                cells,
+            )
         n = mi.Float(dr.maximum(self.count, 1))
         light = [mi.Float(sum) for sum in self.sums[:3]]
         total = (light[0] + light[1] + light[2]) / 3

@@ -137,7 +137,7 @@ class GPT(GradientIntegrator):
         within = mi.MediumPtr(camera.sensor.get_medium()) if plan.space.media else None
         shifted = [camera.rays(shift) for shift in SHIFTS.values()]
         # Clones of the random numbers, here and below: features draw as many as they like, and change no path.
-        paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within, known)
+        paths = trace(self, plan, camera.random.clone(), (ray, importance), shifted, within, known=known)
         Le = self.emission_in_pixel(scene, camera, paths.Le, plan.space.media, within)
         L, Le, L_caustic = (to_rgb(light, ray.wavelengths) for light in (paths.L, Le, paths.L_caustic))
         Δ = [to_rgb(y.Δ, ray.wavelengths) for y in paths.offsets]

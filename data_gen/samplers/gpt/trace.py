@@ -27,7 +27,7 @@ class Traced:
     chain: Chain | None  # what the shift "manifold" has recorded
 
 
-def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, known=None) -> Traced:
+def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=None, *, known=None) -> Traced:
     """Traces base paths that begin with ``camera_ray``, a ray and its importance, and their four offset paths.
 
     Those begin with the ``shifted`` rays, and are in the order of SHIFTS. The camera is in the medium ``within``;
@@ -64,11 +64,11 @@ def trace(view, plan: Plan, random, camera_ray: tuple, shifted: list, within=Non
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
         if not plan.replays:
             # Without it in the loop, that loop has no paths apart.
-            path, so_far = go_on(scene, plan, random, path, so_far, known, first=True)
+            path, so_far = go_on(scene, plan, random, path, so_far, known=known, first=True)
         return walk(scene, plan, random, path, so_far, known)
 
 
-def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, known, first: bool = False) -> tuple[Path, Traced]:
+def go_on(scene, plan: Plan, random, path: Path, so_far: Traced, *, known, first=False) -> tuple[Path, Traced]:
     """One step of all paths."""
     # The base path first: an offset path can only join a vertex that is known.
     step, path = base_step(scene, plan, random, path, so_far.offsets)
@@ -90,6 +90,6 @@ def walk(scene, plan: Plan, random, path: Path, so_far: Traced, known) -> Traced
     """All that is left of all paths."""
     active = path.goes_on(plan, so_far.offsets)
     while dr.hint(active, label="gpt", exclude=[known]):
-        path, so_far = go_on(scene, plan, random, path, so_far, known)
+        path, so_far = go_on(scene, plan, random, path, so_far, known=known)
         active = path.goes_on(plan, so_far.offsets)
     return so_far

@@ -63,7 +63,7 @@ def shared_tails(scene, integrator, features: bool, places: Places | None) -> Sh
 
     def known_samples(known, camera):
         def L(random, ray, medium, active):
-            paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], None, known)
+            paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], None, known=known)
             return paths.L + paths.Le
 
         return samples(scene, integrator, L, features, camera)

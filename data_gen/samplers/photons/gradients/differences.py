@@ -149,7 +149,8 @@ def differences(passes: Passes, near: Near, paths: list, longest: mi.UInt32, mos
     ``longest``: edges that the light path of a photon may have, of each base path.
     """
     frozen, world = passes.frozen, passes.world
-    points, receives = frozen(where, near, world, paths[0])
+    # Recorded each time, which is soon done: what it returns may hold a whole map, which Dr.Jit cannot make anew.
+    points, receives = near.where(world, paths[0])
     dr.eval(points, receives)
     for pairs in pieces(near, points, receives, most, frozen):
         found = frozen(of_pairs, near, world, pairs, paths, longest)
@@ -181,10 +182,6 @@ class Found:
 
 def spread_out(near: Any, world: World, paths: list) -> list:
     return near.spread(world, paths)
-
-
-def where(near: Near, world: World, base: Any) -> tuple:
-    return near.where(world, base)
 
 
 def of_pairs(near: Near, world: World, pairs: Pairs, paths: list, longest: mi.UInt32) -> Found:
