@@ -22,7 +22,7 @@ from data_gen.scenes.cameras import place_of
 from data_gen.scenes.facts import scene_facts
 from data_gen.scenes.lamps import weighed
 from data_gen.scenes.load import check_scene
-from data_gen.tails.schedule import FIRST, LEAST_PATHS
+from data_gen.tails.schedule import FIRST, LEAST_MIB, LEAST_PATHS, MIB
 from ngpt.errors import NgptError, WrongUse, stop_if_interrupted
 from ngpt.io.exr import with_channels
 from ngpt.layers import FEATURE_NOISE
@@ -93,12 +93,11 @@ def render_stack(
     settings = entry.settings(options)
     if "tails" in settings:
         why_not = why_not_shared(facts, settings, mi.variant())
-        if why_not and options.get("tails") == "shared":
+        if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
-        pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
-        enough = pixels * (spp or FIRST) >= LEAST_PATHS
-        if enough and not unbiased and not why_not and "tails" not in options:
+        if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, spp, memory):
             settings["tails"] = "shared"
+            memory -= MIB
     if adaptive is not None:
         check_adaptive(adaptive, entry, settings, spp)
     _LOG.info("sampler %s, options %s", sampler, options_as_attribute(entry, settings) or "as by default")
@@ -147,6 +146,12 @@ def render_stack(
     if failed:
         raise Unfinished(str(failed) or type(failed).__name__, stack) from failed
     return stack
+
+
+def _enough_to_share(scene: mi.Scene, spp: int | None, memory: int) -> bool:
+    """Whether a render has paths and memory enough for a cache that they share."""
+    pixels = math.prod(int(n) for n in scene.sensors()[0].film().crop_size())
+    return pixels * (spp or FIRST) >= LEAST_PATHS and memory >= LEAST_MIB
 
 
 def options_as_attribute(entry: Entry, settings: dict[str, Any]) -> dict[str, str]:

@@ -80,6 +80,8 @@ class GPT(GradientIntegrator):
                              Its variance is 2.6 times lower, but the noise of neighbouring pixels is then correlated.
     ``caustic``              true: light that has come over a rough surface and then mirrors, glass or sharp gloss is in
                              a layer of its own, not in the gradients, see ``data_gen.paths.caustic``; false: it is
+    ``tails``                "paths": each path finds all of its light; "shared": it may end where others have been, see
+                             ``data_gen.tails``
     ``volumes``              false: media are not seen, as with ``path``; true: they are, as with ``volpath``
     ``diagnostics``          false; true adds the layer ``shift_failures``, the share in [0, 1] of a sample's shifts
                              without a counterpart: rejected, or of zero density, at a step that the base path took
@@ -97,6 +99,11 @@ class GPT(GradientIntegrator):
         self.volumes, self.shared = props.get("volumes", False), self.options["tails"] == "shared"
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
+
+        if self.shared and (self.reuse or self.shift == "manifold"):
+            raise NgptError(
+                "gpt: tails=shared goes without 'reuse' and without shift 'manifold', which need whole paths"
+            )
 
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
@@ -117,6 +124,8 @@ class GPT(GradientIntegrator):
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
         volumes = self.volumes and bool(media_of(scene))
+        if self.shared and (volumes or "rgb" not in mi.variant()):
+            raise NgptError("gpt: tails=shared is for scenes without media, in RGB; use tails=paths")
         more = {"caustic": self.caustic, "volumes": volumes, "places": self.places, "shared": self.shared}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
