@@ -21,10 +21,13 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 CELLS, _FULL = 1 << 20, 0.7
 # Places beside each other in the table, in which a cell may be
 _PLACES = 32
-# Sizes of cells that a record goes into, each of twice the side of the one before
-LEVELS = 3
-# A cell is trusted once it has so many records, and as many that count (see ``Cache``) may be expected of it.
-LEAST, EVIDENCE = 8, 2.0
+# Sizes of cells that paths look up, each of twice the side of the one before; and sizes beyond, to the one that shares
+# what single records have brought
+LEVELS, BEYOND = 3, 3
+# A cell is trusted once it has so many records.
+LEAST = 8
+# What one record may bring to its cell, over what all others there have brought
+SHARE = 0.5
 # The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
 # both as powers of two
 _BITS, _MOST_BITS = 30, 40
@@ -66,22 +69,18 @@ class Known:
 class Cache:
     """Sums by cell, which grow, and what is known of them.
 
-    How far the mean of a cell is to be relied on depends on the number of records that count,
-
-        n' = (Σ x)² / Σ x²,
-
-    which is 1 where a single one has all the light. Cells without such a record look certain, and are too dark: were
-    each judged by its own records, the light of the others would be lost. So the cell around them, of twice the side,
-    judges all of them together.
+    A single path that has found a rare light makes a bright spot, which no denoiser removes. A cell that leaves such a
+    record out, or is not used for it, would do no better: the light of all cells that have missed it would be lost. So
+    what a record brings beyond ``SHARE`` goes to all cells around, by their numbers of records. The sum of all light
+    stays, and the spot spreads. With more records there is less of that.
     """
 
     def __init__(self, fineness: float):
-        self.keys, self.count, self.around = (dr.zeros(mi.UInt32, CELLS) for _ in range(3))
-        # Of red, green and blue, and of squares
-        self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(4)]
+        self.keys, self.count, self.around, self.most = (dr.zeros(mi.UInt32, CELLS) for _ in range(4))
+        self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3)]
         self.unit, self.full = 0.0, False
         self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
-        dr.make_opaque(self.keys, self.count, self.around, self.sums, self.known.values)
+        dr.make_opaque(self.keys, self.count, self.around, self.most, self.sums, self.known.values)
 
     def add(self, place: Place, value: mi.Color3f) -> None:
         """Adds records, ``value`` each, to their cells and to those around."""
@@ -93,27 +92,30 @@ class Cache:
             self.unit = 2.0 ** (math.ceil(math.log2(most)) - _BITS)
         # Opaque: it would be compiled into the kernel, a new one for every scene.
         light = mi.Color3f(dr.minimum(value * dr.opaque(mi.Float, 1 / self.unit), 2.0**_MOST_BITS))
-        square = dr.square(dr.mean(light) * 2.0**-_BITS) * 2.0**_BITS
-        counts = [mi.Int64(each + 0.5) for each in (*light, square)]
+        counts = [mi.Int64(each + 0.5) for each in light]
+        # Floats above 0 are in the order of their bits; those of integers are the same in all kernels.
+        largest = dr.reinterpret_array(mi.UInt32, mi.Float(counts[0] + counts[1] + counts[2]))
         # All levels at once, from the coarsest: fewer kernels
         places = [place]
-        for _ in range(LEVELS - 1):
+        for _ in range(LEVELS + BEYOND - 1):
             places.insert(0, coarser(places[0]))
         h, name = (dr.concat(parts) for parts in zip(*map(key, places), strict=True))
         n, lanes = dr.width(value), dr.arange(mi.UInt32, dr.width(h))
         record = lanes % dr.opaque(mi.UInt32, n)
-        dr.eval(h, name, good, counts)
+        dr.eval(h, name, good, counts, largest)
         slot, placed = self._slots(h, name, dr.gather(mi.Bool, good, record))
         direct = {"mode": dr.ReduceMode.Direct}
         for sum, count in zip(self.sums, counts, strict=True):
             dr.scatter_add(sum, dr.gather(mi.Int64, count, record), slot, placed, **direct)
         dr.scatter_add(self.count, mi.UInt32(1), slot, placed, **direct)
+        largest = dr.gather(mi.UInt32, largest, record)
+        dr.scatter_reduce(dr.ReduceOp.Max, self.most, largest, slot, placed, **direct)
         # The coarsest cells have none around them.
         within = placed & (lanes >= dr.opaque(mi.UInt32, n))
         around = lanes - dr.opaque(mi.UInt32, n)
         within &= dr.gather(mi.Bool, placed, around, within)
         dr.scatter(self.around, dr.gather(mi.UInt32, slot, around, within) + 1, slot, within)
-        dr.eval(self.keys, self.count, self.around, self.sums)
+        dr.eval(self.keys, self.count, self.around, self.most, self.sums)
 
     def _slots(self, h: mi.UInt32, name: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """Where the cells are, once there is one for each record; there are no new ones where the table is full."""
@@ -146,18 +148,31 @@ class Cache:
                 "--unbiased does without the cache",
                 cells,
             )
-        n = mi.Float(dr.maximum(self.count, 1))
-        light = [mi.Float(sum) for sum in self.sums[:3]]
-        total = (light[0] + light[1] + light[2]) / 3
-        # The squares have the unit 2^_BITS. Where they are nothing beside it there is next to no light.
-        evidence = dr.select(self.sums[3] > 0, dr.square(total * 2.0**-_BITS) * 2.0**_BITS / mi.Float(self.sums[3]), n)
-        dr.eval(evidence)
-        # Of four cells of a surface, one is expected to have a quarter of it.
-        within = self.around > 0
-        expected = dr.gather(mi.Float, evidence, self.around - 1, within) / 4
-        trusted = (self.count >= LEAST) & (~within | (expected >= EVIDENCE))
+        n = dr.maximum(self.count, 1)
+        light = [mi.Float(sum) for sum in self.sums]
+        total = mi.Float(self.sums[0] + self.sums[1] + self.sums[2])
+        largest = dr.reinterpret_array(mi.Float, self.most)
+        beyond = dr.maximum(largest - SHARE * dr.maximum(total - largest, 0), 0)
+        # It has the colour of the cell.
+        spread = dr.select(total > 0, dr.minimum(beyond / total, 1), 0)
+        far, there = self.around, self.around > 0
+        for _ in range(BEYOND - 1):
+            far = dr.gather(mi.UInt32, self.around, far - 1, there)
+            there &= far > 0
+        far -= 1
+        records = dr.zeros(mi.UInt32, CELLS)
+        dr.scatter_add(records, self.count, far, there, mode=dr.ReduceMode.Direct)
+        shared = []
+        for each in light:
+            given = dr.zeros(mi.Int64, CELLS)
+            dr.scatter_add(given, mi.Int64(each * spread + 0.5), far, there, mode=dr.ReduceMode.Direct)
+            dr.eval(given, records)
+            back = dr.gather(mi.Int64, given, far, there)
+            of = dr.maximum(dr.gather(mi.UInt32, records, far, there), 1)
+            shared.append(dr.select(there, each * (1 - spread) / n + mi.Float(back) / of, each / n))
+        trusted = self.count >= LEAST
         unit = dr.opaque(mi.Float, self.unit)
-        values = mi.Vector4f(*(unit * each / n for each in light), dr.select(trusted, mi.Float(1), 0))
+        values = mi.Vector4f(*(unit * each for each in shared), dr.select(trusted, mi.Float(1), 0))
         flat = dr.zeros(mi.Float, 4 * CELLS)
         dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
         self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
