@@ -116,6 +116,11 @@ class Config:
         return self.samplers.get(self.sampler, {})
 
     @property
+    def unbiased_options(self) -> dict[str, Any]:
+        """The same for references, whose paths find all of their light by themselves."""
+        return {name: value for name, value in self.options.items() if name != "tails"}
+
+    @property
     def pairs(self) -> bool:
         """Whether its crops have no reference, and two inputs of equally many samples that judge each other."""
         return self.reference_spp == 0

@@ -232,7 +232,8 @@ def _crop(
         return CropData([stack for stack, _ in cleaned], counts), told
     clock = time.perf_counter()
     spp = -(-config.reference_spp // HALVES)
-    halves = [render_stack(scene, spp, seed, config.sampler, made=made, **config.options) for seed in seeds[-HALVES:]]
+    options = {"made": made, **config.unbiased_options}
+    halves = [render_stack(scene, spp, seed, config.sampler, **options) for seed in seeds[-HALVES:]]
     converged = merge(halves)
     reference, caustic = references(converged, config.reference_method)
     apart = [references(half, config.reference_method)[0] for half in halves]

@@ -42,6 +42,20 @@ def test_damage_is_named():
             unpacked(bad, (4, 4), "x.safetensors")
 
 
+def test_references_share_no_tails(renderer, tmp_path):
+    """Those of inputs that do are the same to the bit."""
+    read = []
+    for name, tails in (("paths", {}), ("shared", {"gpt": {"tails": "shared"}})):
+        config = replace(SMALL, crops=1, samplers=tails)
+        (job,) = config.plan()
+        (tmp_path / name / "shards").mkdir(parents=True)
+        shard = Shard(tmp_path / name / crops.make_shard(config, job, str(tmp_path / name), "llvm_ad_rgb"))
+        read.append(Crop(shard, 0, "made", tuple(shard.record["crops"][0]["spp"])))
+    paths, shared = read
+    assert np.array_equal(paths.reference, shared.reference)
+    assert not np.array_equal(paths.stack(1)["primal"], shared.stack(1)["primal"])
+
+
 def test_inputs_are_rendered_anew(renderer, tmp_path):
     """The reference and the view stay; the noise is another."""
     (job,) = SMALL.plan()
