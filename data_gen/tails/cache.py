@@ -21,13 +21,10 @@ _LOG = logging.getLogger(f"ngpt.{__name__}")
 CELLS, _FULL = 1 << 20, 0.7
 # Places beside each other in the table, in which a cell may be
 _PLACES = 32
-# Sizes of cells that paths look up, each of twice the side of the one before; and sizes beyond, to the one that shares
-# what single records have brought
-LEVELS, BEYOND = 3, 3
-# A cell is trusted once it has so many records.
-LEAST = 8
-# What one record may bring to its cell, over what all others there have brought
-SHARE = 0.5
+# Sizes of cells that a record goes into, each of twice the side of the one before
+LEVELS = 2
+# A cell is trusted once it has so many records, whatever they hold: see ``Cache``.
+LEAST = 16
 # The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
 # both as powers of two
 _BITS, _MOST_BITS = 30, 40
@@ -69,53 +66,42 @@ class Known:
 class Cache:
     """Sums by cell, which grow, and what is known of them.
 
-    A single path that has found a rare light makes a bright spot, which no denoiser removes. A cell that leaves such a
-    record out, or is not used for it, would do no better: the light of all cells that have missed it would be lost. So
-    what a record brings beyond ``SHARE`` goes to all cells around, by their numbers of records. The sum of all light
-    stays, and the spot spreads. With more records there is less of that.
+    The number of a cell's records decides whether it is trusted, and not the light in them. Where light is rare, a cell
+    that has found some looks doubtful, and one that has missed it looks sure. To believe the sure ones alone would lose
+    the light: see docs/samplers/tails.md.
     """
 
     def __init__(self, fineness: float):
-        self.keys, self.count, self.around, self.most = (dr.zeros(mi.UInt32, CELLS) for _ in range(4))
+        self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3)]
         self.unit, self.full = 0.0, False
         self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
-        dr.make_opaque(self.keys, self.count, self.around, self.most, self.sums, self.known.values)
+        dr.make_opaque(self.keys, self.count, self.sums, self.known.values)
 
     def add(self, place: Place, value: mi.Color3f) -> None:
         """Adds records, ``value`` each, to their cells and to those around."""
         good = dr.isfinite(dr.sum(value)) & (dr.min(value) >= 0)
         if not self.unit:
             most = dr.max(dr.select(good, dr.max(value), 0))[0]
-            if not most > 0:
-                return
-            self.unit = 2.0 ** (math.ceil(math.log2(most)) - _BITS)
+            if most > 0:
+                # No less than what has an inverse among floats
+                self.unit = 2.0 ** max(math.ceil(math.log2(most)) - _BITS, -126)
         # Opaque: it would be compiled into the kernel, a new one for every scene.
-        light = mi.Color3f(dr.minimum(value * dr.opaque(mi.Float, 1 / self.unit), 2.0**_MOST_BITS))
+        light = mi.Color3f(dr.minimum(value * dr.opaque(mi.Float, 1 / self.unit if self.unit else 0), 2.0**_MOST_BITS))
         counts = [mi.Int64(each + 0.5) for each in light]
-        # Floats above 0 are in the order of their bits; those of integers are the same in all kernels.
-        largest = dr.reinterpret_array(mi.UInt32, mi.Float(counts[0] + counts[1] + counts[2]))
-        # All levels at once, from the coarsest: fewer kernels
         places = [place]
-        for _ in range(LEVELS + BEYOND - 1):
-            places.insert(0, coarser(places[0]))
+        for _ in range(LEVELS - 1):
+            places.append(coarser(places[-1]))
+        # All levels at once: fewer kernels
         h, name = (dr.concat(parts) for parts in zip(*map(key, places), strict=True))
-        n, lanes = dr.width(value), dr.arange(mi.UInt32, dr.width(h))
-        record = lanes % dr.opaque(mi.UInt32, n)
-        dr.eval(h, name, good, counts, largest)
+        record = dr.arange(mi.UInt32, dr.width(h)) % dr.opaque(mi.UInt32, dr.width(value))
+        dr.eval(h, name, good, counts)
         slot, placed = self._slots(h, name, dr.gather(mi.Bool, good, record))
         direct = {"mode": dr.ReduceMode.Direct}
         for sum, count in zip(self.sums, counts, strict=True):
             dr.scatter_add(sum, dr.gather(mi.Int64, count, record), slot, placed, **direct)
         dr.scatter_add(self.count, mi.UInt32(1), slot, placed, **direct)
-        largest = dr.gather(mi.UInt32, largest, record)
-        dr.scatter_reduce(dr.ReduceOp.Max, self.most, largest, slot, placed, **direct)
-        # The coarsest cells have none around them.
-        within = placed & (lanes >= dr.opaque(mi.UInt32, n))
-        around = lanes - dr.opaque(mi.UInt32, n)
-        within &= dr.gather(mi.Bool, placed, around, within)
-        dr.scatter(self.around, dr.gather(mi.UInt32, slot, around, within) + 1, slot, within)
-        dr.eval(self.keys, self.count, self.around, self.most, self.sums)
+        dr.eval(self.keys, self.count, self.sums)
 
     def _slots(self, h: mi.UInt32, name: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
         """Where the cells are, once there is one for each record; there are no new ones where the table is full."""
@@ -148,31 +134,9 @@ class Cache:
                 "--unbiased does without the cache",
                 cells,
             )
-        n = dr.maximum(self.count, 1)
-        light = [mi.Float(sum) for sum in self.sums]
-        total = mi.Float(self.sums[0] + self.sums[1] + self.sums[2])
-        largest = dr.reinterpret_array(mi.Float, self.most)
-        beyond = dr.maximum(largest - SHARE * dr.maximum(total - largest, 0), 0)
-        # It has the colour of the cell.
-        spread = dr.select(total > 0, dr.minimum(beyond / total, 1), 0)
-        far, there = self.around, self.around > 0
-        for _ in range(BEYOND - 1):
-            far = dr.gather(mi.UInt32, self.around, far - 1, there)
-            there &= far > 0
-        far -= 1
-        records = dr.zeros(mi.UInt32, CELLS)
-        dr.scatter_add(records, self.count, far, there, mode=dr.ReduceMode.Direct)
-        shared = []
-        for each in light:
-            given = dr.zeros(mi.Int64, CELLS)
-            dr.scatter_add(given, mi.Int64(each * spread + 0.5), far, there, mode=dr.ReduceMode.Direct)
-            dr.eval(given, records)
-            back = dr.gather(mi.Int64, given, far, there)
-            of = dr.maximum(dr.gather(mi.UInt32, records, far, there), 1)
-            shared.append(dr.select(there, each * (1 - spread) / n + mi.Float(back) / of, each / n))
-        trusted = self.count >= LEAST
-        unit = dr.opaque(mi.Float, self.unit)
-        values = mi.Vector4f(*(unit * each for each in shared), dr.select(trusted, mi.Float(1), 0))
+        each = dr.opaque(mi.Float, self.unit) / dr.maximum(self.count, 1)
+        trusted = dr.select(self.count >= LEAST, mi.Float(1), 0)
+        values = mi.Vector4f(*(each * mi.Float(sum) for sum in self.sums), trusted)
         flat = dr.zeros(mi.Float, 4 * CELLS)
         dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
         self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
