@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import logging
 import math
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -93,7 +95,7 @@ class Cache:
         for _ in range(LEVELS - 1):
             places.append(coarser(places[-1]))
         # All levels at once: fewer kernels
-        h, name = (dr.concat(parts) for parts in zip(*map(key, places), strict=True))
+        h, name = (joined(parts) for parts in zip(*map(key, places), strict=True))
         record = dr.arange(mi.UInt32, dr.width(h)) % dr.opaque(mi.UInt32, dr.width(value))
         dr.eval(h, name, good, counts)
         slot, placed = self._slots(h, name, dr.gather(mi.Bool, good, record))
@@ -141,3 +143,13 @@ class Cache:
         dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
         self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
         dr.eval(self.known.keys, self.known.values)
+
+
+def joined(parts: Iterable[Any]) -> Any:
+    """Arrays one behind the other. ``dr.concat`` compiles their widths into its kernels, which are others each time."""
+    parts = list(parts)
+    whole, begin = dr.empty(type(parts[0]), sum(map(dr.width, parts))), 0
+    for part in parts:
+        dr.scatter(whole, part, dr.arange(mi.UInt32, dr.width(part)) + dr.opaque(mi.UInt32, begin))
+        begin += dr.width(part)
+    return whole

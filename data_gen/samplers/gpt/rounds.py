@@ -15,7 +15,7 @@ from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
 from data_gen.samplers.gpt.tails import feed
 from data_gen.tails import schedule
-from data_gen.tails.cache import Cache, Known
+from data_gen.tails.cache import Cache, Known, joined
 from data_gen.tails.cells import Place
 
 # Paths that feed the cache have random numbers of their own: "TAILS".
@@ -88,7 +88,7 @@ class SharedTails:
         if there:
             # One by one, the kernels that add them would take longer to begin than to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
-            x, y, z, code, level, *value = (dr.concat(list(parts)) for parts in fields)
+            x, y, z, code, level, *value = map(joined, fields)
             self.cache.add(Place(mi.Point3f(x, y, z), code, level), mi.Color3f(*value))
         return dr.width(lanes[0]) / n
 
