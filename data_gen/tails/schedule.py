@@ -30,5 +30,5 @@ def paths_before(sample: int, spp: int | None) -> float:
 
 
 def fineness(sample: int) -> float:
-    """The fineness of cells in the round that begins with this ``sample``."""
-    return FINENESS * max(1.0, sample / 64) ** _RATE
+    """The fineness of cells in the round that this ``sample`` is in."""
+    return FINENESS * max(1.0, end_of_round(sample) / 128) ** _RATE

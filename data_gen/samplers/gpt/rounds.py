@@ -41,7 +41,7 @@ class SharedTails:
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.view, self.plan, self.frozen, self.take = view, plan, frozen, take
         self.cache: Cache | None = None
-        self.fed = 0
+        self.fed, self.fineness = 0, 0.0
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
         self.take(self.cache and self.cache.known, camera, film)
@@ -60,11 +60,13 @@ class SharedTails:
         ``spp`` is the number of all samples, if it is known.
         """
         if sample == 0:
-            self.cache, self.fed = Cache(schedule.fineness(0)) if self.plan.matt.any else None, 0
+            self.fineness, self.fed = schedule.fineness(0), 0
+            self.cache = Cache(self.fineness) if self.plan.matt.any else None
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
         wanted = max(round(schedule.paths_before(sample, spp) * pixels), schedule.FEWEST)
+        fineness = schedule.fineness(sample)
         for part in (round(_FIRST_PART * wanted), wanted) if sample == 0 else (wanted,):
             while self.fed < part:
                 first = self.fed == 0
@@ -73,7 +75,10 @@ class SharedTails:
                 if first and able < _PAYS:
                     self.cache = None
                     return
-                self.cache.settle(schedule.fineness(sample))
+                self.cache.settle(fineness)
+        if fineness != self.fineness:
+            self.cache.settle(fineness)
+            self.fineness = fineness
 
     def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""
