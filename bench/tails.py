@@ -1,0 +1,282 @@
+"""What shared tails are worth: seconds and errors with tails=shared over those with tails=paths.
+
+    python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
+
+Samplers `primal` (as it is, "raw", and `oidn`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine`, `oidn`). Of each cell:
+
+    seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
+    error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
+    steady     the same error, relative to the denoised reference, which also says which pixels are the worst
+    blocks     root of the same error of means over 8x8 pixels; none where it is below what the halves can tell
+    energy     mean of the image over the mean of the reference
+
+Where a reference is noisy most of its pixels are too dark, and these count more for it: ``error`` has a floor there,
+and images that are too dark come below it. ``steady`` has none.
+
+References are NAME-WxH-a.exr and -b.exr of the folder; what is missing is rendered there, without shared tails. At
+equal whole time a cell with shared tails is over the errors of its own sampler and method with tails=paths, read off
+between their numbers of samples; for the marks see ``ngpt.evaluation.curves``. W, C and W/C of gradients are against
+`primal` with the same tails (``ngpt.evaluation.worth``). Each cell is written as soon as it is there, and cells that
+the file has already are not measured again. Values are medians over seeds, means over scenes geometric.
+"""
+
+import argparse
+import gc
+import json
+import os
+import resource
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import ngpt
+from bench.claims import blocks
+from bench.common import metadata, save
+from ngpt.evaluation.averages import mean, median
+from ngpt.evaluation.config import scene_name
+from ngpt.evaluation.curves import error_at, joined
+from ngpt.evaluation.references import HALVES, Reference, read_reference
+from ngpt.evaluation.worth import worth_of_gradients, worth_tables
+from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
+
+RAW = "raw"
+METHODS = {"primal": [RAW, "oidn"], "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"]}
+TAILS = ("paths", "shared")
+VALUES = ("error", "steady", "FLIP", "blocks", "energy")
+ERRORS = VALUES[:-1]
+# Far from those that images have
+REFERENCE_SEED = 1 << 20
+# With these a render comes to its second round of samples: all kernels are compiled.
+WARM_SPP = 9
+CELL = ("scene", "size", "sampler", "tails", "spp", "seed")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="*", metavar="SCENE", help="files or built-in names; none: only the tables")
+    parser.add_argument("--references", type=Path, metavar="FOLDER")
+    parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
+    parser.add_argument("--size", default="640x360")
+    parser.add_argument("--samplers", nargs="+", default=list(METHODS), choices=list(METHODS))
+    parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1])
+    parser.add_argument("--groups", nargs="*", default=[], metavar="NAME=SCENE,...", help="scenes to take means over")
+    parser.add_argument("-o", "--output", type=Path, default=Path("bench/results/tails.json"))
+    args = parser.parse_args()
+    if args.scenes and not args.references:
+        parser.error("give the folder of --references")
+    result = {
+        "benchmark": "tails",
+        "metadata": metadata("mitsuba", "drjit", "mitsuba-oidn", "onnxruntime"),
+        "cells": [],
+    }
+    if args.output.exists():
+        result["cells"] = json.loads(args.output.read_text())["cells"]
+    for scene in args.scenes:
+        for cell in measured(scene, args, {place(cell) for cell in result["cells"]}):
+            result["cells"].append(cell)
+            save(args.output, result)
+            print(*place(cell), f"{cell['seconds']:.2f} s", flush=True)
+    groups = dict(text.split("=", 1) for text in args.groups)
+    show(result["cells"], {name: members.split(",") for name, members in groups.items()})
+
+
+def place(cell: dict[str, Any]) -> tuple:
+    return tuple(cell[name] for name in CELL)
+
+
+def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
+    """The cells of a scene that are not ``known``, one after the other."""
+    from data_gen.backend import use_variant
+    from data_gen.render import render_stack
+    from data_gen.scenes.load import load_scene
+
+    use_variant()
+    # A kernel knows the shapes of all scenes in memory.
+    gc.collect()
+    loaded = load_scene(scene, tuple(map(int, args.size.split("x"))))
+    reference = reference_of(loaded, scene, args)
+    clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
+    for sampler in args.samplers:
+        warm: set[str] = set()
+        for spp in args.spp:
+            for seed in args.seeds:
+                for tails in TAILS:
+                    values = (scene_name(scene), args.size, sampler, tails, spp, seed)
+                    if values in known:
+                        continue
+                    if tails not in warm:
+                        stack = render_stack(loaded, WARM_SPP, 0, sampler, tails=tails)
+                        for method in METHODS[sampler]:
+                            image_of(stack, method)
+                        warm.add(tails)
+                    load, start = os.getloadavg()[0], processor_seconds()
+                    stack = render_stack(loaded, spp, seed, sampler, tails=tails)
+                    cell = dict(zip(CELL, values, strict=True)) | {"seconds": processor_seconds() - start}
+                    cell |= {"load average": load, "options": stack.attributes.get("ngpt:samplerOptions", "")}
+                    yield cell | {"methods": {name: judged(stack, name, reference, clean) for name in METHODS[sampler]}}
+
+
+def processor_seconds() -> float:
+    used = resource.getrusage(resource.RUSAGE_SELF)
+    return used.ru_utime + used.ru_stime
+
+
+def reference_of(loaded: Any, scene: str, args: argparse.Namespace) -> Reference:
+    from data_gen.render import render_stack
+
+    files = [args.references / f"{scene_name(scene)}-{args.size}{half}.exr" for half in HALVES]
+    for i, file in enumerate(files):
+        if not file.exists():
+            print(f"rendering {file}", flush=True)
+            ngpt.write(file, render_stack(loaded, args.reference_spp, REFERENCE_SEED + i, "primal", tails="paths"))
+    return read_reference(files)
+
+
+def image_of(stack: ngpt.GradientStack, method: str) -> np.ndarray:
+    return stack["primal"] if method == RAW else ngpt.reconstruct(stack, method).image
+
+
+def judged(stack: ngpt.GradientStack, method: str, reference: Reference, clean: np.ndarray) -> dict[str, float | None]:
+    """Seconds of the reconstruction, and ``VALUES``; no FLIP of the raw primal."""
+    start = processor_seconds()
+    image = image_of(stack, method)
+    seconds = processor_seconds() - start if method != RAW else 0.0
+    names = ["relMSE trimmed", *(["FLIP"] if method != RAW else [])]
+    found = scores(names, image, *reference.images)
+    steady = (squared_error(image, *halves) / (clean**2 + EPSILON) for halves in (reference.images, (clean,)))
+    coarse = relmse_trimmed(*(blocks(each.astype(np.float64)) for each in (image, *reference.images)))
+    return {
+        "seconds": seconds,
+        "error": found["relMSE trimmed"],
+        "steady": trimmed_mean(*steady, share=0.001),
+        "FLIP": found.get("FLIP"),
+        "blocks": coarse**0.5 if coarse > 0 else None,
+        "energy": float(image.mean(dtype=np.float64) / reference.mean.mean(dtype=np.float64)),
+    }
+
+
+def rows_of(cells: list[dict]) -> dict[tuple, dict[int, dict[str, dict]]]:
+    """(scene, size, sampler, method) -> samples -> tails -> medians over seeds, also of ``render`` and ``whole``."""
+    each: dict[tuple, dict[int, dict[str, list]]] = {}
+    for cell in cells:
+        for method, values in cell["methods"].items():
+            line = values | {"render": cell["seconds"], "whole": cell["seconds"] + values["seconds"]}
+            by_spp = each.setdefault((cell["scene"], cell["size"], cell["sampler"], method), {})
+            by_spp.setdefault(cell["spp"], {}).setdefault(cell["tails"], []).append(line)
+    return {
+        key: {
+            spp: {
+                tails: {name: median(line.get(name) for line in lines) for name in ("render", "whole", *VALUES)}
+                for tails, lines in by.items()
+            }
+            for spp, by in sorted(by_spp.items())
+        }
+        for key, by_spp in each.items()
+    }
+
+
+def ratios(by_spp: dict[int, dict[str, dict]], spp: int) -> dict[str, tuple[float, str]]:
+    """Shared over paths, with marks: ``seconds``, and errors at equal samples and at equal whole time."""
+    paths, shared = (by_spp[spp].get(tails) for tails in TAILS)
+    found: dict[str, tuple[float, str]] = {}
+    if not paths or not shared:
+        return found
+    found["seconds"] = shared["whole"] / paths["whole"], ""
+    for name in ERRORS:
+        if (shared[name] or 0) <= 0 or (paths[name] or 0) <= 0:
+            continue
+        found[f"{name}, samples"] = shared[name] / paths[name], ""
+        lines = [by["paths"] for by in by_spp.values() if "paths" in by]
+        points = [(line["whole"], line[name]) for line in lines if (line[name] or 0) > 0]
+        if answer := error_at(shared["whole"], points):
+            found[f"{name}, time"] = shared[name] / answer[0], answer[1]
+    return found
+
+
+RATIOS = ("seconds", *(f"{name}, {at}" for at in ("samples", "time") for name in ERRORS))
+
+
+def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
+    rows = rows_of(cells)
+    heads = ["scene", "sampler", "method", "spp", "render s", "whole s", *VALUES, *RATIOS]
+    found: dict[tuple, dict[str, dict[str, tuple[float, str]]]] = {}
+    lines = []
+    for (scene, size, sampler, method), by_spp in rows.items():
+        for spp, by in by_spp.items():
+            told = ratios(by_spp, spp)
+            found.setdefault((size, sampler, method, spp), {})[scene] = told
+            values = [
+                " / ".join(digits(by.get(t, {}).get(name)) for t in TAILS) for name in ("render", "whole", *VALUES)
+            ]
+            lines.append([f"{scene} {size}", sampler, method, str(spp), *values, *map(marked, map(told.get, RATIOS))])
+    print("\ntails=paths / tails=shared, and the second over the first; seconds of processors")
+    table(heads, lines)
+    lines = []
+    for name, members in groups.items():
+        for (size, sampler, method, spp), by_scene in found.items():
+            here = [told for scene, told in by_scene.items() if scene in members and "seconds" in told]
+            if here:
+                means = [over([told.get(key) for told in here]) for key in RATIOS]
+                lines.append([f"{name} ({len(here)}) {size}", sampler, method, str(spp), *means])
+    print("\ngeometric means over scenes")
+    table(["scenes", "sampler", "method", "spp", *RATIOS], lines)
+    for tails in TAILS:
+        print(f"\ngradients, tails={tails}")
+        told = worth_tables({"worth": worth_of_gradients(evaluated(cells, tails, groups)), "methods": pipelines()})
+        for title, (head, *lines) in told.items():
+            print(f"\n{title}")
+            table(head, lines)
+    loads = [cell["load average"] for cell in cells]
+    print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
+
+
+def pipelines() -> dict[str, dict[str, str]]:
+    """Columns of an evaluation; `oidn` knows no gradients."""
+    pairs = [(sampler, method) for sampler, methods in METHODS.items() for method in methods]
+    return {
+        f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
+        for sampler, method in pairs
+        if (sampler, method) != ("gpt", "oidn")
+    }
+
+
+def evaluated(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> dict[str, Any]:
+    """The cells with these ``tails`` as results of `ngpt evaluate`, as far as ``worth_of_gradients`` reads them."""
+    summary, renders = [], []
+    for (scene, _, sampler, method), by_spp in rows_of(cells).items():
+        name = f"{sampler}+{method}"
+        for spp, by in by_spp.items():
+            if name in pipelines() and tails in by:
+                row, line = {"scene": scene, "method": name, "spp": spp}, by[tails]
+                summary.append(row | {"error": line["error"], "seconds": {"total": line["whole"]}})
+                renders.append(row | {"absent": None, "spp used": spp, "seconds": {"render": line["render"]}})
+    settings = {"spp": sorted({cell["spp"] for cell in cells}), "groups": groups}
+    scenes = list(dict.fromkeys(row["scene"] for row in summary))
+    return {"scenes": scenes, "summary": summary, "cells": renders, "methods": pipelines(), "settings": settings}
+
+
+def digits(value: float | None) -> str:
+    return "-" if value is None else f"{value:.4g}" if value < 100 else f"{value:.0f}"
+
+
+def marked(value: tuple[float, str] | None) -> str:
+    return f"{value[1]}{value[0]:.2f}" if value else "-"
+
+
+def over(values: list[tuple[float, str] | None]) -> str:
+    """Their geometric mean, where all are there."""
+    known = [value for value in values if value]
+    if len(known) < len(values):
+        return "-"
+    return marked((mean([value for value, _ in known], geometric=True), joined(mark for _, mark in known)))
+
+
+def table(head: list[str], lines: list[list[str]]) -> None:
+    for line in (head, ["---"] * len(head), *lines):
+        print(f"| {' | '.join(line)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
