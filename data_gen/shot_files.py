@@ -135,6 +135,7 @@ def asked_of(
     seconds: float | None = None,
     memory: int | None = None,
     diagnostics: bool = False,
+    unbiased: bool = False,
     variant: str | None = None,
     **options: Any,
 ) -> Asked:

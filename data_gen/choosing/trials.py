@@ -93,7 +93,7 @@ def try_all(
             continue
         said(f"pilot: trying '{name}'; to compile its kernels may take {slow * compiles:.0f} s")
         begins = clock()
-        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased)
+        trial, compiled = try_out(scene, name, clock, rest, stop, unbiased=unbiased)
         if stop():
             break
         # A scene of many materials, or a busy machine, slows down the next one as well. Where kernels are kept from

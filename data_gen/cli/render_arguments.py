@@ -84,7 +84,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--unbiased",
         action="store_true",
-        help="no path ends in a cache of what others have found: as the integrator of the scene, and noisier",
+        help="all paths on their own: noisier",
     )
     parser.add_argument(
         "--diagnostics",
@@ -94,7 +94,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--live",
         action="store_true",
-        help="serve a page on 127.0.0.1 that shows the render, noisy and denoised, while it goes on",
+        help="a page on 127.0.0.1 that shows the render as it goes",
     )
     parser.add_argument("--view", metavar="HOST:PORT", help="send the same to tev (its own: 127.0.0.1:14158)")
     parser.add_argument("--variant", help="Mitsuba variant: llvm_ad_rgb (default), cuda_ad_rgb")

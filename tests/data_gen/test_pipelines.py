@@ -158,7 +158,7 @@ def test_samplers_are_tried_while_there_is_time(renderer, monkeypatch):
     monkeypatch.setattr(plans, "candidates", lambda scene: ["gpt", "bdpt", "gbdpt"])
     tried, sizes = [], []
 
-    def try_out(scene, name, clock, limit, stop):
+    def try_out(scene, name, clock, limit, stop, unbiased):
         tried.append((name, limit))
         for _ in range(8):
             compiled = clock()
@@ -222,7 +222,7 @@ def test_slow_compilation_keeps_other_samplers_out(renderer, monkeypatch):
     for took, names in ((20.0, ["gpt"]), (10.0, ["gpt", "gbdpt"])):
         tried.clear()
 
-        def try_out(scene, name, clock, limit, stop, took=took):
+        def try_out(scene, name, clock, limit, stop, unbiased, took=took):
             tried.append(name)
             return None, clock() + took
 

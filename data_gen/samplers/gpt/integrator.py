@@ -45,7 +45,7 @@ from typing import Any
 import drjit as dr
 import mitsuba as mi
 
-from data_gen.film import SHIFTS
+from data_gen.film import SHIFTS, GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features
@@ -129,7 +129,7 @@ class GPT(GradientIntegrator):
         more = {"caustic": self.caustic, "volumes": volumes, "places": self.places, "shared": self.shared}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 
-    def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film) -> None:
+    def sample_pass(self, frozen: Frozen, plan: Plan, known: Known | None, camera: CameraSamples, film: GradientFilm):
         """Takes one base path and its four offset paths for each camera sample; paths end in what is ``known``."""
         values, Δ, inside, rest = frozen(self.samples, plan, known, camera.look((0, 0), *SHIFTS.values(), *QUARTERS))
         if self.reuse:

@@ -30,7 +30,7 @@ register(
         "data_gen.samplers.teaching.gpt_basic",
         notes=_notes_on_replay,
         rank=9,
-        lane_bytes=384,  # five paths that are recorded as one function: all that they return is there at once
+        lane_bytes=320,  # five paths that are recorded as one function: all that they return is there at once
     )
 )
 register(
