@@ -131,9 +131,9 @@ def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
     sizes = []
     tried = trials.try_out
 
-    def try_out(scene, *args):
+    def try_out(scene, *args, **more):
         sizes.append(tuple(scene.sensors()[0].film().size()))
-        return tried(scene, *args)
+        return tried(scene, *args, **more)
 
     monkeypatch.setattr(trials, "try_out", try_out)
     choice = plans.plan_sampler(scene, 1 << 30, 1e6)
