@@ -50,22 +50,22 @@ PASS_SECONDS = 2.0
 
 @runtime_checkable
 class Rounds(Protocol):
-    """What a ``SamplePass`` is as well whose samples depend on those of earlier rounds.
+    """A ``SamplePass`` that renders in rounds: its samples depend on what earlier rounds have found.
 
-    ``shares``  whether they do, in the render that has begun
+    ``shares``  whether they depend on it in the current render
     """
 
     shares: bool
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
-        """To be called before each pass, with the number of its first sample, and that of all, if it is known."""
+        """Called before each pass. ``sample`` is the first sample of the pass; ``spp`` counts all samples, if known."""
 
     def end_of_round(self, sample: int) -> int | None:
-        """Where a pass has to end at the latest that begins with this sample; None: anywhere."""
+        """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
 
 
 class _OneRound:
-    """Of samples that are independent of each other."""
+    """Independent samples, which need no rounds."""
 
     shares = False
 

@@ -109,7 +109,7 @@ def make_classes() -> None:
 
 
 def _modules_with_classes() -> list[ModuleType]:
-    """The modules imported so far that define an integrator, those of base classes first."""
+    """All imported modules that define an integrator. Modules with base classes come first."""
     common = sys.modules.get("data_gen.samplers.common")
     if not common:
         return []

@@ -68,8 +68,8 @@ def render_stack(
     With ``adaptive``, pixels get samples in different numbers, which the layer ``samples`` says: see
     ``data_gen.adaptive``. ``spp``, and ``ngpt:spp``, are means over pixels then.
 
-    Unless it is to be ``unbiased``, paths of samplers with the option ``tails`` share what they find, where that works
-    and pays (``data_gen.tails``). ``ngpt:samplerOptions`` says which it was.
+    Without ``unbiased``, samplers with the option ``tails`` let paths share what they find, where that works and pays
+    (``data_gen.tails``). The attribute ``ngpt:samplerOptions`` then contains ``tails=shared``.
 
     Renders of one scene that are given the same object ``made`` share their samplers, where that is possible.
 
@@ -92,7 +92,9 @@ def render_stack(
         options["features"] = False
     settings = entry.settings(options)
     if "tails" in settings:
-        why_not = why_not_shared(facts, settings, mi.variant())
+        why_not = why_not_shared(bool(facts.media), settings, mi.variant())
+        if facts.integrator != "path":
+            why_not = f"the integrator is '{facts.integrator}', and only paths of 'path' do"
         if why_not and settings["tails"] == "shared":
             raise WrongUse(f"sampler '{sampler}': tails=shared is not possible: {why_not}; leave it out")
         if "tails" not in options and not unbiased and not why_not and _enough_to_share(scene, spp, memory):

@@ -77,8 +77,8 @@ def render_scene(
     ``sampler``     "auto" or one of ``data_gen.samplers.SAMPLERS``; ``options`` are its own
     ``memory``      MiB for paths and film, beside the scene (6144)
     ``diagnostics`` adds rates of failed shifts and discarded values as channels
-    ``unbiased``    no path ends in a cache of what others have found, which most renders are better with and a little
-                    biased by: see docs/samplers/tails.md
+    ``unbiased``    turns the cache off that paths share. The cache lowers the noise of most renders and adds a small
+                    bias: see docs/samplers/tails.md
     ``variant``     of Mitsuba; by default the current one, or llvm_ad_rgb where none is set
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See

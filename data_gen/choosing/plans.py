@@ -157,8 +157,8 @@ def plan(
     then ``primal``, then all unbiased others that ``--sampler auto`` compares, as far as they fit into a fifth of the
     time, compilation included. The less time, the smaller are its images. Where there is no time for a pilot, and where
     it finds that nothing fits, the description decides, and what is left of the time is rendered. ``said`` is told what
-    is tried; ``stop`` ends the pilot; ``unbiased`` is that of ``data_gen.render.render_stack``. What it measures
-    changes from run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
+    is tried; ``stop`` ends the pilot; ``unbiased`` goes to ``data_gen.render.render_stack``. The measurements
+    change from run to run. Raises NgptError for a method that does not run here or cannot use any of the stacks.
     """
     start = clock()
     able = _able(scene, method)

@@ -83,7 +83,7 @@ def try_all(
     All of them together may take as many seconds of the ``clock`` as the ``budget`` says, which is asked with the
     trials that there are: one that would not fit into the rest is left out, by what it takes to compile and to render.
     The ``first`` has a budget of its own, and is compiled in any case. ``said`` is told what is tried, and ``stop``
-    asked whether to end there. ``unbiased`` is that of ``data_gen.render.render_stack``.
+    asked whether to end there. ``unbiased`` goes to ``data_gen.render.render_stack``.
     """
     start, slow, trials = clock(), 1.0, {}
     for i, name in enumerate(samplers):

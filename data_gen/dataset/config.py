@@ -117,7 +117,7 @@ class Config:
 
     @property
     def unbiased_options(self) -> dict[str, Any]:
-        """The same for references, whose paths find all of their light by themselves."""
+        """The sampler's options for references: without ``tails``, because references are unbiased."""
         return {name: value for name, value in self.options.items() if name != "tails"}
 
     @property

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import dr_number
+from data_gen.paths.vertex import ByMaterial, materials_of
 
 # Materials that evaluate all of their lobes whatever ``BSDFContext.type_mask`` says, by the names of their classes.
 DEAF = ("Principled", "PrincipledThin")
@@ -33,14 +33,11 @@ class Lobes:
     """
 
     def __init__(self, scene: mi.Scene):
-        materials = {dr_number(shape.bsdf()): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+        materials = materials_of(scene)
         table = np.full(max(materials, default=0) + 1, _HEARS, np.float32)
         for number, bsdf in materials.items():
             table[number] = _lambert(bsdf)
-        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
-        self.size = dr.opaque(mi.UInt32, len(table))
-        self.lambert = mi.Float(table)
-        dr.eval(self.lambert)
+        self.lambert = ByMaterial(mi.Float(table))
 
     def diffuse(self, si: mi.SurfaceInteraction3f, wo: mi.Vector3f, active: mi.Bool) -> mi.Spectrum:
         """The share, in [0, 1] for each wavelength, of what goes from ``wo`` (local) into ``si.wi``; 0 of nothing.
@@ -53,9 +50,8 @@ class Lobes:
         f = bsdf.eval(mi.BSDFContext(), si, wo, active)
         only = mi.BSDFContext()
         only.type_mask = int(mi.BSDFFlags.Diffuse)
-        number = dr.reinterpret_array(mi.UInt32, bsdf)
-        s = dr.gather(mi.Float, self.lambert, number, active & (number < self.size))
-        deaf = (number < self.size) & (s != _HEARS)
+        listed, s = self.lambert.of(bsdf, active)
+        deaf = listed & (s != _HEARS)
         part = bsdf.eval(only, si, wo, active & ~deaf)
         reaches = (si.wi.z * wo.z > 0) | mi.has_flag(flags, mi.BSDFFlags.DiffuseTransmission)
         ρ = bsdf.eval_diffuse_reflectance(si, active & deaf & reaches)

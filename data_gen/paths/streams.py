@@ -60,8 +60,8 @@ def sample_streams(seed: int, pixel: mi.UInt32, sample: mi.UInt32, width: int = 
     x, y = pixel % width, pixel // width
     within = (1 << _TILE) - 1
     number = _apart(x & within) | _apart(y & within) << 1
-    key = _mixed(first ^ _key(seed, 0))
-    key = _mixed(key ^ (x >> _TILE | y >> _TILE << 16))
+    key = mixed(first ^ _key(seed, 0))
+    key = mixed(key ^ (x >> _TILE | y >> _TILE << 16))
     return _sobol_class(mi.variant())((number << bits | sample - first, key, dr.zeros(mi.UInt32, dr.width(key))))
 
 
@@ -70,7 +70,7 @@ def light_streams(seed: int, number: mi.UInt32, turn: int, independent: bool = F
     turn = dr.opaque(mi.UInt32, turn)
     if independent:
         return _independent(seed, number, turn, of_lights=True)
-    key = _mixed(turn ^ _key(seed, 1)) + dr.zeros(mi.UInt32, dr.width(number))
+    key = mixed(turn ^ _key(seed, 1)) + dr.zeros(mi.UInt32, dr.width(number))
     return _sobol_class(mi.variant())((number, key, dr.zeros(mi.UInt32, dr.width(number))))
 
 
@@ -158,21 +158,21 @@ def _sobol_class(variant: str) -> type:
 
         def next_1d(self, active=True):
             bits = self._scramble()
-            place = _owen(self.index, _mixed(bits))
+            place = _owen(self.index, mixed(bits))
             self.dimension = dr.select(active, self.dimension + 1, self.dimension)
-            return _unit(_reversed_owen(place, _mixed(bits ^ 0x68BC21EB)))
+            return _unit(_reversed_owen(place, mixed(bits ^ 0x68BC21EB)))
 
         def next_2d(self, active=True):
             bits = self._scramble()
-            place = _owen(self.index, _mixed(bits))
-            x = _reversed_owen(place, _mixed(bits ^ 0x68BC21EB))
-            y = _reversed_owen(_pascal(place), _mixed(bits ^ 0x02E5BE93))
+            place = _owen(self.index, mixed(bits))
+            x = _reversed_owen(place, mixed(bits ^ 0x68BC21EB))
+            y = _reversed_owen(_pascal(place), mixed(bits ^ 0x02E5BE93))
             self.dimension = dr.select(active, self.dimension + 2, self.dimension)
             return mi.Point2f(_unit(x), _unit(y))
 
         def next_key(self):
             """Any 32 bits, from which more random numbers are made than would be drawn whether used or not."""
-            bits = _mixed(self._scramble() ^ _mixed(self.index + 0x967A889B))
+            bits = mixed(self._scramble() ^ mixed(self.index + 0x967A889B))
             self.dimension = self.dimension + 1
             return bits
 
@@ -196,7 +196,7 @@ def _sobol_class(variant: str) -> type:
     return Points
 
 
-def _mixed(x: mi.UInt32) -> mi.UInt32:
+def mixed(x: mi.UInt32) -> mi.UInt32:
     """Other bits for other numbers. [Wellons 2018, "Prospecting for hash functions", lowbias32]"""
     x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
     x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)

@@ -60,22 +60,41 @@ class Materials:
             self.unconnectable.append("those inside shape groups")
         self.unconnectable.sort()
         self.all_connectable = not self.unconnectable
-        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
-        self.size = dr.opaque(mi.UInt32, len(table))
-        self.rough = mi.Bool(table)
-        dr.eval(self.rough)
+        self.rough = ByMaterial(mi.Bool(table))
 
     def connectable(self, bsdf: mi.BSDFPtr) -> mi.Bool:
         """The classification of a vertex with this material; False where there is none, as for a path that escaped."""
-        index = dr.reinterpret_array(mi.UInt32, bsdf)
-        rough = (index >= self.size) | dr.gather(mi.Bool, self.rough, index, index < self.size)
-        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & rough
+        listed, rough = self.rough.of(bsdf)
+        return mi.has_flag(bsdf.flags(), mi.BSDFFlags.Smooth) & (~listed | rough)
 
     def sharp(self, si: mi.SurfaceInteraction3f, scene: mi.Scene) -> mi.Bool:
         """Whether a path can leave vertex ``si`` by mirror, glass or sharp gloss alone, and no emitter is there."""
         bsdf = si.bsdf()
         dark = si.emitter(scene) == None  # noqa: E711 - a comparison of arrays of pointers
         return si.is_valid() & dark & ~self.connectable(bsdf) & ~mi.has_flag(bsdf.flags(), mi.BSDFFlags.Null)
+
+
+class ByMaterial:
+    """Values by Dr.Jit's number of a material.
+
+    Mitsuba does not list the materials inside shape groups, so they have no value.
+    """
+
+    def __init__(self, values: mi.Bool | mi.Float):
+        # Opaque: the numbers may be others in each process, and the kernel is to be the same.
+        self.size, self.values = dr.opaque(mi.UInt32, dr.width(values)), values
+        dr.eval(self.values)
+
+    def of(self, bsdf: mi.BSDFPtr, active: mi.Bool | bool = True) -> tuple[mi.Bool, mi.Bool | mi.Float]:
+        """Whether each of the ``active`` materials has a value, and that, 0 where not."""
+        number = dr.reinterpret_array(mi.UInt32, bsdf)
+        listed = active & (number < self.size)
+        return listed, dr.gather(type(self.values), self.values, number, listed)
+
+
+def materials_of(scene: mi.Scene) -> dict[int, mi.BSDF]:
+    """The materials of a scene's shapes by Dr.Jit's number of each."""
+    return {dr_number(shape.bsdf()): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
 
 
 def dr_number(bsdf: mi.BSDF) -> int:

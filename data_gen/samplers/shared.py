@@ -100,13 +100,14 @@ TAILS = Option(
 )
 
 
-def why_not_shared(facts: Facts, settings: Mapping[str, Any], variant: str) -> str:
-    """Why paths of a sampler with the option ``tails`` cannot share what they find; "" where they can."""
-    if facts.integrator != "path":
-        return f"the integrator is '{facts.integrator}', and only paths of 'path' do"
-    if facts.media:
-        return f"there are media ({', '.join(facts.media)})"
-    if "rgb" not in variant or facts.polarised:
+def why_not_shared(media: bool, settings: Mapping[str, Any], variant: str) -> str:
+    """Why paths with these ``settings`` cannot share what they find, of a sampler with the option ``tails``.
+
+    ``media``: the paths go through media. "" where they can share.
+    """
+    if media:
+        return "there are media"
+    if "rgb" not in variant or "polarized" in variant:
         return f"variant '{variant}' renders other colours than RGB"
     unable = {"reuse": (True, "reuse"), "shift": ("manifold", "shift=manifold")}
     return next(

@@ -49,19 +49,7 @@ class Known:
         return mi.Color3f(value.x, value.y, value.z), active & (value.w > 0)
 
     def _of(self, place: Place, active: mi.Bool) -> mi.Vector4f:
-        h, name = key(place)
-        last = dr.width(self.keys) - 1
-        i, open, slot, found = mi.UInt32(0), mi.Bool(active), mi.UInt32(0), mi.Bool(False)
-
-        def body(i, open, slot, found):
-            at = (h + i) & last
-            there = dr.gather(mi.UInt32, self.keys, at, open)
-            hit = open & (there == name)
-            return i + 1, open & ~hit & (there != 0) & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
-
-        _, _, slot, found = dr.while_loop(
-            (i, open, slot, found), lambda i, open, slot, found: open, body, label="look up"
-        )
+        slot, found = in_table(self.keys, *key(place), active)
         return dr.gather(mi.Vector4f, self.values, slot, found)
 
 
@@ -76,7 +64,7 @@ class Cache:
     def __init__(self, fineness: float):
         self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3)]
-        self.unit, self.full = 0.0, False
+        self.unit, self.full, self.fineness = 0.0, False, fineness
         self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
         dr.make_opaque(self.keys, self.count, self.sums, self.known.values)
 
@@ -98,36 +86,17 @@ class Cache:
         h, name = (joined(parts) for parts in zip(*map(key, places), strict=True))
         record = dr.arange(mi.UInt32, dr.width(h)) % dr.opaque(mi.UInt32, dr.width(value))
         dr.eval(h, name, good, counts)
-        slot, placed = self._slots(h, name, dr.gather(mi.Bool, good, record))
+        slot, placed = in_table(self.keys, h, name, dr.gather(mi.Bool, good, record), fill=not self.full)
+        dr.eval(slot, placed, self.keys)
         direct = {"mode": dr.ReduceMode.Direct}
         for sum, count in zip(self.sums, counts, strict=True):
             dr.scatter_add(sum, dr.gather(mi.Int64, count, record), slot, placed, **direct)
         dr.scatter_add(self.count, mi.UInt32(1), slot, placed, **direct)
         dr.eval(self.keys, self.count, self.sums)
 
-    def _slots(self, h: mi.UInt32, name: mi.UInt32, active: mi.Bool) -> tuple[mi.UInt32, mi.Bool]:
-        """Where the cells are, once there is one for each record; there are no new ones where the table is full."""
-        last, keys, fill = CELLS - 1, self.keys, not self.full
-
-        def body(i, open, slot, placed):
-            at = (h + i) & last
-            if fill:
-                there, made = dr.scatter_cas(keys, mi.UInt32(0), name, at, open)
-                hit, over = open & (made | (there == name)), mi.Bool(False)
-            else:
-                there = dr.gather(mi.UInt32, keys, at, open)
-                hit, over = open & (there == name), there == 0
-            return i + 1, open & ~hit & ~over & (i < _PLACES - 1), dr.select(hit, at, slot), placed | hit
-
-        state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, dr.width(h)))
-        _, _, slot, placed = dr.while_loop(
-            state, lambda i, open, slot, placed: open, body, label="find cells", mode="symbolic"
-        )
-        dr.eval(slot, placed, keys)
-        return slot, placed
-
     def settle(self, fineness: float) -> None:
         """Makes what is known anew, of all records so far; from here on cells have this ``fineness``."""
+        self.fineness = fineness
         cells = int(dr.count(self.keys != 0)[0])
         if cells > _FULL * CELLS and not self.full:
             self.full = True
@@ -143,6 +112,32 @@ class Cache:
         dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
         self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
         dr.eval(self.known.keys, self.known.values)
+
+
+def in_table(
+    keys: mi.UInt32, h: mi.UInt32, name: mi.UInt32, active: mi.Bool, *, fill: bool = False
+) -> tuple[mi.UInt32, mi.Bool]:
+    """The places of cells in a table, and which are there; ``fill``: cells that are not there are made.
+
+    All places from ``h`` on up to the first empty one are searched.
+    """
+    last, lanes = dr.width(keys) - 1, dr.width(h)
+
+    def body(i, open, slot, found):
+        at = (h + i) & last
+        if fill:
+            there, made = dr.scatter_cas(keys, mi.UInt32(0), name, at, open)
+            hit, empty = open & (made | (there == name)), mi.Bool(False)
+        else:
+            there = dr.gather(mi.UInt32, keys, at, open)
+            hit, empty = open & (there == name), there == 0
+        return i + 1, open & ~hit & ~empty & (i < _PLACES - 1), dr.select(hit, at, slot), found | hit
+
+    state = (mi.UInt32(0), mi.Bool(active), mi.UInt32(0), dr.full(mi.Bool, False, lanes))
+    _, _, slot, found = dr.while_loop(
+        state, lambda i, open, slot, found: open, body, label="find cells", mode="symbolic"
+    )
+    return slot, found
 
 
 def joined(parts: Iterable[Any]) -> Any:

@@ -1,7 +1,7 @@
 """Cells of the cache: cubes in space, apart by their size and by the side and direction of the surface.
 
-A cell is small against the *spread* of a path where it is looked up: against the width of the bundle of paths that
-arrive there, like which the light of the cell is blurred. The widths of smooth events add up,
+A cell is small against the *spread* of a path at the vertex where the path looks it up. The spread is the width of the
+bundle of paths that arrive there, and the light of the cell is blurred over that width. Smooth events add to it,
 
     spread = Σ t / sqrt(p |cos θ|),
 
@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import drjit as dr
 import mitsuba as mi
+
+from data_gen.paths.streams import mixed
 
 # Directions of normals along an axis of the octahedral map, where the fineness is 16
 _NORMALS = 8
@@ -80,12 +82,5 @@ def key(place: Place) -> tuple[mi.UInt32, mi.UInt32]:
     q = (place.p + _CORNER) * dr.exp2(mi.Float(-place.level))
     x, y, z = (mi.UInt32(mi.Int32(dr.floor(q[i]))) for i in range(3))
     code = place.code + (mi.UInt32(place.level) << 24)
-    h = _mixed(x + _mixed(y + _mixed(z + _mixed(code + 0x1234567))))
-    return h, _mixed(h ^ (x * 0x9E3779B1 + y * 0x85EBCA6B + z * 0xC2B2AE35 + code * 0x27D4EB2F)) | 1
-
-
-def _mixed(x: mi.UInt32) -> mi.UInt32:
-    """A bijection that scatters numbers: Wellons, "lowbias32"."""
-    x = (x ^ (x >> 16)) * mi.UInt32(0x7FEB352D)
-    x = (x ^ (x >> 15)) * mi.UInt32(0x846CA68B)
-    return x ^ (x >> 16)
+    h = mixed(x + mixed(y + mixed(z + mixed(code + 0x1234567))))
+    return h, mixed(h ^ (x * 0x9E3779B1 + y * 0x85EBCA6B + z * 0xC2B2AE35 + code * 0x27D4EB2F)) | 1

@@ -8,7 +8,7 @@ import drjit as dr
 import mitsuba as mi
 import numpy as np
 
-from data_gen.paths.vertex import dr_number, smallest_roughness
+from data_gen.paths.vertex import ByMaterial, materials_of, smallest_roughness
 
 # Gloss that is rougher than this passes for matt beside a diffuse part: its α.
 ROUGH = 0.15
@@ -28,30 +28,25 @@ class Matt:
     """
 
     def __init__(self, scene: mi.Scene):
-        bsdfs = {dr_number(shape.bsdf()): shape.bsdf() for shape in scene.shapes() if shape.bsdf() is not None}
+        bsdfs = materials_of(scene)
         # Below 0: not matt
         table = np.full(max(bsdfs, default=0) + 1, -1.0, np.float32)
         for number, bsdf in bsdfs.items():
             if is_matt(bsdf):
                 table[number] = _GLOSS if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) else 0
         self.any = bool((table >= 0).any())
-        self.size, self.gloss = dr.opaque(mi.UInt32, len(table)), mi.Float(table)
-        dr.eval(self.gloss)
+        self.gloss = ByMaterial(mi.Float(table))
 
     def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
         """Whether the vertices are of such a material."""
-        return active & (self._gloss(x.bsdf(), active) >= 0)
+        listed, gloss = self.gloss.of(x.bsdf(), active)
+        return listed & (gloss >= 0)
 
     def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """What light is divided by in the cache, and multiplied with where it is read: above 0, textured."""
         bsdf = x.bsdf()
         rho = mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(x, active)))
-        return dr.clip(rho + self._gloss(bsdf, active), 1e-3, 1)
-
-    def _gloss(self, bsdf: mi.BSDFPtr, active: mi.Bool) -> mi.Float:
-        index = dr.reinterpret_array(mi.UInt32, bsdf)
-        known = active & (index < self.size)
-        return dr.select(known, dr.gather(mi.Float, self.gloss, index, known), -1)
+        return dr.clip(rho + self.gloss.of(bsdf, active)[1], 1e-3, 1)
 
 
 def is_matt(bsdf: mi.BSDF) -> bool:

@@ -107,7 +107,7 @@ def evaluate(
                 ]
             # After each scene, so that a long run can be looked at.
             write_results(results, out)
-            # Kernels cannot be recorded once while another scene is in the process, which takes seconds of each pass.
+            # Kernels hold code for the objects of all scenes in the process, those that are left over too.
             gc.collect()
         progress(total, total)
     return results

@@ -54,9 +54,9 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import GradientIntegrator, like_path
 from data_gen.samplers.gpt.manifold_shift import add_followed
 from data_gen.samplers.gpt.plan import Plan, make_plan
-from data_gen.samplers.gpt.rounds import SharedTails
+from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
-from data_gen.samplers.shared import VOLUMETRIC
+from data_gen.samplers.shared import VOLUMETRIC, why_not_shared
 from data_gen.scenes.facts import integrator_name, media_of
 from data_gen.scenes.places import Places
 from data_gen.tails.cache import Known
@@ -100,11 +100,6 @@ class GPT(GradientIntegrator):
         if self.shift == "manifold" and (self.reuse or not self.caustic):
             raise NgptError("gpt: shift 'manifold' needs the layer 'caustic', and goes without 'reuse'")
 
-        if self.shared and (self.reuse or self.shift == "manifold"):
-            raise NgptError(
-                "gpt: tails=shared goes without 'reuse' and without shift 'manifold', which need whole paths"
-            )
-
     def sample(self, scene, sampler, ray, medium=None, active=True):
         """The primal estimate alone, by Mitsuba's ``path`` or ``volpath``."""
         path = mi.load_dict({"type": "volpath" if self.volumes else "path", **self.limits.parameters()})
@@ -113,8 +108,7 @@ class GPT(GradientIntegrator):
     def prepare(self, scene, sensor: mi.Sensor | None = None) -> SamplePass:
         plan = self.plan(scene)
         frozen = Frozen(scene, plan)
-        take = partial(self.sample_pass, frozen, plan)
-        return SharedTails(self, plan, frozen, take) if plan.matt else partial(take, None)
+        return sharing(self, plan, frozen, partial(self.sample_pass, frozen, plan))
 
     def plan(self, scene) -> Plan:
         """What the kernel contains for a scene. Raises NgptError for polarised variants."""
@@ -124,8 +118,8 @@ class GPT(GradientIntegrator):
                 f"use variant '{mi.variant().removesuffix('_polarized')}', or sampler 'gpt-basic'"
             )
         volumes = self.volumes and bool(media_of(scene))
-        if self.shared and (volumes or "rgb" not in mi.variant()):
-            raise NgptError("gpt: tails=shared is for scenes without media, in RGB; use tails=paths")
+        if self.shared and (reason := why_not_shared(volumes, self.options, mi.variant())):
+            raise NgptError(f"gpt: tails=shared is not possible: {reason}; use tails=paths")
         more = {"caustic": self.caustic, "volumes": volumes, "places": self.places, "shared": self.shared}
         return make_plan(scene, self.limits, self.roughness_threshold, self.shift, **more)
 

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 
 import drjit as dr
 import mitsuba as mi
 import numpy as np
 
 from data_gen.film import GradientFilm
-from data_gen.passes import recording
+from data_gen.passes import SamplePass, recording
 from data_gen.paths.camera import CameraSamples
 from data_gen.paths.frozen import Frozen
 from data_gen.samplers.gpt.plan import Plan
@@ -31,8 +32,13 @@ _PAYS = 0.25
 Take = Callable[[Known | None, CameraSamples, GradientFilm], None]
 
 
+def sharing(view, plan: Plan, frozen: Frozen, take: Take) -> SamplePass:
+    """The pass that ``take`` makes: of paths that share a cache where the ``plan`` says so, else of whole paths."""
+    return SharedTails(view, plan, frozen, take) if plan.matt else partial(take, None)
+
+
 class SharedTails:
-    """A ``data_gen.passes.SamplePass`` whose paths may end in a cache; what they read depends on the round alone.
+    """A ``data_gen.passes.SamplePass`` whose paths may end in a cache. The cache changes only between rounds.
 
     ``take`` puts samples into a film, and is given what is known, or None where all paths go on by themselves. ``view``
     is the integrator. ``cache`` is None before the first pass, and where it does not pay.
@@ -41,7 +47,7 @@ class SharedTails:
     def __init__(self, view, plan: Plan, frozen: Frozen, take: Take):
         self.view, self.plan, self.frozen, self.take = view, plan, frozen, take
         self.cache: Cache | None = None
-        self.fed, self.fineness = 0, 0.0
+        self.fed = 0
 
     def __call__(self, camera: CameraSamples, film: GradientFilm) -> None:
         self.take(self.cache and self.cache.known, camera, film)
@@ -51,17 +57,16 @@ class SharedTails:
         return self.cache is not None
 
     def end_of_round(self, sample: int) -> int | None:
-        """Where a pass has to end at the latest that begins with this sample of each pixel; None: anywhere."""
+        """The sample before which a pass must end that begins with this ``sample``; None: there is no limit."""
         return schedule.end_of_round(sample) if self.cache else None
 
     def begin(self, sensor: mi.Sensor, seed: int, sample: int, spp: int | None) -> None:
-        """To be called before a pass that begins with this ``sample``: feeds the cache where that begins a round.
+        """Feeds the cache if this ``sample`` begins a round.
 
-        ``spp`` is the number of all samples, if it is known.
+        It is called before each pass. ``spp`` counts all samples, if known.
         """
         if sample == 0:
-            self.fineness, self.fed = schedule.fineness(0), 0
-            self.cache = Cache(self.fineness) if self.plan.matt.any else None
+            self.cache, self.fed = Cache(schedule.fineness(0)) if self.plan.matt.any else None, 0
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
@@ -76,9 +81,8 @@ class SharedTails:
                     self.cache = None
                     return
                 self.cache.settle(fineness)
-        if fineness != self.fineness:
+        if fineness != self.cache.fineness:
             self.cache.settle(fineness)
-            self.fineness = fineness
 
     def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""

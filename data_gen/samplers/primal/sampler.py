@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import partial
 
 import mitsuba as mi
 
+from data_gen.film import GradientFilm
 from data_gen.passes import SamplePass
 from data_gen.paths.camera import QUARTERS, CameraSamples
 from data_gen.paths.features import features as feature_layers
@@ -16,12 +16,13 @@ from data_gen.paths.spectrum import to_rgb
 from data_gen.samplers.common import loses_light, radiance, recorded
 from data_gen.samplers.gpt.integrator import stand_in
 from data_gen.samplers.gpt.plan import Plan
-from data_gen.samplers.gpt.rounds import SharedTails
+from data_gen.samplers.gpt.rounds import sharing
 from data_gen.samplers.gpt.trace import trace
 from data_gen.samplers.shared import VOLUMETRIC
 from data_gen.scenes.facts import integrator_name
 from data_gen.scenes.load import reference_integrator
 from data_gen.scenes.places import Places
+from data_gen.tails.cache import Known
 
 
 def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places | None = None) -> SamplePass:
@@ -31,57 +32,38 @@ def make(scene: mi.Scene, features: bool, tails: str = "paths", places: Places |
     """
     integrator = reference_integrator(scene)
     followed = integrator_name(scene) in ("path", *VOLUMETRIC) and not mi.is_polarized
-    shared = tails == "shared"
-    if shared:
-        return shared_tails(scene, integrator, features, places)
-    ours = followed and (places or loses_light(scene, integrator))
-    plan, L = our_radiance(scene, places) if ours else (None, radiance(scene, integrator))
-    return recorded(scene, partial(samples, scene, integrator, L, features), plan)
-
-
-def our_radiance(scene: mi.Scene, places: Places | None) -> tuple[Plan, Callable[..., mi.Spectrum]]:
-    """``radiance()`` by the base paths of ``gpt``, whose plan comes first.
-
-    Others choose a lamp alike everywhere. Behind holes these paths trace a quarter fewer rays than ``prb``.
-    """
-    view = stand_in(scene, places, caustic=False)
-    plan = view.plan(scene)
-
-    def L(random, ray, medium, active) -> mi.Spectrum:
-        within = mi.MediumPtr(medium) if plan.space.media else None
-        paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], within)
-        return paths.L + paths.Le
-
-    return plan, L
-
-
-def shared_tails(scene, integrator, features: bool, places: Places | None) -> SharedTails:
-    """Passes of base paths of ``gpt`` that end in a cache."""
-    view = stand_in(scene, places, caustic=False, tails="shared")
+    if not (tails == "shared" or (followed and (places or loses_light(scene, integrator)))):
+        return recorded(scene, partial(samples, scene, integrator, radiance(scene, integrator), features))
+    # Others choose a lamp alike everywhere. Behind holes these paths trace a quarter fewer rays than ``prb``.
+    view = stand_in(scene, places, caustic=False, tails=tails)
     plan = view.plan(scene)
     frozen = Frozen(scene, plan)
+    of_camera = partial(samples, scene, integrator, partial(our_radiance, view, plan), features)
 
-    def known_samples(known, camera):
-        def L(random, ray, medium, active):
-            paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], None, known=known)
-            return paths.L + paths.Le
+    def take(known: Known | None, camera: CameraSamples, film: GradientFilm) -> None:
+        film.put_all(frozen(of_camera, camera.look((0, 0), *QUARTERS), known))
 
-        return samples(scene, integrator, L, features, camera)
-
-    def take(known, camera, film) -> None:
-        film.put_all(frozen(known_samples, known, camera.look((0, 0), *QUARTERS)))
-
-    return SharedTails(view, plan, frozen, take)
+    return sharing(view, plan, frozen, take)
 
 
-def samples(scene, integrator, radiance, features: bool, camera: CameraSamples) -> dict:
+def our_radiance(view, plan: Plan, random, ray, medium, active, *, known: Known | None = None) -> mi.Spectrum:
+    """``radiance()`` by the base paths of ``gpt``, which end in what is ``known`` of the cache."""
+    within = mi.MediumPtr(medium) if plan.space.media else None
+    paths = trace(view, plan, random, (ray, mi.Spectrum(1)), [], within, known=known)
+    return paths.L + paths.Le
+
+
+def samples(scene, integrator, radiance, features: bool, camera: CameraSamples, known: Known | None = None) -> dict:
     """Layers: one sample of ``radiance``, and of features, for each camera sample.
+
+    Where something is ``known`` of a cache, ``radiance`` is given it.
 
     Where ``features`` tell what is emission seen directly, that is the mean over a pixel's quarters.
     """
     ray, importance, _ = camera.rays()
     medium, all_lanes = camera.sensor.get_medium(), mi.Bool(True)
-    L = importance * radiance(camera.random.clone(), ray, medium, all_lanes)
+    more = {"known": known} if known else {}
+    L = importance * radiance(camera.random.clone(), ray, medium, all_lanes, **more)
     layers = {}
     if features:
         seen = partial(emission_seen, scene, integrator, medium, active=all_lanes)
