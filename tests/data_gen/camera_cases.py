@@ -5,7 +5,7 @@ The scenes have no symmetry. A card stands before some near planes, and somethin
 
 import numpy as np
 from data_gen_scenes import _scale
-from unbiased import differences, light_apart, render_references
+from unbiased import differences, light_apart, load, render_references
 
 from ngpt.testing import z_test
 
@@ -130,7 +130,7 @@ def scene_with(mi, name, media=False):
         # Of meters on shapes, too: their rays start in the air.
         sensor = changes["sensor"].get("sensor", changes["sensor"])
         sensor["medium"] = {"type": "ref", "id": "air"}
-    return mi.load_dict(corner(media) | changes, optimize=False)
+    return load(mi, corner(media) | changes)
 
 
 def compare(stacks, references, level, slack=0.0):

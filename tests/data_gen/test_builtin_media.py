@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from data_gen.scenes import grids
 
@@ -34,7 +35,7 @@ def test_media_matter_to_the_image(renderer, name):
     from data_gen.scenes.load import set_film_size
 
     def image(scene):
-        scene = renderer.load_dict(scene)
+        scene = load(renderer, scene)
         set_film_size(scene, (24, 16))
         return np.array(renderer.render(scene, spp=64)).mean(axis=-1)
 

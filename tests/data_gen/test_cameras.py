@@ -16,6 +16,7 @@ from camera_cases import (
     scene_with,
     stacks_of,
 )
+from unbiased import load
 
 from data_gen.samplers import FRAME_SAMPLERS, SAMPLERS
 from ngpt.errors import NgptError
@@ -154,7 +155,7 @@ def rendered(mi, sensor, **objects):
         "to_world": mi.ScalarTransform4f().look_at([0, 0, -1], [0.5, 0.3, 0], [0, 1, 0]).scale(20),
     }
     scene = {"type": "scene", "sensor": sensor, "light": {"type": "constant"}, "wall": wall, **objects}
-    return render_stack(mi.load_dict(scene), 4, sampler="primal")
+    return render_stack(load(mi, scene), 4, sampler="primal")
 
 
 @pytest.mark.parametrize("kind", ["perspective", "thinlens", "orthographic"])
@@ -204,7 +205,7 @@ def test_lamps_are_weighed_by_what_any_camera_sees(renderer, view):
     from data_gen.scenes.lamps import lamp_weights
 
     dim = {"type": "sphere", "center": [0.5, 0.2, 0.5], "radius": 0.1, "emitter": {"type": "area"}}
-    weights = lamp_weights(renderer.load_dict(scene() | CAMERAS[view]() | {"zz": dim}, optimize=False))
+    weights = lamp_weights(load(renderer, scene() | CAMERAS[view]() | {"zz": dim}))
     assert len(weights) == 2 and 0.1 <= weights.min() < 0.4
 
 
@@ -254,8 +255,8 @@ def test_plugins_render_from_any_camera_of_a_scene(renderer, sampler):
     mi = renderer
     one, other = perspective()["sensor"], orthographic(1.5)["sensor"]
     integrator = mi.load_dict({"type": sampler, "max_depth": 3, "lamps": "uniform"})
-    first = mi.load_dict({**scene(), "a": one, "b": other}, optimize=False)
-    second = mi.load_dict({**scene(), "b": other, "c": one}, optimize=False)
+    first = load(mi, {**scene(), "a": one, "b": other})
+    second = load(mi, {**scene(), "b": other, "c": one})
     assert [s.class_name() for s in second.sensors()] == ["OrthographicCamera", "PerspectiveCamera"]
     images = [np.array(integrator.render(s, sensor=i, seed=3, spp=4)) for s, i in ((first, 0), (second, 1))]
     assert np.array_equal(*images) and images[0][..., :3].mean() > 0.01

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 
 def features_of(mi, size=(33, 33), spp=4, **objects):
@@ -14,8 +15,9 @@ def features_of(mi, size=(33, 33), spp=4, **objects):
         "fov": 30,
         "to_world": mi.ScalarTransform4f().look_at(origin=[0, 0, 5], target=[0, 0, 0], up=[0, 1, 0]),
     }
-    scene = mi.load_dict(
-        {"type": "scene", "sensor": camera, "light": {"type": "constant"}, "integrator": {"type": "path"}, **objects}
+    scene = load(
+        mi,
+        {"type": "scene", "sensor": camera, "light": {"type": "constant"}, "integrator": {"type": "path"}, **objects},
     )
     set_film_size(scene, size)
     return render_stack(scene, spp, sampler="primal")

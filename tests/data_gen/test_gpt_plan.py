@@ -127,7 +127,7 @@ def test_shared_emitters_are_what_sampling_would_find(renderer, name):
         lamp["bitmap"] = mi.Bitmap(np.random.default_rng(1).random((8, 16, 3)).astype(np.float32))
     block = {"type": "sphere", "center": [0, 0, 2.5], "radius": 0.4}
     scene = {"type": "scene", "lamp": lamp, "block": block} | ({"sky": {"type": "constant"}} if name == "two" else {})
-    scene = mi.load_dict(scene)
+    scene = load(mi, scene)
     lights = Lights(scene)
     assert lights.shared
     random = mi.load_dict({"type": "independent"})

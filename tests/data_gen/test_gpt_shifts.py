@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from unbiased import load
 
 MATERIALS = {
     "diffuse": {"type": "diffuse"},
@@ -66,7 +67,7 @@ class Steps:
         from data_gen.samplers.gpt.plan import make_plan
 
         self.mi, self.dr = mi, dr
-        self.scene = mi.load_dict(museum())
+        self.scene = load(mi, museum())
         self.plan = make_plan(self.scene, Limits(rr_depth=1000), threshold, shift, caustic=caustic)
         assert self.plan.replays
         self.random = mi.load_dict({"type": "independent"})

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from ngpt.errors import NgptError
 
@@ -21,7 +22,7 @@ def scene_of(mi, origin=(0, 0, 5), target=(0, 0, 0), sensor=(), **objects):
 
     to_world = mi.ScalarTransform4f().look_at(origin=list(origin), target=list(target), up=[0, 1, 0])
     camera = {"type": "perspective", "fov": 30, "to_world": to_world} | dict(sensor)
-    scene = mi.load_dict({"type": "scene", "sensor": camera, "light": {"type": "constant"}, **objects}, optimize=False)
+    scene = load(mi, {"type": "scene", "sensor": camera, "light": {"type": "constant"}, **objects})
     set_film_size(scene, SIZE)
     return scene
 

@@ -431,7 +431,7 @@ def room(mi, weights=(None, None, None)):
 def test_lamps_are_chosen_by_what_they_bring_and_left_as_they_were(renderer):
     from data_gen.scenes.lamps import lamp_weights, weighed
 
-    scene = renderer.load_dict(room(renderer))
+    scene = load(renderer, room(renderer))
     weights = lamp_weights(scene)
     assert weights.max() > 0.8
     assert np.isclose(weights.sum(), 1)
@@ -449,7 +449,7 @@ def test_lamps_are_chosen_by_what_they_bring_and_left_as_they_were(renderer):
 def test_weights_that_a_scene_gives_are_honoured(renderer):
     from data_gen.scenes.lamps import weighed
 
-    scene = renderer.load_dict(room(renderer, (1.0, 0.0, 3.0)))
+    scene = load(renderer, room(renderer, (1.0, 0.0, 3.0)))
     with weighed(scene, "power"):
         assert sorted(float(scene.pdf_emitter(i)[0]) for i in range(3)) == [0, 0.25, 0.75]
 
@@ -458,7 +458,7 @@ def test_weights_that_a_scene_gives_are_honoured(renderer):
 def test_lamps_take_noise_away_and_no_light(renderer, sampler):
     from data_gen.render import render_stack
 
-    scene, found = renderer.load_dict(room(renderer)), []
+    scene, found = load(renderer, room(renderer)), []
     for lamps in ("power", "uniform"):
         stacks = [render_stack(scene, 16, seed, sampler, points="independent", lamps=lamps) for seed in range(16)]
         found.append(np.array([stack["primal"] for stack in stacks], np.float64).mean(axis=-1))
@@ -503,7 +503,7 @@ def in_fog(description):
 @pytest.fixture(scope="module")
 def light_of_box(renderer):
     """Means of images, where both lamps are chosen."""
-    scene = renderer.load_dict(box(renderer, 1.0))
+    scene = load(renderer, box(renderer, 1.0))
     return np.array([np.array(renderer.render(scene, spp=256, seed=100 + seed)).mean() for seed in range(8)])
 
 
@@ -512,9 +512,9 @@ def test_light_of_a_lamp_that_is_chosen_never_is_found_or_refused(renderer, ligh
     from data_gen.render import render_stack
     from data_gen.scenes.facts import scene_facts
 
-    scene = renderer.load_dict(box(renderer, 0.0))
+    scene = load(renderer, box(renderer, 0.0))
     if SAMPLERS[sampler].refuses(scene_facts(scene)):
-        scene = renderer.load_dict(in_fog(box(renderer, 0.0)))
+        scene = load(renderer, in_fog(box(renderer, 0.0)))
     if sampler in BY_PHOTONS:
         with pytest.raises(
             NgptError, match=f"sampler '{sampler}' .*'hidden' has sampling_weight 0; give it a positive"
@@ -531,6 +531,6 @@ def test_a_point_that_is_chosen_never_is_off(renderer):
     from data_gen.render import render_stack
 
     description = box(renderer, 1.0) | {"point": {"type": "point", "position": [0, 0, 0], "sampling_weight": 0.0}}
-    without = render_stack(renderer.load_dict(box(renderer, 1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
-    found = render_stack(renderer.load_dict(description), 64, 0, "ppm")["primal"].mean()
+    without = render_stack(load(renderer, box(renderer, 1.0)), 64, 0, "ppm", lamps="uniform")["primal"].mean()
+    found = render_stack(load(renderer, description), 64, 0, "ppm")["primal"].mean()
     assert found == pytest.approx(without, rel=0.05)

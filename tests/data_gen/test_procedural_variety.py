@@ -9,6 +9,7 @@ from xml.etree import ElementTree as xml
 
 import numpy as np
 import pytest
+from unbiased import load
 
 pytest.importorskip("mitsuba")
 
@@ -155,7 +156,8 @@ def test_cameras_are_found_beside_media_and_see_through_their_boundaries(rendere
     things = {
         f"ball{i}": _sphere([1.8 * np.sin(i), 0.3, 1.8 * np.cos(i)], 0.3, _diffuse(0.5, 0.5, 0.5)) for i in range(7)
     }
-    scene = renderer.load_dict(
+    scene = load(
+        renderer,
         {
             "type": "scene",
             "sensor": _camera([0.2, 1, 2.6], [0, 0.5, 0], 60) | lens,
@@ -163,7 +165,7 @@ def test_cameras_are_found_beside_media_and_see_through_their_boundaries(rendere
             "block": _box([0.2, 0.6, 0], [0.3, 1.2, 0.3], 10, _diffuse(0.5, 0.5, 0.5)),
             "medium": _volume((low, high), air),
             **things,
-        }
+        },
     )
     around, rng = Surroundings(scene), np.random.default_rng(0)
     for _ in range(4):

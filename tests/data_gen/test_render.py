@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 import ngpt
 from ngpt.cli import main
@@ -263,7 +264,7 @@ def test_media_are_refused_by_name(renderer):
 
     description = within_fog()
     description["integrator"]["type"] = "path"
-    scene = renderer.load_dict(description)
+    scene = load(renderer, description)
     set_film_size(scene, (6, 4))
     assert scene_facts(scene).media == ("air",) and choose(scene_facts(scene))[0] == "gpt-basic"
     with pytest.raises(NgptError, match=r"media \(air\).*gpt-basic, or primal"):

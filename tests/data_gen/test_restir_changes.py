@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from ngpt.testing import z_test
 
@@ -42,7 +43,7 @@ class Room:
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         self.mi, self.change, self.pan = mi, change, PAN
         self.depths = {key: description["integrator"].get(key, 5) for key in ("max_depth", "rr_depth")}
-        self.scenes = [mi.load_dict(description, optimize=False) for _ in range(2)]
+        self.scenes = [load(mi, description) for _ in range(2)]
         params = mi.traverse(self.scenes[0])
         self.starts = {
             key: mi.Transform4f(params[f"{key}.to_world"])

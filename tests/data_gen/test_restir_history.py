@@ -4,6 +4,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from data_gen.samplers.restir.footprint import pair_motions
 from data_gen.samplers.restir.reservoir import confidence_after
@@ -23,7 +24,7 @@ class Room:
 
         description = getattr(builtin, name)()
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
-        self.mi, self.step, self.scene = mi, step, mi.load_dict(description)
+        self.mi, self.step, self.scene = mi, step, load(mi, description)
         depths = {key: description["integrator"].get(key, 5) for key in ("max_depth", "rr_depth")}
         self.plan = make_plan(self.scene, Limits(**depths), caustic=False)
         self.sensor = self.scene.sensors()[0]

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from unbiased import load
 
 SIZE, SPP, SEED = 24, 16, 3
 MOVES = [(1, 0), (5, 3), (0.3, -0.6)]
@@ -46,7 +47,7 @@ class Paths:
 
         description["sensor"]["film"] = {"type": "hdrfilm", "width": SIZE, "height": SIZE, "rfilter": {"type": "box"}}
         self.mi, self.walk = mi, walk
-        self.scene = mi.load_dict(description)
+        self.scene = load(mi, description)
         self.sensor = self.scene.sensors()[0]
         self.plan = make_plan(self.scene, Limits(6, 3), caustic=False)
         self.stage = Stage(self.scene, self.plan, self.sensor)

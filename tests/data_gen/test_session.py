@@ -6,6 +6,7 @@ import sys
 
 import numpy as np
 import pytest
+from unbiased import load
 
 import data_gen
 from ngpt.errors import NgptError
@@ -146,7 +147,7 @@ def test_the_tensor_of_an_integrator_is_told_how_it_becomes_a_stack(renderer):
 
     box = renderer.cornell_box() | {"integrator": {"type": "gpt", "max_depth": 3}}
     box["sensor"]["film"] |= {"width": 16, "height": 12}
-    scene = renderer.load_dict(box)
+    scene = load(renderer, box)
     image = renderer.render(scene, spp=2)
     with pytest.raises(NgptError) as error:
         ngpt.denoise(image)

@@ -4,6 +4,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from ngpt.sequence.warp import warped
 
@@ -37,7 +38,7 @@ def around(renderer):
         "box": {"type": "cube", "to_world": t().translate([1, 0, 1]).scale(0.7), "paint": painted(9)},
         **walls,
     }
-    return Surroundings(mi.load_dict(scene, optimize=False))
+    return Surroundings(load(mi, scene))
 
 
 def config_of(**changes):

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from ngpt.errors import NgptError
 from ngpt.testing import z_test
@@ -25,7 +26,7 @@ def spectral(renderer):
 def loaded(mi, description):
     from data_gen.scenes.load import set_film_size
 
-    scene = mi.load_dict(description)
+    scene = load(mi, description)
     set_film_size(scene, SIZE)
     return scene
 

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from unbiased import load
 
 from ngpt.training.dataset import Dataset, problems
 
@@ -27,7 +28,7 @@ def around(renderer):
         "box": {"type": "cube", "to_world": t().translate([1, 0, 1]).scale(0.7)},
         **walls,
     }
-    return Surroundings(mi.load_dict(scene, optimize=False))
+    return Surroundings(load(mi, scene))
 
 
 def config_of(**changes):

@@ -18,13 +18,19 @@ DISTANCES = (1, FAR)
 REFERENCES = 1000
 
 
-def load(mi, scene, size):
-    """A built-in scene by name, or one that a function describes, at (width, height) pixels."""
+def load(mi, scene, size=None):
+    """A scene: a built-in one by name, or a description, or what a function describes; at (width, height) pixels.
+
+    Its parts keep their order, and so do its lamps. Mitsuba's defaults order them by chance, and all draws with them.
+    """
     from data_gen.scenes.builtin import SCENES
     from data_gen.scenes.load import set_film_size
 
-    scene = mi.load_dict(SCENES[scene]() if isinstance(scene, str) else scene())
-    set_film_size(scene, size)
+    if isinstance(scene, str):
+        scene = SCENES[scene]
+    scene = mi.load_dict(scene() if callable(scene) else scene, parallel=False, optimize=False)
+    if size:
+        set_film_size(scene, size)
     return scene
 
 
