@@ -10,6 +10,7 @@ import logging
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from functools import reduce
 from typing import Any
 
 import drjit as dr
@@ -34,63 +35,65 @@ _BITS, _MOST_BITS = 30, 40
 
 @dataclass
 class Known:
-    """What paths may read: light over reflectance by cell, RGB, and 1 where it is trusted, 0 where not."""
+    """What paths may read by cell: light over reflectance of each sort, RGB, and 1 where it is trusted, 0 where not."""
 
     keys: mi.UInt32
-    values: mi.Float
+    values: list[mi.Float]
     fineness: mi.Float
 
-    def look(self, place: Place, active: mi.Bool) -> tuple[mi.Color3f, mi.Bool]:
-        """The light at a place, and whether it is trusted: that of the smallest cell around it that is."""
-        value = self._of(place, active)
+    def look(self, place: Place, active: mi.Bool) -> tuple[list[mi.Color3f], mi.Bool]:
+        """The light of each sort at a place, and whether it is trusted: that of the smallest cell around it that is."""
+        values = self._of(place, active)
         for _ in range(LEVELS - 1):
-            place, more = coarser(place), active & (value.w == 0)
-            value = dr.select(more, self._of(place, more), value)
-        return mi.Color3f(value.x, value.y, value.z), active & (value.w > 0)
+            place, more = coarser(place), active & (values[0].w == 0)
+            values = [dr.select(more, new, old) for new, old in zip(self._of(place, more), values, strict=True)]
+        return [mi.Color3f(v.x, v.y, v.z) for v in values], active & (values[0].w > 0)
 
-    def _of(self, place: Place, active: mi.Bool) -> mi.Vector4f:
+    def _of(self, place: Place, active: mi.Bool) -> list[mi.Vector4f]:
         slot, found = in_table(self.keys, *key(place), active)
-        return dr.gather(mi.Vector4f, self.values, slot, found)
+        return [dr.gather(mi.Vector4f, each, slot, found) for each in self.values]
 
 
 class Cache:
-    """Sums by cell, which grow, and what is known of them.
+    """Sums by cell of so many ``sorts`` of light, which grow, and what is known of them.
 
     The number of a cell's records decides whether it is trusted, and not the light in them. Where light is rare, a cell
     that has found some looks doubtful, and one that has missed it looks sure. To believe the sure ones alone would lose
     the light: see docs/samplers/tails.md.
     """
 
-    def __init__(self, fineness: float):
+    def __init__(self, fineness: float, sorts: int = 1):
         self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
-        self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3)]
+        self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3 * sorts)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
-        self.known = Known(self.keys, dr.zeros(mi.Float, 4 * CELLS), dr.opaque(mi.Float, fineness))
+        blank = [dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)]
+        self.known = Known(self.keys, blank, dr.opaque(mi.Float, fineness))
         dr.make_opaque(self.keys, self.count, self.sums, self.known.values)
 
-    def add(self, place: Place, value: mi.Color3f) -> None:
-        """Adds records, ``value`` each, to their cells and to those around."""
-        good = dr.isfinite(dr.sum(value)) & (dr.min(value) >= 0)
+    def add(self, place: Place, values: list[mi.Float]) -> None:
+        """Adds records to their cells and to those around: ``values`` are RGB of each sort of light."""
+        least, largest = (reduce(extreme, values) for extreme in (dr.minimum, dr.maximum))
+        good = dr.isfinite(sum(values)) & (least >= 0)
         if not self.unit:
-            most = dr.max(dr.select(good, dr.max(value), 0))[0]
+            most = dr.max(dr.select(good, largest, 0))[0]
             if most > 0:
                 # No less than what has an inverse among floats
                 self.unit = 2.0 ** max(math.ceil(math.log2(most)) - _BITS, -126)
         # Opaque: it would be compiled into the kernel, a new one for every scene.
-        light = mi.Color3f(dr.minimum(value * dr.opaque(mi.Float, 1 / self.unit if self.unit else 0), 2.0**_MOST_BITS))
-        counts = [mi.Int64(each + 0.5) for each in light]
+        scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
+        counts = [mi.Int64(dr.minimum(value * scale, 2.0**_MOST_BITS) + 0.5) for value in values]
         places = [place]
         for _ in range(LEVELS - 1):
             places.append(coarser(places[-1]))
         # All levels at once: fewer kernels
         h, name = (joined(parts) for parts in zip(*map(key, places), strict=True))
-        record = dr.arange(mi.UInt32, dr.width(h)) % dr.opaque(mi.UInt32, dr.width(value))
+        record = dr.arange(mi.UInt32, dr.width(h)) % dr.opaque(mi.UInt32, dr.width(good))
         dr.eval(h, name, good, counts)
         slot, placed = in_table(self.keys, h, name, dr.gather(mi.Bool, good, record), fill=not self.full)
         dr.eval(slot, placed, self.keys)
         direct = {"mode": dr.ReduceMode.Direct}
-        for sum, count in zip(self.sums, counts, strict=True):
-            dr.scatter_add(sum, dr.gather(mi.Int64, count, record), slot, placed, **direct)
+        for each, count in zip(self.sums, counts, strict=True):
+            dr.scatter_add(each, dr.gather(mi.Int64, count, record), slot, placed, **direct)
         dr.scatter_add(self.count, mi.UInt32(1), slot, placed, **direct)
         dr.eval(self.keys, self.count, self.sums)
 
@@ -107,10 +110,13 @@ class Cache:
             )
         each = dr.opaque(mi.Float, self.unit) / dr.maximum(self.count, 1)
         trusted = dr.select(self.count >= LEAST, mi.Float(1), 0)
-        values = mi.Vector4f(*(each * mi.Float(sum) for sum in self.sums), trusted)
-        flat = dr.zeros(mi.Float, 4 * CELLS)
-        dr.scatter(flat, values, dr.arange(mi.UInt32, CELLS))
-        self.known = Known(mi.UInt32(self.keys), flat, dr.opaque(mi.Float, fineness))
+        self.known.values.clear()
+        for first in range(0, len(self.sums), 3):
+            light = [each * mi.Float(of_cell) for of_cell in self.sums[first : first + 3]]
+            flat = dr.zeros(mi.Float, 4 * CELLS)
+            dr.scatter(flat, mi.Vector4f(*light, trusted), dr.arange(mi.UInt32, CELLS))
+            self.known.values.append(flat)
+        self.known = Known(mi.UInt32(self.keys), self.known.values, dr.opaque(mi.Float, fineness))
         dr.eval(self.known.keys, self.known.values)
 
 

@@ -8,7 +8,7 @@ SHARE = 1 / 8
 FEWEST = 1 << 13
 LEAST_PATHS = 8 * FEWEST
 # MiB that the cache takes, and of those a render may use, what makes this little
-MIB, LEAST_MIB = 96, 512
+MIB, LEAST_MIB = 160, 512
 # Samples of the first round; each further one has as many as there are before it.
 FIRST = 8
 # The fineness of cells: how many times smaller they are than the spread of a path. It grows slowly with the samples, so

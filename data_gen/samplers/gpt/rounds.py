@@ -66,7 +66,7 @@ class SharedTails:
         It is called before each pass. ``spp`` counts all samples, if known.
         """
         if sample == 0:
-            self.cache, self.fed = Cache(schedule.fineness(0)) if self.plan.matt.any else None, 0
+            self.cache, self.fed = self.empty() if self.plan.matt.any else None, 0
         if self.cache is None:
             return
         pixels = int(dr.prod(mi.ScalarVector2u(sensor.film().crop_size())))
@@ -84,6 +84,10 @@ class SharedTails:
         if fineness != self.cache.fineness:
             self.cache.settle(fineness)
 
+    def empty(self) -> Cache:
+        """A cache that keeps the light of the layer ``caustic`` apart, where there is such a layer."""
+        return Cache(schedule.fineness(0), 2 if self.plan.caustic else 1)
+
     def feed(self, sensor: mi.Sensor, seed: int, pixels: int, n: int) -> float:
         """Has so many paths feed the cache; returns the share of them that come by a place to end."""
         # Spread over the image, row by row: rays side by side are quick.
@@ -97,12 +101,15 @@ class SharedTails:
         if there:
             # One by one, the kernels that add them would take longer to begin than to run.
             fields = zip(*([dr.gather(type(v), v, which) for v in record] for which, record in there), strict=True)
-            x, y, z, code, level, *value = map(joined, fields)
-            self.cache.add(Place(mi.Point3f(x, y, z), code, level), mi.Color3f(*value))
+            x, y, z, code, level, *values = map(joined, fields)
+            self.cache.add(Place(mi.Point3f(x, y, z), code, level), values)
         return dr.width(lanes[0]) / n
 
     def paths(self, known: Known, camera: CameraSamples) -> tuple[mi.UInt32, list[list]]:
-        """How many records each path has, and these: place, and light over reflectance, a number each."""
+        """How many records each path has, and these: place, and light of each sort over reflectance, RGB."""
         ray, importance, _ = camera.rays()
         count, records = feed(self.view, self.plan, known, camera.random.clone(), (ray, importance))
-        return count, [[*r.place.p, r.place.code, r.place.level, *(mi.Color3f(r.L) / r.ρ)] for r in records]
+        return count, [
+            [*r.place.p, r.place.code, r.place.level, *(each for L in r.L for each in mi.Color3f(L) / r.ρ)]
+            for r in records
+        ]

@@ -9,6 +9,9 @@ the vertex's reflectance times the light over reflectance of the cell; an offset
 the factor ``a`` that it would have had for all that follows (``offset_path.settle``). Emission at the vertex itself is
 found by the step before, and weighted as ever.
 
+Where there is the layer ``caustic``, the cache keeps the light apart that belongs to it from the vertex on, because it
+has come over a sharp surface behind it (``data_gen.paths.caustic``). It goes into the layer and into no difference.
+
 A path that feeds the cache opens a record at its first such vertex, and at those behind it, as many as there is room
 for; from the second on it may end in the cache itself. So light of many bounces comes together one by one. [Müller et
 al. 2021, "Real-time neural radiance caching for path tracing", section 4]
@@ -16,7 +19,7 @@ al. 2021, "Real-time neural radiance caching for path tracing", section 4]
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import drjit as dr
 import mitsuba as mi
@@ -53,8 +56,12 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     where, able = place(plan, known, path)
     for y in offsets:
         able &= ~y.apart
-    C, ends = known.look(where, able)
-    found, caustic_found = caustic.split(path.late, dr.select(ends, plan.matt.reflectance(path.x, ends) * C, 0))
+    sorts, ends = known.look(where, able)
+    ρ = plan.matt.reflectance(path.x, ends)
+    found, *late = [dr.select(ends, ρ * C, 0) for C in sorts]
+    found, caustic_found = caustic.split(path.late, found)
+    for light in late:
+        caustic_found = caustic_found + light
     for y in offsets:
         # Of a joined path, what it would settle with at this vertex, which scatters alike in all directions
         joined = shift.gradient_weight(y.r, True) * (y.β - path.β)
@@ -65,12 +72,18 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
 
 @dataclass
 class Record:
-    """A vertex where a path has come by, and what it has found from there on."""
+    """A vertex where a path has come by, and what it has found from there on: light of each sort."""
 
     place: Place
     ρ: mi.Color3f
     T: mi.Spectrum  # throughput from there on
-    L: mi.Spectrum
+    late: mi.Bool  # what follows belongs to the layer ``caustic``
+    L: list[mi.Spectrum]
+
+    def find(self, light: mi.Spectrum, late: mi.Bool) -> None:
+        """Adds what the path has found, which is ``late`` or not."""
+        parts = caustic.split(late, self.T * light) if len(self.L) > 1 else (self.T * light,)
+        self.L = [L + part for L, part in zip(self.L, parts, strict=True)]
 
 
 def feed(view, plan: Plan, known: Known, random, camera_ray: tuple) -> tuple[mi.UInt32, list[Record]]:
@@ -81,9 +94,12 @@ def feed(view, plan: Plan, known: Known, random, camera_ray: tuple) -> tuple[mi.
     path = begin(plan, x, first.place, None, importance * first.weight)
     path.trail, lanes = Trail.to(x), dr.width(x.t)
     blank = Place(dr.zeros(mi.Point3f, lanes), mi.UInt32(0), mi.Int32(0))
-    none = [Record(blank, mi.Color3f(1), mi.Spectrum(0), dr.zeros(mi.Spectrum, lanes)) for _ in range(RECORDS)]
+    dark = [dr.zeros(mi.Spectrum, lanes) for _ in known.values]
+    none = [Record(blank, mi.Color3f(1), mi.Spectrum(0), mi.Bool(False), list(dark)) for _ in range(RECORDS)]
+    # What is late is not so from the camera on, but from each record on.
+    whole = replace(plan, caustic=False)
     with dr.scoped_set_flag(dr.JitFlag.OptimizeLoops, False):
-        return walk(scene, plan, known, random, path, none)
+        return walk(scene, whole, known, random, path, none)
 
 
 @dr.syntax
@@ -91,20 +107,24 @@ def walk(scene, plan: Plan, known: Known, random, path: Path, records: list) -> 
     count, active = mi.UInt32(0), path.goes_on(plan, [])
     while dr.hint(active, label="feed", exclude=[known]):
         step, path = base_step(scene, plan, random, path, [])
-        found = step.L_light + step.f_p * step.L_bsdf + step.L_caustic
+        rough = mi.Bool(True)
         for r in records:
-            r.L = r.L + r.T * found
+            # A record is at a matt vertex, so its path has been rough since.
+            r.find(step.L_light, caustic.lit_late(rough, r.late, step.x_connectable))
+            _, r.late = caustic.classes(rough, r.late, step.goes_on, step.kind, step.x_connectable)
+            r.find(step.f_p * step.L_bsdf, r.late)
             r.T = r.T * step.f_p
         where, able = place(plan, known, path)
-        C, ends = known.look(where, able)
+        sorts, ends = known.look(where, able)
         ρ = plan.matt.reflectance(path.x, able)
         # The first vertex is where others will end: it has a record in any case.
         ends &= count > 0
-        behind = dr.select(ends, ρ * C, 0)
         opens = able & ~ends & (count < RECORDS)
         for i in range(RECORDS):
             r, this = records[i], opens & (count == i)
-            r.L = r.L + r.T * behind
+            for C, late in zip(sorts, (r.late, mi.Bool(True)), strict=False):
+                r.find(dr.select(ends, ρ * C, 0), late)
+            r.late = r.late & ~this
             r.T = dr.select(this, 1, r.T)
             r.ρ = dr.select(this, ρ, r.ρ)
             r.place = dr.select(this, where, r.place)
