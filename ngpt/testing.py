@@ -36,16 +36,19 @@ class ZTest:
         )
 
 
-def z_test(renders: np.ndarray, references: np.ndarray, block: int = 8, level: float = 0.01) -> ZTest:
+def z_test(
+    renders: np.ndarray, references: np.ndarray, block: int = 8, level: float = 0.01, scale: float = 0.0
+) -> ZTest:
     """Tests whether two sets of independent renders have the same mean.
 
     ``renders``, ``references``  (batches, H, W, C), at least 8 batches each; batches must differ in their seed
     ``block``                    edge of the pixel blocks whose means are compared: averaging makes them nearly normal,
                                  which single pixels of path-traced images are not
     ``level``                    probability that two equal means fail the test as a whole
+    ``scale``                    largest value of the images that a layer is computed from, where it is not the layer's
 
     Welch's t-test per block and channel, with Šidák's correction 1 - (1 - level)^(1/n). Standard errors are bounded
-    from below by float32 rounding, so blocks without any variance must agree to that.
+    from below by float32 rounding of the scale, so blocks without any variance must agree to that.
     """
     means, errors = [], []
     for batches in (renders, references):
@@ -54,7 +57,7 @@ def z_test(renders: np.ndarray, references: np.ndarray, block: int = 8, level: f
         blocks = _block_means(np.asarray(batches, np.float64), block)
         means.append(blocks.mean(axis=0))
         errors.append(blocks.var(axis=0, ddof=1) / len(blocks))
-    scale = np.abs(np.stack(means)).max()
+    scale = max(scale, np.abs(np.stack(means)).max(), float(np.finfo(np.float32).tiny))
     total = errors[0] + errors[1] + (1e-6 * scale) ** 2
     z = (means[0] - means[1]) / np.sqrt(total)
     # Welch-Satterthwaite: the effective degrees of freedom of a sum of two unequal variances.

@@ -198,6 +198,14 @@ def test_a_window_that_trains_nothing_is_an_error(tmp_path, monkeypatch, capsys)
     assert conductor.main(call) == 0
 
 
+def test_a_program_finds_what_its_starter_finds(tmp_path, monkeypatch):
+    """Packages that lie on the path, and are not installed."""
+    (tmp_path / "carried.py").write_text("print('found')")
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    work = Work(["-c", "import carried, scripts.gpu"], tmp_path / "log.txt")
+    assert work.wait(60) and work.status == 0 and work.last_words() == "found"
+
+
 def test_a_program_is_ended_with_all_that_it_started(tmp_path):
     """It is asked first, and may save."""
     code = (

@@ -30,6 +30,9 @@ def test_blocks_without_variance_must_agree():
     flat = np.ones((8, 16, 16, 3))
     assert z_test(flat, flat * (1 + 1e-7)).passed
     assert not z_test(flat, flat * 1.001).passed
+    assert z_test(0 * flat, 0 * flat).passed
+    rounded = flat * np.linspace(1e-8, 2e-8, 8)[:, None, None, None]
+    assert not z_test(rounded, 0 * flat).passed and z_test(rounded, 0 * flat, scale=1.0).passed
 
 
 def test_needs_enough_batches(rng):

@@ -9,6 +9,7 @@ images differ; 2 for a call that makes no sense (``WrongUse``); 130 and 143 afte
 import argparse
 import shlex
 import sys
+from collections.abc import Mapping
 from importlib import import_module
 from typing import Any, NamedTuple, NoReturn
 
@@ -133,13 +134,15 @@ def main(arguments: list[str] | None = None) -> int:
     return run_command(lambda: _work(_parser(called, verbs), verbs, words, "ngpt"), interrupted=interrupted)
 
 
-def door(verb: str, program: str, arguments: list[str] | None = None, name: str = "ngpt") -> int:
+def door(
+    verb: str, program: str, arguments: list[str] | None = None, name: str = "ngpt", verbs: Mapping[str, Verb] = VERBS
+) -> int:
     """Runs a script of the repository that does what a verb does: ``python train.py``, ``python -m data_gen``.
 
-    ``name`` is what its errors begin with.
+    ``name`` is what its errors begin with. ``verbs`` hold the verb, so that it need not be installed.
     """
     words = sys.argv[1:] if arguments is None else arguments
-    verbs, parser = all_verbs(), argparse.ArgumentParser(program)
+    parser = argparse.ArgumentParser(program)
     return run_command(
         lambda: _work(_filled(parser, verb, verbs[verb]), verbs, words, program), name, verbs[verb].interrupted
     )
@@ -190,7 +193,7 @@ def _filled(parser: argparse.ArgumentParser, name: str, verb: Verb) -> argparse.
     return parser
 
 
-def _work(parser: argparse.ArgumentParser, verbs: dict[str, Verb], words: list[str], program: str) -> int:
+def _work(parser: argparse.ArgumentParser, verbs: Mapping[str, Verb], words: list[str], program: str) -> int:
     args, unknown = parser.parse_known_args(words)
     if unknown:
         meant = did_you_mean(unknown[0].partition("=")[0], args.parser._option_string_actions)

@@ -115,7 +115,9 @@ class Window:
         if gpu.get("status") == FAILED:
             sides["processors"][1] = "0/1"
         else:
-            sides["gpu"] = ["--shard", "1/2", "--variant", self.recipe.variant]
+            # Kernels of a new scene are compiled for seconds by one core, and run for tenths of a second.
+            several = str(max(1, workers() // 2))
+            sides["gpu"] = ["--shard", "1/2", "--workers", several, "--variant", self.recipe.variant]
         return {
             name: Work([*command, *options], self.work / "logs" / f"crops-{name}.txt", nice=5 if name != "gpu" else 0)
             for name, options in sides.items()
@@ -169,7 +171,7 @@ class Window:
         finally:
             work.end()
         failed = f"ended by itself, status {work.status}: " if ended and work.status else ""
-        self.note(run.name, work.seconds, failed + work.last_words(1))
+        self.note(run.name, work.seconds, failed + work.last_words(2))
 
 
 def main(arguments: list[str] | None = None) -> int:

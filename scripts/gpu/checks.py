@@ -30,6 +30,8 @@ PACKAGES = (
 )
 # Of renders: image size, samples of each, renders on either side (`z_test` asks for eight).
 SIZE, SPP, RENDERS = (32, 24), 16, 8
+# Paths share their tails where there are this many.
+SHARING = (80, 60)
 
 
 class Unavailable(Exception):
@@ -197,7 +199,7 @@ def training(recipe: Recipe, precision: str, kind: str) -> dict[str, Any]:
     return told | {"passed": bool(told["loss"] < allowed and np.isfinite(told["gradient norm"]))}
 
 
-def renderer(recipe: Recipe, sampler: str) -> dict[str, Any]:
+def renderer(recipe: Recipe, sampler: str, size: tuple[int, int] = SIZE, **options: Any) -> dict[str, Any]:
     """Renders of a built-in scene by the variant, and by the one for processors: whether they have the same mean."""
     from data_gen.backend import DEFAULT_VARIANT
     from ngpt.testing import z_test
@@ -206,7 +208,7 @@ def renderer(recipe: Recipe, sampler: str) -> dict[str, Any]:
     # Both are tried: that one of them runs is worth knowing.
     for side, variant in (("there", recipe.variant), ("here", DEFAULT_VARIANT)):
         try:
-            sides[side] = _renders(variant, sampler, first=0 if side == "here" else 1000)
+            sides[side] = _renders(variant, sampler, 0 if side == "here" else 1000, size, options)
         except NgptError as error:
             failed[side] = one_line(error)
     if "there" in failed:
@@ -217,7 +219,8 @@ def renderer(recipe: Recipe, sampler: str) -> dict[str, Any]:
         raise Unavailable(f"{recipe.variant} renders, with nothing to compare it with: {failed['here']}")
     here = sides["here"][2]
     told |= {"seconds by processors": round(sides["here"][1], 2)}
-    wrong = []
+    # Light that is not there is exactly 0 by one variant, and rounding by the other.
+    wrong, scale = [], float(np.abs(here[0]["primal"]).max())
     for name in here[0].names:
         ours, theirs = (np.stack([stack[name] for stack in stacks]) for stacks in (there, here))
         if name.endswith("_var") or name == "alpha":
@@ -226,13 +229,15 @@ def renderer(recipe: Recipe, sampler: str) -> dict[str, Any]:
             told[name] = _largest(ours.mean(axis=0) - theirs.mean(axis=0), theirs) / 2
             right = told[name] < 0.25 and np.abs(ours.mean() - theirs.mean()) < 5e-3 * np.abs(theirs).max()
         else:
-            test = z_test(ours, theirs, level=1e-3)
+            test = z_test(ours, theirs, level=1e-3, scale=scale)
             told[name], right = str(test), test.passed
         wrong += [] if right else [name]
     return told | {"wrong": wrong, "passed": not wrong}
 
 
-def _renders(variant: str, sampler: str, first: int) -> tuple[str, float, list]:
+def _renders(
+    variant: str, sampler: str, first: int, size: tuple[int, int], options: dict[str, Any]
+) -> tuple[str, float, list]:
     """The first built-in scene that the sampler renders, seconds, and its stacks."""
     from data_gen.backend import use_variant
 
@@ -245,14 +250,14 @@ def _renders(variant: str, sampler: str, first: int) -> tuple[str, float, list]:
 
     refusal = None
     for name in SCENES:
-        scene = load_scene(name, SIZE)
+        scene = load_scene(name, size)
         try:
             find(sampler, scene_facts(scene))
         except NgptError as error:
             refusal = error
             continue
         start = time.perf_counter()
-        stacks = [render_stack(scene, SPP, first + seed, sampler) for seed in range(RENDERS)]
+        stacks = [render_stack(scene, SPP, first + seed, sampler, **options) for seed in range(RENDERS)]
         return name, time.perf_counter() - start, stacks
     raise NgptError(f"no built-in scene will do: {refusal}")
 
@@ -267,6 +272,7 @@ CHECKS: dict[str, Callable[[Recipe], dict[str, Any]]] = {
     "training float32": lambda recipe: training(recipe, "float32", "l1"),
     "training bfloat16": lambda recipe: training(recipe, "bfloat16", "l1"),
     "training perceptual": lambda recipe: training(recipe, "bfloat16", "structural"),
+    "shared tails": lambda recipe: renderer(recipe, "gpt", SHARING, tails="shared"),
 }
 
 

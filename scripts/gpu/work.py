@@ -22,7 +22,9 @@ class Work:
     def __init__(self, arguments: list[str], log: Path, nice: int = 0):
         self.log, self.start = log, time.monotonic()
         log.parent.mkdir(parents=True, exist_ok=True)
-        environment = os.environ | {"PYTHONPATH": str(ROOT), "PYTHONUNBUFFERED": "1"}
+        # What is not installed may be on the path of whoever started this.
+        path = os.pathsep.join(filter(None, (str(ROOT), os.environ.get("PYTHONPATH"))))
+        environment = os.environ | {"PYTHONPATH": path, "PYTHONUNBUFFERED": "1"}
         command = [sys.executable, *arguments]
         if nice:
             command = ["nice", "-n", str(nice), *command]

@@ -9,6 +9,7 @@ import sys
 import pytest
 
 from ngpt.cli import all_verbs, main
+from ngpt.system import parts
 from ngpt.system.install import install_command
 
 VERBS = all_verbs()
@@ -81,6 +82,14 @@ def test_a_door_takes_what_its_verb_takes(verb, capfd):
         and errors.startswith("usage: python ")
         and re.search("error: (unrecognized argument|the following arguments)", errors)
     )
+
+
+@pytest.mark.parametrize("verb", DOORS)
+def test_a_door_opens_where_nothing_is_installed(verb, capfd, monkeypatch):
+    """In a checkout that is only on the path, as on a lent machine, there are no entry points."""
+    monkeypatch.setattr(parts, "points", lambda group: iter(()))
+    status, output, _ = stopped(runpy.run_path(DOORS[verb])["main"], ["--help"], capfd)
+    assert status == 0 and "--help" in output
 
 
 @pytest.mark.parametrize(
