@@ -18,9 +18,10 @@ import drjit as dr
 import mitsuba as mi
 
 from data_gen.paths.streams import mixed
+from data_gen.tails.schedule import FINENESS
 
-# Directions of normals along an axis of the octahedral map, where the fineness is 16
-_NORMALS = 8
+# Directions along an axis of the octahedral map, where the fineness is the least
+_DIRECTIONS = 8
 # A corner of cells of all sizes, as each lies within one of twice the side: not at a round coordinate, where walls are.
 _CORNER = 0.3713
 
@@ -30,7 +31,9 @@ class Place:
     """A vertex as the cache knows it."""
 
     p: mi.Point3f
-    code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
+    code: (
+        mi.UInt32
+    )  # direction of the normal on the side that is seen, of gloss also of the view, and what else is apart
     level: mi.Int32  # cells have the side 2^level
 
 
@@ -54,22 +57,30 @@ class Trail:
         return Trail(self.reach + dr.select(further, x.t, 0), self.spread + dr.select(there & smooth, wider, 0))
 
 
-def place_of(x: mi.SurfaceInteraction3f, spread: mi.Float, fineness: mi.Float, kind: mi.UInt32 | int) -> Place:
+def place_of(
+    x: mi.SurfaceInteraction3f, spread: mi.Float, fineness: mi.Float, kind: mi.UInt32 | int, gloss: mi.Bool
+) -> Place:
     """Where vertex ``x`` lies among the cells that are ``fineness`` times smaller than the ``spread``.
 
-    ``kind`` tells vertices apart that have no light in common.
+    ``kind`` tells vertices apart that have no light in common. Where ``gloss`` counts, light is another one in each
+    direction, and cells are apart by that.
     """
-    n = mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z))
     level = mi.Int32(dr.floor(dr.log2(dr.maximum(spread / fineness, 1e-20))))
-    # Octahedral: Meyer et al. 2010, "On floating-point normal vectors"
-    side = _NORMALS * dr.exp2(dr.floor(dr.log2(fineness / 16)))
+    normal = octahedral(mi.Normal3f(dr.mulsign(x.sh_frame.n, x.wi.z)), fineness)
+    view = dr.select(gloss, mixed(octahedral(x.to_world(x.wi), fineness) + 1), 0)
+    return Place(mi.Point3f(x.p), (normal + (mi.UInt32(kind) << 16)) ^ view, level)
+
+
+def octahedral(n: mi.Vector3f, fineness: mi.Float) -> mi.UInt32:
+    """The number of a direction's cell on the sphere. [Meyer et al. 2010, "On floating-point normal vectors"]"""
+    side = _DIRECTIONS * dr.exp2(dr.floor(dr.log2(fineness / FINENESS)))
     s = dr.rcp(dr.abs(n.x) + dr.abs(n.y) + dr.abs(n.z))
     u, v = n.x * s, n.y * s
     folded = n.z < 0
     u, v = dr.select(folded, (1 - dr.abs(v)) * dr.sign(u), u), dr.select(folded, (1 - dr.abs(u)) * dr.sign(v), v)
-    # Shifted a little, so that axes lie within directions and not between them.
+    # Shifted a little, so that axes lie within cells and not between them.
     i, j = (mi.UInt32(dr.clip((w + 1) * 0.5 * side + 0.02, 0, side - 1)) for w in (u, v))
-    return Place(mi.Point3f(x.p), i + mi.UInt32(side) * j + (mi.UInt32(kind) << 16), level)
+    return i + mi.UInt32(side) * j
 
 
 def coarser(place: Place) -> Place:

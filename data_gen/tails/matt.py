@@ -9,8 +9,9 @@ import mitsuba as mi
 import numpy as np
 
 from data_gen.paths.vertex import ByMaterial, materials_of, smallest_roughness
+from data_gen.tails.schedule import FINENESS
 
-# Gloss that is rougher than this passes for matt beside a diffuse part: its α.
+# Gloss that is rougher than this passes for matt beside a diffuse part, where cells are coarsest: its α.
 ROUGH = 0.15
 # What is added to the diffuse reflectance of materials with gloss: what they scatter beside it
 _GLOSS = 0.05
@@ -33,20 +34,23 @@ class Matt:
         table = np.full(max(bsdfs, default=0) + 1, -1.0, np.float32)
         for number, bsdf in bsdfs.items():
             if is_matt(bsdf):
-                table[number] = _GLOSS if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) else 0
+                table[number] = smallest_roughness(bsdf) if mi.has_flag(bsdf.flags(), mi.BSDFFlags.Glossy) else 0
         self.any = bool((table >= 0).any())
-        self.gloss = ByMaterial(mi.Float(table))
+        self.α = ByMaterial(mi.Float(table))
 
-    def at(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Bool:
-        """Whether the vertices are of such a material."""
-        listed, gloss = self.gloss.of(x.bsdf(), active)
-        return listed & (gloss >= 0)
+    def at(self, x: mi.SurfaceInteraction3f, fineness: mi.Float, active: mi.Bool) -> tuple[mi.Bool, mi.Bool]:
+        """Whether the vertices are of such a material, and whether it has gloss that counts at that ``fineness``.
+
+        More gloss counts the finer the cells are, in the end all of it: so its bias vanishes too.
+        """
+        listed, α = self.α.of(x.bsdf(), active)
+        return listed & (α >= 0), listed & (α > 0) & (α < ROUGH * dr.square(fineness / FINENESS))
 
     def reflectance(self, x: mi.SurfaceInteraction3f, active: mi.Bool) -> mi.Color3f:
         """What light is divided by in the cache, and multiplied with where it is read: above 0, textured."""
         bsdf = x.bsdf()
         rho = mi.Color3f(mi.unpolarized_spectrum(bsdf.eval_diffuse_reflectance(x, active)))
-        return dr.clip(rho + self.gloss.of(bsdf, active)[1], 1e-3, 1)
+        return dr.clip(rho + dr.select(self.α.of(bsdf, active)[1] > 0, _GLOSS, 0), 1e-3, 1)
 
 
 def is_matt(bsdf: mi.BSDF) -> bool:

@@ -38,14 +38,14 @@ RECORDS = 3
 _ALL = 16
 
 
-def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool]:
-    """Where a path is in the cache, and whether it may end there, or open a record."""
+def place(plan: Plan, known: Known, path: Path) -> tuple[Place, mi.Bool, mi.Bool]:
+    """Where a path is in the cache, whether it may end there, or open a record, and whether gloss counts there."""
     x, trail = path.x, path.trail
     able = path.walks & x.is_valid() & (path.depth < plan.limits.max_depth) & (trail.spread > NEAR * trail.reach)
-    able = plan.matt.at(x, able)
+    able, gloss = plan.matt.at(x, known.fineness, able)
     most = plan.limits.max_depth
     late = mi.UInt32(0) if most == UNLIMITED else path.depth - dr.minimum(path.depth, max(most - _ALL, 0))
-    return place_of(x, trail.spread, known.fineness, late), able
+    return place_of(x, trail.spread, known.fineness, late, gloss), able, gloss
 
 
 def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.Spectrum, mi.Spectrum]:
@@ -53,9 +53,10 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
 
     Differences get theirs, but for what is in that layer.
     """
-    where, able = place(plan, known, path)
+    where, able, gloss = place(plan, known, path)
     for y in offsets:
-        able &= ~y.apart
+        # A joined path sees the vertex from elsewhere, where gloss has other light.
+        able &= ~(y.apart | (y.joined & gloss))
     sorts, ends = known.look(where, able)
     ρ = plan.matt.reflectance(path.x, ends)
     found, *late = [dr.select(ends, ρ * C, 0) for C in sorts]
@@ -114,7 +115,7 @@ def walk(scene, plan: Plan, known: Known, random, path: Path, records: list) -> 
             _, r.late = caustic.classes(rough, r.late, step.goes_on, step.kind, step.x_connectable)
             r.find(step.f_p * step.L_bsdf, r.late)
             r.T = r.T * step.f_p
-        where, able = place(plan, known, path)
+        where, able, _ = place(plan, known, path)
         sorts, ends = known.look(where, able)
         ρ = plan.matt.reflectance(path.x, able)
         # The first vertex is where others will end: it has a record in any case.
