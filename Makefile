@@ -2,7 +2,7 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow reliability check docs wheel release bench setup-demo setup-dev setup-quick setup-docs
+.PHONY: demo quick test test-slow reliability check docs wheel release bench setup-demo setup-dev setup-test setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
@@ -15,14 +15,14 @@ quick: setup-quick
 		tests/io tests/classical tests/denoisers tests/measure tests/report tests/system tests/network/test_unet.py \
 		tests/training/test_augment.py tests/training/test_losses.py tests/test_*.py
 
-test: setup-dev
+test: setup-test
 	$(PY) -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
-test-slow: setup-dev
+test-slow: setup-test
 	$(PY) -m pytest -q -m slow
 
 # The campaigns against bad inputs, kills and long runs, and the page of what came out (an hour or several).
-reliability: setup-dev
+reliability: setup-test
 	$(PY) scripts/reliability.py
 
 check: setup-dev docs
@@ -53,7 +53,10 @@ setup-demo:
 	@scripts/setup render llvm
 
 setup-dev:
-	@scripts/setup dev llvm chromium
+	@scripts/setup dev llvm
+
+setup-test:
+	@scripts/setup dev llvm chromium hosts programs
 
 setup-quick:
 	@scripts/setup dev

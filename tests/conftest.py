@@ -1,13 +1,34 @@
 """Fixtures that several tests share."""
 
+import os
 import signal
 
 import numpy as np
 import pytest
+from skips import allowed
 
 from ngpt.classical.gradients import forward_differences
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
+
+
+def strictly(report):
+    """With ``NGPT_STRICT=1`` what is skipped for a reason that is not listed fails."""
+    if os.environ.get("NGPT_STRICT") == "1" and report.skipped and not hasattr(report, "wasxfail"):
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not allowed(reason):
+            report.outcome, report.longrepr = "failed", f"{reason}: mend it, or list it in tests/skips.py"
+    return report
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_runtest_makereport(item, call):
+    return strictly((yield))
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_make_collect_report(collector):
+    return strictly((yield))
 
 
 @pytest.fixture

@@ -12,6 +12,8 @@ from types import ModuleType, SimpleNamespace
 import pytest
 from test_docs import parser_of
 
+# It may be installed in an environment that is not in the path.
+OPENJD = shutil.which("openjd") or shutil.which("openjd", path=Path(sys.executable).parent)
 FARM = Path(__file__).parents[1] / "docs" / "use" / "farm"
 FAKE = '#!/bin/sh\nfor word in "$@"; do printf \'%s\\t\' "$word"; done >> "$FARM_LOG"\necho >> "$FARM_LOG"\n'
 # Runs what it is given at once: each number of an array, or the command of --wrap.
@@ -73,13 +75,13 @@ def shares(calls):
     return renders
 
 
-@pytest.mark.skipif(shutil.which("openjd") is None, reason="needs openjd-cli")
+@pytest.mark.skipif(OPENJD is None, reason="needs openjd-cli")
 def test_open_job_description(farm):
     given = ["-p", f"Scene={farm.scene}", "-p", f"Out={farm.folder / 'out'}"]
     for name in ("openjd-shot.yaml", "openjd-still.yaml"):
-        assert "passes validation checks" in run("openjd", "check", str(FARM / name))
+        assert "passes validation checks" in run(OPENJD, "check", str(FARM / name))
     frames = ["-p", "Frames=0-9,20"]
-    run("openjd", "run", str(FARM / "openjd-shot.yaml"), "--step", "Denoise", "--run-dependencies", *given, *frames)
+    run(OPENJD, "run", str(FARM / "openjd-shot.yaml"), "--step", "Denoise", "--run-dependencies", *given, *frames)
     *renders, last = farm.calls()
     assert sorted(n for call in shares(renders) for n in call.frames) == [*range(10), 20] and len(renders) == 2
     assert last.verb == "denoise" and last.temporal and last.skip_existing
@@ -87,7 +89,7 @@ def test_open_job_description(farm):
     for seed in (1, 2, 3):
         (farm.folder / "out" / f"part.{seed}.exr").touch()
     run(
-        "openjd",
+        OPENJD,
         "run",
         str(FARM / "openjd-still.yaml"),
         "--step",

@@ -122,9 +122,8 @@ def test_a_record_is_worth_in_its_own_pixel_what_was_recorded(paths):
     assert not f[:, paths.kind == STUCK].any()
 
 
+@pytest.mark.parametrize("paths", ["glossy"], indirect=True)
 def test_all_kinds_of_paths_are_met(paths):
-    if "mirror" not in {shape.id() for shape in paths.scene.shapes()}:
-        pytest.skip("the scene has no mirror and glass")
     assert set(paths.kind[paths.W > 0]) == {0, 1, 2, 3, 4, 5}
     assert paths.replayed[paths.W > 0].max() > 2
 

@@ -73,14 +73,16 @@ def toy():
     del SAMPLERS["toy"]
 
 
-def cases(dear=lambda entry: entry.batch):
-    """(name, whether the law runs at full length) of every sampler.
+def cases(dear=lambda entry: entry.batch, of=lambda entry: True):
+    """(name, whether the law runs at full length) of every sampler that it is a law ``of``.
 
     Short for those that are ``dear``, since their passes take long to start, and at full length in the slow suite.
     Studies run there alone, as the toy does, whose laws are those of a film with splats.
     """
     found = []
     for name, entry in (SAMPLERS | {"toy": TOY}).items():
+        if not of(entry):
+            continue
         apart = entry.standing == "study" or name == "toy"
         if not apart:
             found.append(pytest.param(name, not dear(entry), id=name))
@@ -124,14 +126,27 @@ def references_of(mi, description, size):
     return render_references(mi, load(mi, description, size), spp=128)
 
 
-@pytest.mark.parametrize("pixels", DISTANCES)
-@pytest.mark.parametrize(("name", "full"), cases())
+def unbiased(entry):
+    """Not those that say they are biased: their own tests hold them to what they converge to."""
+    return not entry.biased
+
+
+def with_each(cases, *values, unless=lambda entry, full, value: False):
+    """The cases with each of the values, but for those that are nothing to be tested."""
+    return [
+        pytest.param(*case.values, value, id=f"{case.id}-{value}", marks=case.marks)
+        for value in values
+        for case in cases
+        if not unless((SAMPLERS | {"toy": TOY})[case.values[0]], case.values[1], value)
+    ]
+
+
+@pytest.mark.parametrize(
+    ("name", "full", "pixels"),
+    with_each(cases(of=unbiased), *DISTANCES, unless=lambda entry, full, pixels: pixels > 1 and not entry.gradients),
+)
 def test_unbiased(renderer, name, full, pixels):
     """Over one pixel, and over eight, where wrong densities and weights stand out of the noise."""
-    if pixels > 1 and not SAMPLERS[name].gradients:
-        pytest.skip("no gradients")
-    if SAMPLERS[name].biased:
-        pytest.skip("biased, and says so; its own tests hold it to what it converges to")
     description = quick(renderer, name)
     references = references_of(renderer, description, (32, 32))
     assert references.mean() > 0.01  # black images agree all too well
@@ -182,11 +197,9 @@ def block_variances(images, side=8):
     return np.exp(np.log(variances[variances > 0]).mean())
 
 
-@pytest.mark.parametrize(("name", "full"), cases())
+@pytest.mark.parametrize(("name", "full"), cases(of=unbiased))
 def test_unbiased_where_there_are_holes_and_no_environment(renderer, name, full):
     """Where Mitsuba's ``path`` loses light (docs/use/rendering.md), and no sampler of ours may."""
-    if SAMPLERS[name].biased:
-        pytest.skip("biased, and says so")
     scene, references = load(renderer, leaf, (32, 32)), references_of(renderer, leaf, (32, 32))
     for pixels in DISTANCES:
         try:
@@ -223,11 +236,10 @@ FLOORS = (2.5, 4.0)
 FAILURES = 0.25
 
 
-@pytest.mark.parametrize(("name", "full"), cases())
+# The toy's samples of a pass are all one.
+@pytest.mark.parametrize(("name", "full"), cases(of=lambda entry: entry.gradients and entry.name != "toy"))
 def test_gradients_have_less_noise_than_pixels(renderer, name, full):
     """No z-test asks for that: a sampler that rejects every shift is unbiased."""
-    if not SAMPLERS[name].gradients or name == "toy":  # whose samples of a pass are all one
-        pytest.skip("no gradients to judge")
     for layer, found in zip(("dx", "dy"), gains(renderer, name, full), strict=True):
         assert all(np.greater(found, FLOORS)), f"{layer}: {found}"
     if SAMPLERS[name].diagnoses:
@@ -272,14 +284,15 @@ def test_variances_are_those_over_seeds(renderer, name, full):
             assert low < ratio < high + 0.2 * entry.biased, (layer, ratio)
 
 
-@pytest.mark.parametrize("size", [(16, 12), (7, 5)])
-@pytest.mark.parametrize(("name", "full"), cases())
+# Those that are dear render the larger image in the slow suite.
+@pytest.mark.parametrize(
+    ("name", "full", "size"),
+    with_each(cases(), (16, 12), (7, 5), unless=lambda entry, full, size: not full and size == (16, 12)),
+)
 def test_the_same_seed_gives_the_same_bits_whatever_the_passes(renderer, monkeypatch, name, full, size):
     from data_gen import passes
     from data_gen.render import render_stack
 
-    if not full and size == (16, 12):
-        pytest.skip("in the slow suite")
     scene = scene_for(renderer, name, size)
     # Passes of one sample take long to start.
     spp = (20 if SAMPLERS[name].batch == 1 else 150) if full else 3 * SAMPLERS[name].batch + 1
