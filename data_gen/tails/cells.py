@@ -31,9 +31,7 @@ class Place:
     """A vertex as the cache knows it."""
 
     p: mi.Point3f
-    code: (
-        mi.UInt32
-    )  # direction of the normal on the side that is seen, of gloss also of the view, and what else is apart
+    code: mi.UInt32  # direction of the normal on the side that is seen, and what else tells cells apart
     level: mi.Int32  # cells have the side 2^level
 
 

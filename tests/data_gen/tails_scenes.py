@@ -208,3 +208,17 @@ def mirrors():
         "pane": _wall([-1.4, 1.2, 0], [1, 0, 0], (1.8, 1.6), mirror),
         "ball": _sphere([0.6, 0.35, 0.3], 0.35, mirror),
     }
+
+
+def varnish():
+    """A room whose floor is dark varnish, which sends the light of a window in one wall to the wall across."""
+    from data_gen.scenes.builtin import _light, _wall
+
+    wood = {"type": "roughplastic", "alpha": 0.2, "diffuse_reflectance": {"type": "rgb", "value": 0.02}}
+    return _place(
+        (0, 1.2, 1.4),
+        (0, 0.9, -1.5),
+        fov=90,
+        **_walls((-1.5, 0, -1.5), (1.5, 2.4, 1.5), _grey(0.3)) | {"floor": _wall([0, 0, 0], [0, 1, 0], (3, 3), wood)},
+        window=_light([-1.49, 0.6, 0], [1, 0, 0], (1.5, 0.8), (6, 7, 8)),
+    )
