@@ -28,6 +28,9 @@ _PLACES = 32
 LEVELS = 2
 # A cell is trusted once it has so many records, whatever they hold: see ``Cache``.
 LEAST = 16
+# A record may be so many times as bright as the mean of all so far, or have such a part of their light. What is
+# brighter is cut: one path would make a spot that no denoiser removes.
+MOST, PARTS = 3000, 200
 # The light of the brightest record of the first round, and the brightest that is told from others, in units of sums,
 # both as powers of two
 _BITS, _MOST_BITS = 30, 40
@@ -66,6 +69,8 @@ class Cache:
         self.keys, self.count = dr.zeros(mi.UInt32, CELLS), dr.zeros(mi.UInt32, CELLS)
         self.sums = [dr.zeros(mi.Int64, CELLS) for _ in range(3 * sorts)]
         self.unit, self.full, self.fineness = 0.0, False, fineness
+        # Of all records so far: how many, and the light of the brightest colour of each, in units
+        self.records = self.light = 0
         blank = [dr.zeros(mi.Float, 4 * CELLS) for _ in range(sorts)]
         self.known = Known(self.keys, blank, dr.opaque(mi.Float, fineness))
         dr.make_opaque(self.keys, self.count, self.sums, self.known.values)
@@ -81,6 +86,11 @@ class Cache:
                 self.unit = 2.0 ** max(math.ceil(math.log2(most)) - _BITS, -126)
         # Opaque: it would be compiled into the kernel, a new one for every scene.
         scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
+        brightest = dr.select(good, dr.minimum(largest * scale, 2.0**_MOST_BITS), 0)
+        self.records += int(dr.count(good)[0])
+        self.light += int(dr.sum(mi.Int64(brightest + 0.5))[0])
+        most = max(MOST, self.records / PARTS) * self.light / max(self.records, 1)
+        scale = scale * dr.minimum(1, dr.opaque(mi.Float, most) / dr.maximum(brightest, 1))
         counts = [mi.Int64(dr.minimum(value * scale, 2.0**_MOST_BITS) + 0.5) for value in values]
         places = [place]
         for _ in range(LEVELS - 1):

@@ -96,7 +96,7 @@ def test_what_is_known_depends_on_no_order(renderer):
 
 @pytest.mark.parametrize("scale", [1.0, 1e-30, 1e12])
 def test_what_is_known_has_all_the_light(renderer, scale):
-    """Also where one record in thousands brings most of it."""
+    """Also where one record in thousands brings a tenth of it."""
     import drjit as dr
 
     from data_gen.tails.cache import Cache
@@ -105,7 +105,7 @@ def test_what_is_known_has_all_the_light(renderer, scale):
     mi, rng, n = renderer, np.random.default_rng(1), 20_000
     u, v = (mi.Float(rng.random(n).astype(np.float32)) for _ in range(2))
     place = Place(mi.Point3f(u, v, 0.02), mi.UInt32(0), mi.Int32(-3))
-    light = scale * dr.select(dr.arange(mi.UInt32, n) == 5, 1e4, mi.Float(rng.random(n).astype(np.float32)))
+    light = scale * dr.select(dr.arange(mi.UInt32, n) == 5, 1e3, mi.Float(rng.random(n).astype(np.float32)))
     cache = Cache(16.0)
     cache.add(place, [light, 0.5 * light, mi.Float(0)])
     cache.settle(16.0)
@@ -114,6 +114,28 @@ def test_what_is_known_has_all_the_light(renderer, scale):
     assert np.array(trusted).all() and np.allclose(green, 0.5 * red, rtol=1e-4) and not blue.any()
     # At the edges cells have too few records, and those around answer for them.
     assert red.sum() == pytest.approx(np.array(light, np.float64).sum(), rel=1e-3)
+
+
+def test_one_record_cannot_bring_most_of_the_light(renderer, monkeypatch):
+    """It is cut to so many times the mean, or to a part of all light where there are many records."""
+    import drjit as dr
+
+    from data_gen.tails import cache
+    from data_gen.tails.cells import Place
+
+    mi, n = renderer, 20_000
+    place = Place(mi.Point3f(dr.full(mi.Float, 0.5, n), 0.5, 0.02), mi.UInt32(0), mi.Int32(-3))
+    values = np.ones(n, np.float32)
+    values[5] = 1e6
+    mean = values.mean()
+    for parts, most in ((200, 3000 * mean), (2, n * mean / 2)):
+        monkeypatch.setattr(cache, "PARTS", parts)
+        filled = cache.Cache(16.0)
+        filled.add(place, [mi.Float(values), mi.Float(0.5 * values), mi.Float(0)])
+        filled.settle(16.0)
+        (found,), trusted = filled.known.look(place, mi.Bool(True))
+        assert trusted[0] and float(found.x[0]) == pytest.approx((n - 1 + most) / n, rel=1e-3)
+        assert float(found.y[0]) == pytest.approx(0.5 * float(found.x[0]), rel=1e-3)
 
 
 def test_a_full_cache_says_so_and_goes_on(renderer, caplog, monkeypatch):
