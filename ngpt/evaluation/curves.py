@@ -27,12 +27,13 @@ _Segment = tuple[tuple[float, float], tuple[float, float]]
 def first_at(error: float, points: Points) -> tuple[float, str] | None:
     """Where a curve first comes down to ``error``, and its mark.
 
-    None where there are fewer than two points, or the error never falls. All numbers must be positive.
+    A curve that never falls is there at its first point at the latest, or nobody knows: None. All numbers must be
+    positive.
     """
     curve, falls = _curve(points)
-    if not falls:
-        return None
     target, reach = math.log(error), math.log(REACH)
+    if not falls:
+        return (math.exp(curve[0][0]), "<") if curve and target >= curve[0][1] else None
     (first, highest), (last, lowest) = curve[0], curve[-1]
     if target > highest:
         x = first + (target - highest) / _outside(falls[0])

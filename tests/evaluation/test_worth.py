@@ -66,7 +66,9 @@ def test_a_curve_that_rises_has_the_error_it_had_before():
     # It stays at 0.25 until 64 at least: what comes below is sought from there on, by the last slope that falls.
     found, mark = first_at(0.125, [*points, (64, 0.3)])
     assert (found, mark) == (pytest.approx(64 * 2), "~")
-    assert first_at(0.2, [(1, 0.5), (4, 0.6)]) is None and first_at(0.2, [(1, 0.5)]) is None
+    assert first_at(0.2, [(1, 0.5), (4, 0.6)]) is None and first_at(0.2, [(1, 0.5)]) is None and first_at(1, []) is None
+    # A rival whose error only rises has this one from its first point on: it must not be left out.
+    assert first_at(0.55, [(3, 0.5), (4, 0.6)]) == first_at(0.5, [(3, 0.5)]) == (pytest.approx(3), "<")
 
 
 def write_room(folder, rng):
