@@ -176,6 +176,17 @@ def test_the_numbers_of_the_readme_are_in_the_results():
         assert pair in results, pair
 
 
+def test_papers_are_those_of_the_bibliography():
+    """Keys of papers.md are entries of references.bib, and the other way round; CITATION.cff names no other papers."""
+    bib = (ROOT / "docs" / "references.bib").read_text()
+    titles = dict(re.findall(r"^@\w+\{(\w+),.*?^ +title += \{\{(.+?)\}\},$", bib, re.M | re.S))
+    cited = re.findall(r"`([a-z]+\d{4}[a-z]+)`", (ROOT / "docs" / "papers.md").read_text())
+    assert set(cited) == set(titles) and len(titles) == bib.count("\n@")
+    named = re.findall(r'^ +title: "(.+)"$', (ROOT / "CITATION.cff").read_text(), re.M)
+    assert set(named) <= set(titles.values()) and len(named) == len(set(named)) > 20
+    assert set(list(titles.values())[:5]) <= set(named)  # the five come first
+
+
 def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):
     """The first block of Python, and what follows from it."""
     import ngpt

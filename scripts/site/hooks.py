@@ -84,13 +84,14 @@ def on_files(files, config):
 
 
 def menu(pages: list[str]) -> list:
-    """Pages by folder, in the order in which the front page names them."""
+    """The front page, pages beside it, then pages by folder, in the order in which the front page names them."""
     front = [address((DOCS / target).resolve()) for _, target in LINK.findall((DOCS / "index.md").read_text())]
     order = {page: place for place, page in reversed(list(enumerate(front)))}
     of = {folder: [page for page in pages if page.startswith(folder + "/")] for folder in FOLDERS}
-    for chosen in of.values():
+    beside = [page for page in pages if "/" not in page and page != "index.md"]
+    for chosen in (beside, *of.values()):
         chosen.sort(key=lambda page: (order.get(page, len(front)), page))
-    return ["index.md", *({FOLDERS[folder]: chosen} for folder, chosen in of.items() if chosen)]
+    return ["index.md", *beside, *({FOLDERS[folder]: chosen} for folder, chosen in of.items() if chosen)]
 
 
 def on_page_markdown(markdown, page, config, files):
