@@ -10,6 +10,7 @@ ALLOWED = {
     r"this build of ONNX Runtime sends no telemetry": "what is to be switched off is not there",
     r"root may read anything": "a file without permissions is only closed to others",
     r"it refuses holes": "a sampler says which scenes it cannot render",
+    r"E-LPIPS needs its fitted weights": "its authors' weights may not be shipped",
     r"this machine may have room for them": "images of 16 TiB",
     r"strace may not trace here": "some containers forbid it",
     r"oidnDenoise, of an OIDN release, is not in PATH": "no registry has that program",
