@@ -1,15 +1,15 @@
-"""How the error of paths that share their tails falls with the number of samples, beside that of whole paths.
+"""Error against the number of samples: paths that share their tails, and whole paths.
 
     python -m bench.consistency room/scene.xml diffuse --variant cuda_ad_rgb
 
-Of each scene, each number of samples and each ``tails``, for the sampler `primal` without any reconstruction:
+The sampler is `primal`, without a reconstruction. For each scene, number of samples and ``tails``:
 
     error    relMSE by two halves of a reference of whole paths, so that it has no noise of the reference in it
     blocks   the same of means over 8x8 pixels, where bias shows and noise does not
     energy   mean of the image over the mean of the reference
 
-Values are means over seeds. The rate is by how much the error falls where samples are four times as many: 4 where all
-of it is noise.
+Values are means over seeds. A rate is an error over the error at the next number of samples in the table. If that is
+four times as many, pure noise has a rate of 4. Cells of a scene and size that are measured again replace the old ones.
 """
 
 import argparse
@@ -22,12 +22,9 @@ import numpy as np
 
 from bench.claims import blocks
 from bench.common import metadata, save
+from bench.tails import REFERENCE_SEED, TAILS
 from ngpt.evaluation.config import scene_name
 from ngpt.measure.metrics import relmse_trimmed
-
-TAILS = ("paths", "shared")
-# Far from those that images have
-REFERENCE_SEED = 1 << 20
 
 
 def main() -> None:
@@ -44,7 +41,9 @@ def main() -> None:
     if args.output.exists():
         result["cells"] = json.loads(args.output.read_text())["cells"]
     for scene in args.scenes:
-        result["cells"] += measured(scene, args)
+        cells = measured(scene, args)
+        place = (cells[0]["scene"], cells[0]["size"])
+        result["cells"] = [cell for cell in result["cells"] if (cell["scene"], cell["size"]) != place] + cells
         save(args.output, result)
     show(result["cells"])
 

@@ -45,7 +45,10 @@ class Known:
     fineness: mi.Float
 
     def look(self, place: Place, active: mi.Bool) -> tuple[list[mi.Color3f], mi.Bool]:
-        """The light of each sort at a place, and whether it is trusted: that of the smallest cell around it that is."""
+        """The light of each sort at a place, and whether it is trusted.
+
+        The smallest trusted cell around the place has it.
+        """
         values = self._of(place, active)
         for _ in range(LEVELS - 1):
             place, more = coarser(place), active & (values[0].w == 0)
@@ -80,10 +83,10 @@ class Cache:
         least, largest = (reduce(extreme, values) for extreme in (dr.minimum, dr.maximum))
         good = dr.isfinite(sum(values)) & (least >= 0)
         if not self.unit:
-            most = dr.max(dr.select(good, largest, 0))[0]
-            if most > 0:
+            first = dr.max(dr.select(good, largest, 0))[0]
+            if first > 0:
                 # No less than what has an inverse among floats
-                self.unit = 2.0 ** max(math.ceil(math.log2(most)) - _BITS, -126)
+                self.unit = 2.0 ** max(math.ceil(math.log2(first)) - _BITS, -126)
         # Opaque: it would be compiled into the kernel, a new one for every scene.
         scale = dr.opaque(mi.Float, 1 / self.unit if self.unit else 0)
         brightest = dr.select(good, dr.minimum(largest * scale, 2.0**_MOST_BITS), 0)
@@ -120,14 +123,14 @@ class Cache:
             )
         each = dr.opaque(mi.Float, self.unit) / dr.maximum(self.count, 1)
         trusted = dr.select(self.count >= LEAST, mi.Float(1), 0)
+        # Old values go first, to make room for the new ones.
         self.known.values.clear()
-        for first in range(0, len(self.sums), 3):
-            light = [each * mi.Float(of_cell) for of_cell in self.sums[first : first + 3]]
-            flat = dr.zeros(mi.Float, 4 * CELLS)
+        values = [dr.zeros(mi.Float, 4 * CELLS) for _ in range(len(self.sums) // 3)]
+        for sort, flat in enumerate(values):
+            light = [each * mi.Float(of_cell) for of_cell in self.sums[3 * sort : 3 * sort + 3]]
             dr.scatter(flat, mi.Vector4f(*light, trusted), dr.arange(mi.UInt32, CELLS))
-            self.known.values.append(flat)
-        self.known = Known(mi.UInt32(self.keys), self.known.values, dr.opaque(mi.Float, fineness))
-        dr.eval(self.known.keys, self.known.values)
+        self.known = Known(mi.UInt32(self.keys), values, dr.opaque(mi.Float, fineness))
+        dr.eval(self.known.keys, values)
 
 
 def in_table(

@@ -181,33 +181,32 @@ SCENES = {
 
 def bulb():
     """A room whose only lamp is inside a ball of glass: all of its light comes over rough surfaces and then glass."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _room, _sphere
+    from data_gen.scenes.builtin import _diffuse, _room, _sphere
 
-    lamp = _sphere([0, 1.2, 0], 0.5, _diffuse(0, 0, 0)) | {"emitter": {"type": "area", "radiance": 3.0}}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 8},
-        "sensor": _camera([0, 1.25, 3.9], [0, 1.1, 0], 50),
+    return _place(
+        (0, 1.25, 3.9),
+        (0, 1.1, 0),
+        fov=50,
         **_room(1.5, _diffuse(0.6, 0.6, 0.6)),
-        "lamp": lamp,
-        "glass": _sphere([0, 1.2, 0], 0.6, {"type": "dielectric"}),
-    }
+        lamp=_sphere([0, 1.2, 0], 0.5, _diffuse(0, 0, 0)) | {"emitter": {"type": "area", "radiance": 3.0}},
+        glass=_sphere([0, 1.2, 0], 0.6, {"type": "dielectric"}),
+    )
 
 
 def mirrors():
     """A room with a mirror on the wall, and a small ball that mirrors before it."""
-    from data_gen.scenes.builtin import _camera, _diffuse, _light, _room, _sphere, _wall
+    from data_gen.scenes.builtin import _diffuse, _light, _room, _sphere, _wall
 
     mirror = {"type": "twosided", "nested": {"type": "conductor", "material": "none"}}
-    return {
-        "type": "scene",
-        "integrator": {"type": "path", "max_depth": 8},
-        "sensor": _camera([0, 1.25, 3.9], [0, 1.1, 0], 50),
+    return _place(
+        (0, 1.25, 3.9),
+        (0, 1.1, 0),
+        fov=50,
         **_room(1.5, _diffuse(0.7, 0.6, 0.5)),
-        "lamp": _light([0, 2.3, 0], [0, -1, 0], (1.6, 1.6), (3, 3, 3)),
-        "pane": _wall([-1.4, 1.2, 0], [1, 0, 0], (1.8, 1.6), mirror),
-        "ball": _sphere([0.6, 0.35, 0.3], 0.35, mirror),
-    }
+        lamp=_light([0, 2.3, 0], [0, -1, 0], (1.6, 1.6), (3, 3, 3)),
+        pane=_wall([-1.4, 1.2, 0], [1, 0, 0], (1.8, 1.6), mirror),
+        ball=_sphere([0.6, 0.35, 0.3], 0.35, mirror),
+    )
 
 
 def varnish():

@@ -73,6 +73,9 @@ def toy():
     del SAMPLERS["toy"]
 
 
+EVERY = SAMPLERS | {"toy": TOY}
+
+
 def cases(dear=lambda entry: entry.batch, of=lambda entry: True):
     """(name, whether the law runs at full length) of every sampler that it is a law ``of``.
 
@@ -80,7 +83,7 @@ def cases(dear=lambda entry: entry.batch, of=lambda entry: True):
     Studies run there alone, as the toy does, whose laws are those of a film with splats.
     """
     found = []
-    for name, entry in (SAMPLERS | {"toy": TOY}).items():
+    for name, entry in EVERY.items():
         if not of(entry):
             continue
         apart = entry.standing == "study" or name == "toy"
@@ -137,7 +140,7 @@ def with_each(cases, *values, unless=lambda entry, full, value: False):
         pytest.param(*case.values, value, id=f"{case.id}-{value}", marks=case.marks)
         for value in values
         for case in cases
-        if not unless((SAMPLERS | {"toy": TOY})[case.values[0]], case.values[1], value)
+        if not unless(EVERY[case.values[0]], case.values[1], value)
     ]
 
 

@@ -61,8 +61,7 @@ def end(plan: Plan, known: Known, path: Path, offsets: list) -> tuple[Path, mi.S
     ρ = plan.matt.reflectance(path.x, ends)
     found, *late = [dr.select(ends, ρ * C, 0) for C in sorts]
     found, caustic_found = caustic.split(path.late, found)
-    for light in late:
-        caustic_found = caustic_found + light
+    caustic_found = sum(late, caustic_found)
     for y in offsets:
         # Of a joined path, what it would settle with at this vertex, which scatters alike in all directions
         joined = shift.gradient_weight(y.r, True) * (y.β - path.β)
