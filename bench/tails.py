@@ -2,7 +2,8 @@
 
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
-Samplers `primal` (as it is, "raw", and `oidn`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine`, `oidn`). Of each cell:
+Samplers are `primal` (as it is, "raw", `oidn` and `ngpt-primal`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine` and
+`oidn`). Each cell has:
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
@@ -41,7 +42,8 @@ from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error, trimmed_mean
 
 RAW = "raw"
-METHODS = {"primal": [RAW, "oidn"], "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"]}
+SECONDS = (5, 10, 20, 40)
+METHODS = {"primal": [RAW, "oidn", "ngpt-primal"], "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"]}
 TAILS = ("paths", "shared")
 VALUES = ("error", "steady", "FLIP", "blocks", "energy")
 ERRORS = VALUES[:-1]
@@ -58,6 +60,7 @@ def main() -> None:
     parser.add_argument("--references", type=Path, metavar="FOLDER")
     parser.add_argument("--reference-spp", type=int, default=256, help="of each half that is made")
     parser.add_argument("--size", default="640x360")
+    parser.add_argument("--tails", nargs="+", default=list(TAILS), choices=list(TAILS))
     parser.add_argument("--samplers", nargs="+", default=list(METHODS), choices=list(METHODS))
     parser.add_argument("--spp", type=int, nargs="+", default=[4, 16, 64])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1])
@@ -102,7 +105,7 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
         warm: set[str] = set()
         for spp in args.spp:
             for seed in args.seeds:
-                for tails in TAILS:
+                for tails in args.tails:
                     values = (scene_name(scene), args.size, sampler, tails, spp, seed)
                     if values in known:
                         continue
@@ -228,6 +231,9 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
         for title, (head, *lines) in told.items():
             print(f"\n{title}")
             table(head, lines)
+    for tails in sorted({cell["tails"] for cell in cells}):
+        print(f"\npipelines after equal whole time, tails={tails}: error and FLIP over those of `primal` and `oidn`")
+        table(["scenes", "processor s", *pipelines()], against_oidn(cells, tails, groups))
     loads = [cell["load average"] for cell in cells]
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
 
@@ -238,8 +244,33 @@ def pipelines() -> dict[str, dict[str, str]]:
     return {
         f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
         for sampler, method in pairs
-        if (sampler, method) != ("gpt", "oidn")
+        if (sampler, method) != ("gpt", "oidn") and method != RAW
     }
+
+
+def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
+    """A row for each scene and group, and each of ``SECONDS``: of all ``pipelines``, error and FLIP."""
+    curves: dict[str, dict[str, dict[str, list]]] = {}
+    for (scene, _, sampler, method), by_spp in rows_of(cells).items():
+        if (name := f"{sampler}+{method}") in pipelines():
+            lines = [by[tails] for by in by_spp.values() if tails in by]
+            points = {value: [(line["whole"], line[value]) for line in lines] for value in ("error", "FLIP")}
+            curves.setdefault(scene, {})[name] = points
+
+    def ratio(scene: str, name: str, value: str, seconds: float) -> tuple[float, str] | None:
+        a, b = (error_at(seconds, curves[scene].get(each, {}).get(value, [])) for each in (name, "primal+oidn"))
+        return (a[0] / b[0], joined((a[1], b[1]))) if a and b else None
+
+    rows = []
+    for label, members in [*((scene, [scene]) for scene in curves), *groups.items()]:
+        here = [scene for scene in members if scene in curves]
+        for seconds in SECONDS if here else ():
+            values = {
+                name: [over([ratio(scene, name, value, seconds) for scene in here]) for value in ("error", "FLIP")]
+                for name in pipelines()
+            }
+            rows.append([label, str(seconds), *map(", ".join, values.values())])
+    return rows
 
 
 def evaluated(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> dict[str, Any]:

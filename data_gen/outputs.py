@@ -24,7 +24,7 @@ from ngpt.system.text import by_names
 
 @dataclass(frozen=True)
 class Denoising:
-    """``method`` is a name, or "auto": the one that a pilot has chosen (``ngpt:for``), else the best for the layers.
+    """``method`` is a name, or "auto": see ``ngpt.methods.choose``.
 
     ``transform`` and ``exposure`` say how a picture shows light, as in `ngpt denoise`.
     """
@@ -33,12 +33,16 @@ class Denoising:
     transform: str = "standard"
     exposure: float | str = 0.0
 
+    @property
+    def needs_gradients(self) -> bool:
+        return self.method != "auto" and "dx" in runnable(self.method).needs
+
     def check(self, sampler: str, spp: int | None) -> None:
         """Raises an error for a method that does not run here, or that needs what such a render lacks."""
         if self.method == "auto":
             return
         needs, entry = runnable(self.method).needs, SAMPLERS.get(sampler)
-        if "dx" in needs and (sampler in FRAME_SAMPLERS or (entry and not entry.gradients)):
+        if self.needs_gradients and (sampler in FRAME_SAMPLERS or (entry and not entry.gradients)):
             raise WrongUse(
                 f"method '{self.method}' needs gradients, and sampler '{sampler}' renders none; name another"
             )
@@ -54,17 +58,16 @@ class Denoising:
         """
         from ngpt.cli.denoise_files import Frame, write_frame  # imports metrics, which a stack does not need
 
-        name = stack.attributes.get("ngpt:for", "auto") if self.method == "auto" else self.method
         try:
             pixels = seen(stack.place)
             check_size(file, pixels.width, pixels.height)
-            result = reconstruct(stack, str(name))
+            result = reconstruct(stack, self.method)
         except Exception as error:  # methods may come from other packages, and fail in any way
             if keeps:
                 raise
             why = str(error)
             if not isinstance(error, NgptError):
-                why = f"method '{name}' failed: {type(error).__name__}: {error}".rstrip(": ")
+                why = f"method '{self.method}' failed: {type(error).__name__}: {error}".rstrip(": ")
             # What stands for standard output goes when the command ends.
             lasting = file if by_names(str(file)) == str(file) else Path(file.name)
             raise kept_apart(why, stack, lasting.with_name(f"{file.stem}.stack.exr")) from error

@@ -56,6 +56,7 @@ def render_scene(
     memory: int | None = None,
     diagnostics: bool = False,
     unbiased: bool = False,
+    gradients: bool = False,
     variant: str | None = None,
     progress: Callable[[int, int], None] = lambda done, total: None,
     stop: Callable[[], bool] = lambda: False,
@@ -79,6 +80,7 @@ def render_scene(
     ``diagnostics`` adds rates of failed shifts and discarded values as channels
     ``unbiased``    turns the cache off that paths share. The cache lowers the noise of most renders and adds a small
                     bias: see docs/samplers/tails.md
+    ``gradients``   whether the stack must have dx and dy, also where a sampler without them leaves less error ("auto")
     ``variant``     of Mitsuba; by default the current one, or llvm_ad_rgb where none is set
     ``progress``    called with (samples done, spp), or whole (seconds gone, seconds)
     ``stop``        asked after each pass whether to end there: the stack holds the samples done by then. See
@@ -110,7 +112,8 @@ def render_scene(
     pilot = sharing is None and sampler == "auto"
     plan = None
     if pilot:
-        plan = _plan(scene, spp, seconds, method, memory, said=said, stop=stop, unbiased=unbiased)
+        told = {"said": said, "stop": stop, "unbiased": unbiased}
+        plan = _plan(scene, spp, seconds, method, memory, gradients, **told)
         _LOG.info("plan: sampler %s, method %s: %s", plan.sampler, plan.method or "any", plan.reason)
         chosen(plan)
         sampler, seconds = plan.sampler, plan.render
@@ -268,11 +271,17 @@ def _adaptive(error: float | None, method: str) -> Adaptive:
 
 
 def _plan(
-    scene: mi.Scene, spp: int | None, seconds: float | None, method: str | None, memory: int, **told: Any
+    scene: mi.Scene,
+    spp: int | None,
+    seconds: float | None,
+    method: str | None,
+    memory: int,
+    gradients: bool,
+    **told: Any,
 ) -> Plan:
     """By a pilot: of the sampler and the method for so many ``seconds``, or, without a ``method``, of the sampler."""
     from data_gen.choosing.plans import plan, plan_sampler
 
     if method is None or seconds is None:
-        return plan_sampler(scene, spp, seconds, memory, **told)
+        return plan_sampler(scene, spp, seconds, memory, gradients=gradients, **told)
     return plan(scene, seconds, method, memory, **told)

@@ -225,7 +225,7 @@ ORDER = ("ngpt-combine", "oidn", "ngpt-fast", "wcv", "l1", "nfor")
 def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) -> str:
     """The method that ``auto`` stands for: the best of those that the layers and this machine's packages allow.
 
-    ``layers``  a stack, or names of its layers
+    ``layers``  a stack, or names of its layers. A stack may say what it was rendered for (``ngpt:for``)
     ``usable``  whether a method can be used, by its name; None asks this machine
 
     The errors behind ``ORDER`` are in docs/lab/RESULTS.md, "By the layers of a stack". Where OIDN is installed it is
@@ -233,8 +233,9 @@ def choose(layers: Container[str], usable: Callable[[str], bool] | None = None) 
     better on diffuse scenes.
     """
     usable = usable or (lambda name: not METHODS[name].missing())
-    for name in ORDER:
-        if all(layer in layers for layer in METHODS[name].needs) and usable(name):
+    made_for = str(layers.attributes.get("ngpt:for")) if isinstance(layers, GradientStack) else ""
+    for name in (made_for, *ORDER):
+        if name in METHODS and all(layer in layers for layer in METHODS[name].needs) and usable(name):
             return name
     return "primal"
 

@@ -46,6 +46,22 @@ def test_auto_takes_the_best_that_layers_and_machine_allow(monkeypatch, layers, 
         assert choose(stack) == expected
 
 
+def test_auto_takes_what_a_stack_was_rendered_for(monkeypatch):
+    stack = full_stack(18, 26)
+    for made_for, expected in (
+        ("ngpt-primal", "ngpt-primal"),
+        ("wcv", "wcv"),
+        ("unknown", "ngpt-combine"),
+        (7, "ngpt-combine"),
+    ):
+        stack.attributes["ngpt:for"] = made_for
+        assert choose(stack, lambda name: True) == expected
+    stack.attributes["ngpt:for"] = "ngpt-primal"
+    assert choose(stack, lambda name: name != "ngpt-primal") == "ngpt-combine"
+    lacking = GradientStack({"primal": stack["primal"]}, stack.attributes)
+    assert choose(lacking, lambda name: True) == "oidn"
+
+
 NEED_OIDN = ("ngpt-combine", "ngpt-primal", "oidn")
 
 

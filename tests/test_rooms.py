@@ -53,7 +53,7 @@ data_gen.plugins
 data_gen.backend
 data_gen.render data_gen.inspect
 data_gen.frames
-data_gen.choosing.costs data_gen.choosing.trials
+data_gen.choosing.costs data_gen.choosing.enclosed data_gen.choosing.trials
 data_gen.choosing.pipelines
 data_gen.choosing.plans
 data_gen.choosing

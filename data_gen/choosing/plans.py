@@ -17,12 +17,15 @@ from dataclasses import dataclass, replace
 import mitsuba as mi
 
 from data_gen import samplers
+from data_gen.choosing.enclosed import enclosed
 from data_gen.choosing.pipelines import Pipeline, choose, measure, methods_for
 from data_gen.choosing.trials import PIXELS, Trial, at_most, candidates, try_all
 from data_gen.passes import DEFAULT_MEMORY, film_within
 from data_gen.samplers import SAMPLERS
 from data_gen.scenes.facts import scene_facts
+from data_gen.tails.schedule import FIRST, LEAST_PATHS
 from ngpt.errors import NgptError
+from ngpt.methods import METHODS
 from ngpt.system.console import brief
 
 # Of the time that there is, what trials of samplers may take together, and those and the methods: of an image, and
@@ -47,6 +50,9 @@ LONG, LEAST_PIXELS = 200.0, 1 / 16
 # Renders for which a twentieth is enough to compile the kernels of other samplers and to try them: by seconds, and by
 # paths, of which a core or two make a million a second
 _LEAST_SECONDS, _LEAST_PATHS = 100.0, 10**8
+# What cleans the image of a room, and why
+_ROOM_METHOD = "ngpt-primal"
+_ROOM_REASON = "the camera is in a room, where more samples pay and gradients do not; --sampler gpt renders gradients"
 # A rival must need this much less time: a choice is not worth changing for what chance could have made.
 _MARGIN = 1.1
 
@@ -169,10 +175,13 @@ def plan(
     if ranked := choose(whole, left):
         first = ranked[0]
         return Plan(first.sampler, first.method, first.shared, left - first.after, _why(ranked, left))
+    if method in ("auto", _ROOM_METHOD) and in_a_room(scene, None):
+        sampler, method, why = "primal", _ROOM_METHOD, _ROOM_REASON
+    else:
+        sampler, why = able[0], samplers.choose(scene_facts(scene))[1]
     after = _beside(scene) + _METHOD_SECONDS.get(method, _OTHERS) * _pixels(scene) / 1e6
-    why = f"{samplers.choose(scene_facts(scene))[1]}; there is no time for a pilot"
     # However slow the method may be here, half of the time is rendered.
-    return Plan(able[0], method, False, max(left - after, left / 2, 1e-3), why)
+    return Plan(sampler, method, False, max(left - after, left / 2, 1e-3), f"{why}; there is no time for a pilot")
 
 
 def plan_sampler(
@@ -184,17 +193,21 @@ def plan_sampler(
     said: Said = silent,
     stop: Stop = never,
     unbiased: bool = False,
+    gradients: bool = False,
 ) -> Plan:
     """The sampler for a render of ``spp`` samples per pixel, or of so many ``seconds``; one of them may be None.
 
-    The description alone decides, at no cost, where one sampler alone can render the scene, and where the render is too
-    short for a pilot. What it measures changes from run to run, what it chooses hardly; the render itself has the bits
-    of ``--sampler NAME``. ``said`` and ``stop`` are as of ``plan``. Raises NgptError where no sampler with gradients
-    can render the scene, and before anything is tried where the image does not fit into ``memory`` (MiB).
+    In a room it is ``primal``, unless ``gradients`` are wanted: see ``in_a_room``. Elsewhere the description decides,
+    at no cost, where only one sampler can render the scene, and where the render is too short for a pilot. What a pilot
+    measures changes from run to run, what it chooses hardly; the render itself has the bits of ``--sampler NAME``.
+    ``said`` and ``stop`` are as of ``plan``. Raises NgptError where no sampler with gradients can render the scene, and
+    before anything is tried where the image does not fit into ``memory`` (MiB).
     """
     start = time.perf_counter()
     sampler, reason = samplers.choose(scene_facts(scene))
     described = Plan(sampler, "", False, seconds, reason)
+    if not gradients and in_a_room(scene, spp):
+        return replace(described, sampler="primal", method=_ROOM_METHOD, reason=_ROOM_REASON)
     names = candidates(scene, biased=True)
     if len(names) == 1:
         return described
@@ -220,6 +233,18 @@ def plan_sampler(
     # However long the pilot took, the render is begun.
     left = None if seconds is None else max(seconds - (time.perf_counter() - start), 1e-3)
     return replace(described, sampler=found[0], reason=found[1], render=left)
+
+
+def in_a_room(scene: mi.Scene, spp: int | None) -> bool:
+    """Whether ``primal`` and ``ngpt-primal`` leave less error and FLIP than gradients would, after the same whole time.
+
+    They do in rooms of surfaces, where paths share their tails (docs/lab/worth.md). Small images are the same to both,
+    and without OIDN gradients clean better.
+    """
+    facts = scene_facts(scene)
+    paths = _pixels(scene) * (spp or FIRST)
+    able = samplers.choose(facts)[0] == "gpt" and not facts.media and not SAMPLERS["primal"].refuses(facts)
+    return able and paths >= LEAST_PATHS and not METHODS[_ROOM_METHOD].missing() and enclosed(scene)
 
 
 def _pixels(scene: mi.Scene) -> int:

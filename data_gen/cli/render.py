@@ -140,6 +140,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
                 newest=looking.newest,
                 chosen=chosen,
                 said=console.say,
+                gradients=denoising is not None and denoising.needs_gradients,
                 **how,
                 **given,
             )
@@ -172,7 +173,7 @@ def image(args: argparse.Namespace, denoising: Denoising | None, console: Consol
             "on this machine now; a smaller --size is"
         )
     if denoising is None and (method := stack.attributes.get("ngpt:for")):
-        console.say(f"then: ngpt denoise {shlex.quote(str(target))} --method {method}")
+        console.say(f"then: ngpt denoise {shlex.quote(str(target))}, which takes method '{method}'")
     if args.json:
         kept = {"stack": str(output.kept)} if output.kept else {}
         print_json(report_of(stack, target, made) | {"layers": stack.names} | kept)

@@ -56,7 +56,7 @@ def test_a_pilot_chooses_for_a_method(renderer, tmp_path, capsys, monkeypatch):
     assert main(["render", "diffuse", "-o", target, "--size", "24x16", "--time", "60", "--for", "auto"]) == 0
     said, stack = capsys.readouterr().err, ngpt.read(target)
     assert asked == [(60.0, "auto")] and "method 'oidn': for a test" in said
-    assert f"then: ngpt denoise {target} --method oidn" in said
+    assert f"then: ngpt denoise {target}, which takes method 'oidn'" in said
     assert stack.attributes["ngpt:for"] == "oidn" and stack.attributes["ngpt:sampler"] == "primal"
     # The first 16 samples of those that are shared out are rendered in any case, and may have taken all the time.
     assert "samples shared out" in said and stack.attributes["ngpt:spp"] >= 16

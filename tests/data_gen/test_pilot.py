@@ -1,5 +1,7 @@
 """How ``--sampler auto`` chooses: by the description where that decides, by a pilot where there is time for one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from unbiased import load
@@ -118,6 +120,27 @@ def test_short_renders_are_not_measured(renderer, monkeypatch):
     for spp, seconds in ((1000, None), (None, 10.0), (1 << 30, 10.0), (1000, 1000.0)):
         choice = plans.plan_sampler(scene, spp, seconds)
         assert choice.sampler == "gpt" and "too short" in choice.reason and choice.render == seconds
+
+
+def test_rooms_are_rendered_without_gradients(renderer, monkeypatch):
+    """Where the renders have paths enough to share, nothing asks for gradients, and OIDN is there."""
+    from data_gen.choosing import plans
+
+    def chosen(name, size, spp, **more):
+        plan = plans.plan_sampler(load(renderer, name, size), spp, None, **more)
+        return plan.sampler, plan.method
+
+    room = ("primal", "ngpt-primal")
+    monkeypatch.setitem(plans.METHODS, "ngpt-primal", replace(plans.METHODS["ngpt-primal"], missing=lambda: ""))
+    assert chosen("glossy", (128, 64), 8) == room
+    assert chosen("glossy", (128, 64), 7) == chosen("glossy", (128, 64), 8, gradients=True) == ("gpt", "")
+    for open_scene in ("diffuse", "environment", "lens", "haze"):
+        assert chosen(open_scene, (128, 64), 8) == ("gpt", "")
+    plan = plans.plan(load(renderer, "glossy", (128, 64)), 5.0)
+    assert (plan.sampler, plan.method) == room and 0 < plan.render < 5
+    assert plans.plan(load(renderer, "glossy", (128, 64)), 5.0, "wcv").sampler == "gpt"
+    monkeypatch.setitem(plans.METHODS, "ngpt-primal", replace(plans.METHODS["ngpt-primal"], missing=lambda: "no OIDN"))
+    assert chosen("glossy", (128, 64), 8) == ("gpt", "")
 
 
 def test_a_pilot_leaves_the_scene_as_it_was(renderer, monkeypatch):
