@@ -77,6 +77,7 @@ def inspect_scene(name: str, parameters: dict[str, str] | None = None) -> dict:
         "plan": [
             f"{sampler}: {SAMPLERS[sampler].summary}",
             f"because {reason}",
+            *(["in a room it is 'primal': rays tell, once the scene is loaded"] * (sampler == "gpt" and not media)),
             *([unable] if unable else SAMPLERS[sampler].notes(facts)),
             *([f"integrator '{integrator}': the image of '{followed}' is rendered"] * (integrator != followed)),
             *_contents(plugins, facts),
