@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import ngpt
 from ngpt.stack import GradientStack
 
 DOCS = Path(__file__).parents[2] / "docs"
@@ -48,7 +49,10 @@ def run(notebook, folder, monkeypatch):
     made, shown = {"__name__": "__main__"}, []
     for cell in cells:
         if cell["cell_type"] == "code":
-            *statements, last = ast.parse("".join(cell["source"])).body
+            source = "".join(line for line in cell["source"] if not line.startswith("%"))  # pip's line
+            if not source:
+                continue
+            *statements, last = ast.parse(source).body
             if isinstance(last, ast.Expr):
                 exec(compile(ast.Module(statements, []), cell["id"], "exec"), made)
                 shown.append(eval(compile(ast.Expression(last.value), cell["id"], "eval"), made))
@@ -65,6 +69,19 @@ def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
     assert float(errors["ngpt-fast"]) < 0.5 * float(errors["primal"])
     assert (tmp_path / "report.html").stat().st_size > 100_000
     assert made["difference"] < 1e-4
+
+
+def test_the_first_five_cells_lead_to_a_clean_image(renderer, tmp_path, monkeypatch):
+    """The notebook for Colab has no others; its wheel is the one that `make wheel` makes."""
+    colab = DOCS / "start" / "colab.ipynb"
+    made, shown = run(colab, tmp_path, monkeypatch)
+    cells = [cell for cell in json.loads(colab.read_text())["cells"] if cell["cell_type"] == "code"]
+    assert len(cells) == 5 and f"ngpt_recon-{ngpt.__version__}-py3" in cells[0]["source"][0]
+    assert made["image"].shape == (160, 240, 3) and (tmp_path / "clean.png").stat().st_size > 10_000
+    tutorial = [cell for cell in json.loads(TUTORIAL.read_text())["cells"] if cell["cell_type"] == "code"][:5]
+    for found in (cells, tutorial):
+        text = "".join("".join(cell["source"]) for cell in found)
+        assert text.startswith("%pip install") and "ngpt.denoise(" in text and "clean.exr" in text
 
 
 def test_a_sampler_of_ones_own(renderer, tmp_path, monkeypatch):
