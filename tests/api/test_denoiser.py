@@ -53,40 +53,6 @@ def test_a_noisy_image_alone(arrays):
     assert denoised.shape == arrays["noisy"].shape and not np.array_equal(denoised, arrays["noisy"])
 
 
-def test_methods_and_their_options(arrays):
-    gradients = {name: arrays[name] for name in ("noisy", "dx", "dy")}
-    denoised = call(ngpt.Denoiser((26, 18), method="l2", alpha=0.1), gradients)
-    assert np.array_equal(denoised, ngpt.denoise(full_stack(18, 26), "l2", alpha=0.1))
-    with pytest.raises(NgptError, match="unknown method 'l3'"):
-        ngpt.Denoiser((26, 18), method="l3")
-
-
-def test_torch_tensors(arrays):
-    torch = pytest.importorskip("torch")
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    tensors = {name: torch.tensor(array, requires_grad=name == "noisy") for name, array in arrays.items()}
-    result = call(denoiser, tensors)
-    assert isinstance(result, torch.Tensor) and result.dtype == torch.float32
-    assert np.array_equal(result.numpy(), call(denoiser, arrays))
-    half = call(denoiser, {name: tensor.detach().bfloat16() for name, tensor in tensors.items()})
-    assert half.dtype == torch.bfloat16 and np.allclose(half.float(), result, rtol=0.1, atol=0.1)
-
-
-def test_dr_jit_tensors(renderer, arrays):
-    mi = renderer
-    denoiser = ngpt.Denoiser(mi.ScalarVector2u(26, 18), albedo=True, normals=True)
-    result = call(denoiser, {name: mi.TensorXf(array) for name, array in arrays.items()})
-    assert isinstance(result, mi.TensorXf)
-    assert np.array_equal(np.array(result), call(denoiser, arrays))
-
-
-def test_alpha_is_left_alone(arrays):
-    alpha = np.linspace(0, 1, 18 * 26, dtype=np.float32).reshape(18, 26, 1)
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    result = call(denoiser, arrays | {"noisy": np.concatenate([arrays["noisy"], alpha], axis=-1)})
-    assert np.array_equal(result[..., 3:], alpha) and np.array_equal(result[..., :3], call(denoiser, arrays))
-
-
 @pytest.mark.parametrize("size", [3, 4])
 def test_normals_in_world_space(arrays, size):
     matrix = np.eye(4)
@@ -184,14 +150,6 @@ def test_normals_of_mitsuba_become_those_of_a_stack(renderer, monkeypatch):
     seen = denoiser(sensor.film().bitmap(), albedo_ch="albedo", normals_ch="normals", to_sensor=to_sensor)
     error = np.abs(np.array(seen)[..., :3] - render_stack(scene, 16, 0)["normal"]).mean(axis=(0, 1))
     assert (error < 0.05).all()
-
-
-def test_plain_bitmaps(renderer, arrays):
-    image = renderer.Bitmap(arrays["noisy"])
-    result = ngpt.Denoiser((26, 18))(image)
-    assert np.array_equal(np.array(result), ngpt.Denoiser((26, 18))(arrays["noisy"]))
-    with pytest.raises(NgptError, match="the bitmap has no layer 'albedo'; it has: <root>"):
-        ngpt.Denoiser((26, 18), albedo=True)(image, "albedo")
 
 
 def test_alpha_is_denoised_where_that_is_asked_for(arrays, rng):

@@ -63,19 +63,3 @@ def test_bytes_that_reach_new_lines(target, tmp_path):
     assert done.returncode == 0, done.stderr[-2000:]
     runs = int(re.search(r"Done (\d+) runs", done.stderr)[1])
     record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)
-
-
-@pytest.mark.slow
-def test_campaigns_notice_what_they_are_for():
-    """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
-    report = run("probe", 0, 10, patience=20)
-    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}, report.failures
-    for number, what in {
-        1: "the process died (-11)",
-        3: "hangs: no end after 0 s of work",
-        4: "took 6",
-        5: "MemoryError",
-        6: "KeyError",
-        7: "names no file",
-    }.items():
-        assert what in report.failures[number]
