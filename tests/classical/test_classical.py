@@ -54,9 +54,8 @@ def test_the_same_input_gives_the_same_bits():
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.2, 1.0])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_l1_is_within_half_a_percent_of_reweighted_least_squares(alpha, seed):
-    _, *data, _ = noisy_stack(48, 40, seed)
+def test_l1_is_within_half_a_percent_of_reweighted_least_squares(alpha):
+    _, *data, _ = noisy_stack(32, 28)
     lowest = energy(l1_by_irls(*data, alpha), *data, alpha)
     assert energy(l1(*data, alpha), *data, alpha) < 1.005 * lowest
     # The reference is no straw man: many more iterations of ours gain next to nothing on it.
@@ -231,7 +230,7 @@ def peak_bytes(function):
 
 @pytest.mark.parametrize(("name", "bound"), [("l2", 35), ("l1", 175), ("cv", 100), ("wcv", 100), ("wl2", 180)])
 def test_memory_per_pixel_is_as_stated(name, bound):
-    height, width = 1000, 1100
+    height, width = 500, 600
     _, *data, variances = noisy_stack(height, width)
     assert peak_bytes(lambda: METHODS[name](*data, variances)) < bound * height * width
 

@@ -103,9 +103,9 @@ def configured(folder, *options) -> str:
     return " ".join((outcome.stdout + outcome.stderr).split())
 
 
-def test_cmake_tells_where_to_get_what_is_missing(runtime, tmp_path):
+def test_cmake_tells_where_to_get_what_is_missing(toolchain, tmp_path):
     tool("g++", "clang++")
-    (tmp_path / "include").symlink_to(runtime / "include")
+    (tmp_path / "include").symlink_to(toolchain / "include")
     told = configured(tmp_path / "none")
     assert "headers (onnxruntime_cxx_api.h, of 1.21 or newer) are not found. Pass -DORT_ROOT=FOLDER" in told
     assert "libonnxruntime-dev" in told and "docs/embed/c-library.md" in told

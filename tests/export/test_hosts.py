@@ -71,7 +71,7 @@ def wide(tmp_path_factory, python):
 
 
 @pytest.fixture(scope="module", params=[cpp_host, node_host], ids=["cpp", "node"])
-def host(request, tmp_path_factory):
+def host(request, toolchain, tmp_path_factory):
     return caller(request.param(tmp_path_factory.mktemp("host")))
 
 
@@ -320,7 +320,7 @@ class Page(Session):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def page(chromium, tmp_path_factory):
     from export.hosts.web.build import build
 
     runtime, folder = node_modules("onnxruntime-web", "web"), tmp_path_factory.mktemp("page")

@@ -4,7 +4,6 @@ from urllib.parse import quote, urlencode
 
 import numpy as np
 import pytest
-from browser import Session
 
 from ngpt.errors import NgptError
 from ngpt.report import display
@@ -51,20 +50,14 @@ def scene(height=24, width=36, maps=(), reference=True) -> Scene:
 
 
 @pytest.fixture
-def opened(tmp_path):
+def opened(browser, tmp_path):
     """Opens a page of these scenes in a browser."""
-    sessions = []
 
     def open_page(*scenes, **view):
         path = write_report(tmp_path / "page.html", "A title", list(scenes), **FACTS)
-        sessions.append(Session(tmp_path / "profile", f"file://{quote(str(path))}#{urlencode(view)}"))
-        return sessions[-1]
+        return browser(f"file://{quote(str(path))}#{urlencode(view)}")
 
-    yield open_page
-    for session in sessions:
-        complaints = session.complaints
-        session.close()
-        assert complaints == []
+    return open_page
 
 
 def test_all_text_can_be_read_and_so_can_buttons_under_the_mouse(opened):

@@ -7,70 +7,23 @@ import subprocess
 import sys
 import time
 
-import numpy as np
 import pytest
 from processes import (
-    COMMANDS,
     ROOT,
+    SIGNALS,
     complete,
-    ended,
     half_written,
     make_work,
     one_error,
+    shell,
     start,
-    temporary_files,
     timeless,
 )
-from reliability import record
 
 import ngpt
 from ngpt.system.console import run_command
 
-SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM}
-EARLY = "while Python starts and imports its own modules: as Python does"
-DONE = "done before"
 NGPT = (sys.executable, "-m", "ngpt")
-
-
-def interrupt_campaign(kind, folder, interrupts, name):
-    """Ctrl-C or SIGTERM at moments spread over a whole run."""
-    number = SIGNALS[name]
-    interrupted = f"interrupted, status {128 + number}, one line"
-    job, rng, clock = make_work(kind, folder), np.random.default_rng(2), time.monotonic()
-    out = folder / "out"
-    assert complete(job.arguments(out)).returncode == 0
-    duration, outcomes = time.monotonic() - clock, {interrupted: 0, EARLY: 0, DONE: 0}
-    for i in range(interrupts):
-        out = folder / f"out{i}"
-        arguments = job.arguments(out)
-        with start(arguments) as process:
-            status = ended(process, rng.uniform(0, duration), number)
-            errors = process.stderr.read()
-        assert half_written(out) == [] and temporary_files(out) == []
-        if status == 128 + number:
-            # train.py says on standard output that it stops, and keeps what it has learnt.
-            assert one_error(errors) or (kind == "train" and ": error: " not in errors), errors
-            outcomes[interrupted] += 1
-        else:
-            early = status == -number or "Fatal Python error: init" in errors
-            assert (early or status == 0) and "in run_command" not in errors, (status, errors)
-            assert ": error: " not in errors, (status, errors)
-            outcomes[EARLY if status else DONE] += 1
-    assert outcomes[interrupted]
-    record(f"{name} at random moments of {job.name}", interrupts, outcomes, seconds=round(time.monotonic() - clock))
-
-
-@pytest.mark.parametrize(("kind", "name"), [("denoise", "Ctrl-C"), ("denoise", "SIGTERM"), ("export", "Ctrl-C")])
-def test_a_few_interrupts(tmp_path, kind, name):
-    interrupt_campaign(kind, tmp_path, 4, name)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("name", SIGNALS)
-@pytest.mark.parametrize("kind", COMMANDS)
-def test_many_interrupts(tmp_path, kind, name):
-    interrupt_campaign(kind, tmp_path, 20, name)
 
 
 def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
@@ -124,11 +77,6 @@ def test_handlers_of_others_stay(capfd):
         signal.signal(signal.SIGTERM, before)
 
 
-def shell(line, *arguments):
-    """Runs a line of shell in which "$@" is a command."""
-    return complete(["bash", "-c", f"set -o pipefail; {line}", "bash", *arguments])
-
-
 @pytest.fixture(scope="module")
 def stack(tmp_path_factory):
     """A small stack's file."""
@@ -143,44 +91,6 @@ def stack(tmp_path_factory):
 def test_a_reader_that_has_enough(arguments, stack):
     run = shell('"$@" | head -c 1', *NGPT, *(a.format(stack=stack) for a in arguments))
     assert run.stderr == "" and run.returncode in (0, 1, 141)
-
-
-def closed_streams(job, folder):
-    """Each way in which nobody takes what a command prints; yields (what it is, the run, where it wrote)."""
-    lines = {
-        "standard output read for one line": '"$@" | head -1',
-        "both read for one line": '"$@" 2>&1 | head -1',
-        "standard output closed": '"$@" >&-',
-        "errors closed": '"$@" 2>&-',
-        "all closed": '"$@" <&- >&- 2>&-',
-        "standard output on a full disk": '"$@" > /dev/full',
-        "both on a full disk": '"$@" > /dev/full 2>&1',
-    }
-    for i, (what, line) in enumerate(lines.items()):
-        out = folder / f"out{i}"
-        yield what, shell(line, *job.arguments(out)), out
-
-
-def stream_campaign(kinds, folder):
-    outcomes = {"work done": 0, "quiet or one line, nothing half-written": 0}
-    for kind in kinds:
-        (folder / kind).mkdir()
-        for what, run, out in closed_streams(make_work(kind, folder / kind), folder / kind):
-            assert "Traceback" not in run.stdout + run.stderr and "Exception ignored" not in run.stderr, (kind, what)
-            assert run.returncode in (0, 1, 2, 141), (kind, what, run.stderr)
-            assert half_written(out) == [] and temporary_files(out) == [], (kind, what)
-            outcomes["work done" if run.returncode == 0 else "quiet or one line, nothing half-written"] += 1
-    record("Output that nobody takes, seven ways for each command", sum(outcomes.values()), outcomes)
-
-
-def test_output_that_nobody_takes(tmp_path):
-    stream_campaign(["merge"], tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_output_of_all_commands_that_nobody_takes(tmp_path):
-    stream_campaign(COMMANDS, tmp_path)
 
 
 def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
