@@ -118,25 +118,6 @@ def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
         main([*words, "--skip-existing", "--force"])
 
 
-@pytest.mark.parametrize("exists", [False, True])
-def test_several_stacks_are_not_written_into_one_file(frames, tmp_path, capsys, exists):
-    out = tmp_path / "one.exr"
-    if exists:
-        out.write_text("precious")
-    assert main(["denoise", str(frames / "0.exr"), str(frames / "1.exr"), "-o", str(out), "--force"]) == 2
-    assert "file; the results of 2 stacks need a folder" in capsys.readouterr().err
-    assert out.exists() == exists and not out.is_dir()
-    # A folder of such a name is one if it is there, or if the name says so.
-    assert main(["denoise", str(frames), "-o", f"{tmp_path / 'two.exr'}/", "-m", "primal", "-q"]) == 0
-    assert main(["denoise", str(frames), "-o", str(tmp_path / "two.exr"), "-m", "primal", "-q", "--force"]) == 0
-
-
-def test_a_name_that_cannot_be_written_is_an_error_before_any_work(frames, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("ngpt.cli.denoise.reconstruct", lambda *_, **__: pytest.fail("worked"))
-    assert main(["denoise", str(frames / "0.exr"), "-o", str(tmp_path / "o.tiff")]) == 2
-    assert "let the name end in .exr" in capsys.readouterr().err
-
-
 def on_terminal(*words):
     """What a command writes to a terminal that is its standard error, and its status."""
     ours, its = os.openpty()

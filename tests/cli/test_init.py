@@ -95,9 +95,3 @@ def test_what_no_docstring_explains_is_offered_too():
     default = {"told": 1, "untold": [2.5, "x"]}
     assert offered == default | {"a": {"x": [[1]]} | default, "b": [{"z": 1}]}
     assert text.count("# is told\n# told = 1\n# untold = ") == 2
-
-
-def test_what_builds_on_another_configuration_is_no_start(tmp_path, capsys):
-    path = tmp_path / "mine.toml"
-    assert main(["evaluate", "--config", "eval-640", "--init", str(path)]) == 2 and not path.exists()
-    assert "eval-640 is eval-main.toml with other numbers: give --init that one" in capsys.readouterr().err

@@ -169,40 +169,6 @@ def test_info_on_a_training_run(tmp_path, capsys):
     assert "relMSE 0.1" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(
-    ("name", "data", "message"),
-    [
-        ("x.onnx", b"", "cannot load it"),
-        ("x.onnx", b"no network at all", "cannot load it"),
-        ("x.onnx", FAST.read_bytes()[:5000], "cannot load it"),
-        ("x.onnx", (WEIGHTS / "ngpt-fast.statistics.onnx").read_bytes(), "lacks the metadata 'ngpt.inputs'"),
-        ("x.safetensors", b"", "not a readable safetensors file"),
-        ("x.safetensors", struct.pack("<Q", 2) + b"{}", "holds no configuration of ngpt"),
-        ("run/checkpoint.safetensors", b"\0\0", "is no checkpoint of ngpt, or damaged"),
-        ("run/checkpoint.safetensors", struct.pack("<Q", 2**60) + b"{}", "is no checkpoint of ngpt, or damaged"),
-        ("run/log.jsonl", b"[]\n{}\n", "line 1 is []; it must be a table"),
-        ("run/log.jsonl", b'{"step": 1, "loss": "low"}\n', "line 1: 'loss' is 'low'"),
-        ("run/log.jsonl", b"garbage\n{}\n", "line 1: cannot be read"),
-        ("run/log.jsonl", b"\xff\xfe\n", "cannot be read"),
-    ],
-)
-def test_bad_files_are_one_line(name, data, message, tmp_path, capfd):
-    if name.endswith("x.safetensors"):
-        pytest.importorskip("torch")
-    path = tmp_path / name
-    path.parent.mkdir(exist_ok=True)
-    path.write_bytes(data)
-    assert main(["info", str(path if name.startswith("x") else path.parent)]) == 1
-    out, err = capfd.readouterr()
-    assert out == "" and err.startswith("ngpt: error: ") and err.count("\n") == 1 and message in err
-
-
-@pytest.mark.parametrize("name", ["nowhere.onnx", "nowhere.safetensors"])
-def test_a_network_that_is_not_there(name, capfd):
-    assert main(["info", name]) == 1
-    assert capfd.readouterr().err == f"ngpt: error: {name}: not found; check the name\n"
-
-
 def test_results_that_are_there_count_where_they_are_what_is_asked_for(stack, tmp_path, capsys):
     source, target = tmp_path / "s.exr", tmp_path / "out.exr"
     words = ["denoise", str(source), "-o", str(target), "--skip-existing"]

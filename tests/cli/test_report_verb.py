@@ -82,31 +82,6 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
     assert facts(tmp_path / "page.html")["pictures"] == ["spp16/reference", "spp64/reference", "reference"]
 
 
-def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image)
-    write(tmp_path / "small.exr", image[:20])
-    write(tmp_path / "nothing.exr", image * np.float32(np.nan))
-    a, small, nothing = (str(tmp_path / name) for name in ("a.exr", "small.exr", "nothing.exr"))
-    page = tmp_path / "page.html"
-
-    def refused(*words, status=1):
-        assert main(["report", "-q", *words, "-o", str(page)]) == status
-        _, message = capfd.readouterr()
-        assert message.count("\n") == 1 and not page.exists()
-        return message
-
-    assert f"{small} is 32x20 but {a} is 32x24; render or crop them to one size" in refused(a, small)
-    assert f"{small} is 32x20 but {a} is 32x24" in refused(a, "--ref", small)
-    assert f"{a}: is given twice" in refused(a, a, status=2)
-    assert f"{nothing} and {a}: none of 768 pixels is finite in both images" in refused(nothing, "--ref", a)
-    assert "nowhere.exr" in refused("nowhere.exr")
-    page.touch()
-    assert main(["report", a, "-o", str(page)]) == 1
-    assert "exists already" in capfd.readouterr().err and page.read_text() == ""
-    assert main(["report", a, "-o", str(page.with_suffix(""))]) == 2
-    assert "let it end in .html" in capfd.readouterr().err and not page.with_suffix("").exists()
-
-
 def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
     monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda module: None)
     write(tmp_path / "a.exr", image * 4)
@@ -174,15 +149,3 @@ def test_frames_play_in_the_order_of_numbers_and_results_beside_them_are_compare
         assert list(dict.fromkeys(re.findall(r"f\.\d+", text))) == ["f.1", "f.2", "f.10"]
         played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
         assert [len(scene["pictures"]) for scene in played["scenes"]] == [count] * 3
-
-
-def test_flicker_without_motion_is_explained(tmp_path, capsys):
-    for folder in ("a", "truth"):
-        (tmp_path / folder).mkdir()
-        for i in range(2):
-            write(tmp_path / folder / f"{i}.exr", np.full((12, 16, 3), 1 + i, np.float32))
-    words = ["report", str(tmp_path / "a"), "--ref", str(tmp_path / "truth"), "-o", str(tmp_path / "page.html")]
-    assert main(words) == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[-1].split()[-1] == "nan"
-    assert told.err.count("flicker is nan: no frame after the first has motion vectors (layer 'motion')") == 1

@@ -133,14 +133,6 @@ def test_a_package_that_is_not_installed_is_named_with_its_extra(lacking, argume
     assert (run.returncode, run.stderr) == (1, told)
 
 
-@pytest.mark.parametrize("verb", ["dataset", "train", "evaluate"])
-def test_a_configuration_that_is_not_there_is_told_what_there_is(verb, tmp_path, capfd):
-    assert main([verb, "--config", "nowhere", "--out", str(tmp_path / "out")]) == 1
-    errors = capfd.readouterr().err
-    assert errors.startswith("ngpt: error: nowhere: cannot be read: no such file; configurations that come with ngpt: ")
-    assert "tiny" in errors and errors.count("\n") == 1 and not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("status", "arguments"),
     [(2, ["render", "diffuse"]), (1, ["info", "diffuse"]), (1, ["evaluate", "--config", "eval-tiny"])],

@@ -234,26 +234,6 @@ def test_each_producer_is_understood(producer):
         assert set(where.channels) <= set(parts[where.part][1]), name
 
 
-def test_one_channel_with_two_names_is_not_ambiguous():
-    found = resolve([("beauty", list("RGB")), ("View.Z", ["Z"])])
-    assert found["depth"][:2] == (1, ("Z",))
-
-
-def test_parts_are_told_apart():
-    found = resolve(PRODUCERS["Arnold, multi-part"][0])
-    assert {name: where.part for name, where in found.items()} == {
-        "primal": 0, "normal": 1, "depth": 2, "albedo": 3, "alpha": 0,
-    }  # fmt: skip
-
-
-def test_normals_may_be_spelled_as_colours():
-    assert resolve([("", names("RGB", "normal.RGB"))])["normal"].channels == ("normal.R", "normal.G", "normal.B")
-
-
-def test_channel_order_is_canonical_whatever_the_order_in_the_file():
-    assert resolve([("", ["B", "G", "R", "dx.G", "dx.B", "dx.R"])])["dx"].channels == ("dx.R", "dx.G", "dx.B")
-
-
 TWO_VIEWS = [("", names("Near.Combined.RGBA", "Far.Combined.RGBA", "Near.Denoising Albedo.RGB", "Far.Depth.Z"))]
 
 
@@ -293,18 +273,6 @@ def test_an_ambiguous_feature_is_settled_by_its_own_override_only():
     with pytest.raises(NgptError, match="layer 'albedo' could be any of"):
         resolve(parts, {"albedo": "Denoising Albedo"})
     assert resolve(parts, {"albedo": "b.Denoising Albedo"})["albedo"].channels[1] == "b.Denoising Albedo.G"
-
-
-def test_a_whole_name_beats_a_tail():
-    found = resolve([("", names("RGB", "dx.RGB", "shadow.dx.RGB"))])
-    assert found["dx"].channels[0] == "dx.R"
-
-
-def test_of_two_eyes_the_one_that_holds_primal_counts():
-    found = resolve([("left", [*"RGBAZ", *names("albedo.RGB")]), ("right", [*"RGBAZ", *names("albedo.RGB")])])
-    assert {name: where.part for name, where in found.items()} == {"primal": 0, "albedo": 0, "depth": 0, "alpha": 0}
-    found = resolve([("left", [*"RGBAZ"]), ("right", [*"RGBAZ"])], {"primal": "right"})
-    assert {name: where.part for name, where in found.items()} == {"primal": 1, "depth": 1, "alpha": 1}
 
 
 def test_overrides_beat_aliases_and_match_tails():
@@ -353,12 +321,6 @@ def test_files_that_make_no_stack(channels, expected):
     assert str(caught.value).startswith("a.exr: ") and expected in str(caught.value)
 
 
-def test_the_root_of_a_part_called_albedo_is_no_primal():
-    with pytest.raises(NgptError, match="no primal image"):
-        resolve([("albedo", list("RGB")), ("N", list("XYZ"))])
-    assert resolve([("albedo", list("RGB")), ("Combined", list("RGB"))])["primal"].part == 1
-
-
 @pytest.mark.parametrize("name", ["beauty", "rgba", "fog", "ViewLayer.Bild", "Normal lights.beauty"])
 def test_the_only_layer_of_colour_is_the_colour(name):
     more = names("albedo.RGB", "N.XYZ", "CryptoObject00.rgba", "worldPosition.RGB", "albedo_var.RGB", "diffuse.RGB")
@@ -367,11 +329,6 @@ def test_the_only_layer_of_colour_is_the_colour(name):
     assert found["albedo"].name == "albedo"
     parts = [("albedo", list("RGB")), (name, list("RGBA"))]
     assert resolve(parts)["primal"].part == 1
-
-
-def test_small_letters_are_alpha_too():
-    found = resolve([("", names("C.rgba", "albedo.RGB"))])
-    assert found["primal"].channels == ("C.r", "C.g", "C.b") and found["alpha"].channels == ("C.a",)
 
 
 def test_motion_of_cycles_is_turned_to_ours():

@@ -77,23 +77,6 @@ def test_a_dry_run_says_what_it_would_cost(train):
     assert "4,358,534" in output and "765.3 G at 1280x720" in output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "expected", "complaint"),
-    [
-        (["--config", "nowhere.toml", "--dry-run"], 1, "nowhere.toml: cannot be read"),
-        (["--config", "configs/fast.toml"], 2, "--out is missing"),
-        ([], 2, "--config is missing: a TOML file, or one of: ablations, "),
-        (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], 1, "no such folder"),
-        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], 1, "choose one of"),
-        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base"], 2, "give it as table.key=value"),
-    ],
-)
-def test_mistakes_end_in_one_line(train, tmp_path, arguments, expected, complaint):
-    status, _, errors = train(*[str(tmp_path) if a == "OUT" else a for a in arguments])
-    assert status == expected
-    assert complaint in errors and errors.count("\n") == 1
-
-
 def test_views_of_ones_own_train_a_network(train, tmp_path):
     from crops import SyntheticCrop
 
