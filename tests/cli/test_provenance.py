@@ -11,7 +11,6 @@ from full_stack import full_stack
 import ngpt
 from ngpt.cli import main
 from ngpt.io.exr import MADE_BY
-from ngpt.methods import METHODS
 from ngpt.network.run import WEIGHTS
 
 FAST = WEIGHTS / "ngpt-fast.onnx"
@@ -44,13 +43,6 @@ def test_a_result_says_what_made_it(stack, tmp_path):
     assert told["ngpt:method"] == "l1" and told["ngpt:options"] == "alpha=0.3" and "ngpt:weights" not in told
     assert told["ngpt:reconstructSeconds"] == pytest.approx(result.seconds) and told["ngpt:version"]
     assert told["ngpt:sampler"] == "gpt"
-
-
-def test_defaults_are_no_options(stack):
-    default = METHODS["ngpt-fast"].options["memory"].default
-    result = ngpt.reconstruct(stack, "ngpt-fast", memory=default)
-    assert result.options == {} and "ngpt:options" not in result.attributes
-    assert ngpt.reconstruct(stack, "ngpt-fast", memory=default - 1).options == {"memory": default - 1}
 
 
 def test_the_result_of_a_result_says_what_made_it_and_no_more(stack, tmp_path):
@@ -117,27 +109,11 @@ def test_info_on_our_network(capsys):
     assert report["bytes"] == (WEIGHTS / "ngpt-combine.onnx").stat().st_size
 
 
-def test_info_on_the_network_that_blends_frames(capsys):
-    assert main(["info", str(WEIGHTS / "temporal.onnx"), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert "ngpt's own, method temporal" in report["whose"] and report["needs packages"] == ["ONNX Runtime"]
-    assert "trust" in report["inputs"] and report["training"]["shots"] > 0
-
-
 def test_info_on_a_network_of_ones_own(own, capsys):
     path = own.rename(own.with_name("x.onnx"))
     assert main(["info", str(path)]) == 0
     output = capsys.readouterr().out
     assert "whose: none of those that come with ngpt" in output and "it says: method 'ngpt-fast'" in output
-
-
-def test_info_on_weights_of_pytorch(capsys):
-    pytest.importorskip("torch")
-    path = WEIGHTS.parents[1] / "export" / "weights" / "ngpt-primal.safetensors"
-    assert main(["info", str(path), "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["needs packages"] == ["PyTorch", "OIDN"] and report["base"] == "none"
-    assert "primal_var" in report["needs layers"] and report["training"]["loss.kind"] == "structural"
 
 
 def write_run(folder, log, header=None):

@@ -1,7 +1,7 @@
 """What the commands refuse: one line says why, the exit status says whose fault it is, and no file changes.
 
-A row is a command line in the folder ``shelf``, its exit status (1: a file is at fault, 2: the call is) and words of its
-message.
+A row is a command line in the folder ``shelf``, its exit status (1: a file is at fault, 2: the call is) and words that
+its message has.
 """
 
 import io

@@ -11,7 +11,6 @@ from ngpt.io.exr import read, with_channels, write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
-from ngpt.system.install import install_command
 
 
 @pytest.fixture
@@ -47,18 +46,6 @@ def test_images_of_two_renderers_on_one_page(tmp_path, image, capfd):
     assert messages.endswith(f"{page}: open it in a browser\n") and "errors: 2/2 images" in messages
 
 
-def test_without_a_reference_there_is_nothing_to_measure(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image)
-    write(tmp_path / "b.exr", image)
-    words = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
-    assert main(["report", "-q", *words, "-o", str(tmp_path / "page.html")]) == 0
-    shown = facts(tmp_path / "page.html")
-    assert shown["pictures"] == ["a", "b"] and not shown["reference"] and shown["maps"] == []
-    text = (tmp_path / "page.html").read_text()
-    assert "no reference: with --ref" in text and "<h3>Measurements</h3>" not in text
-    assert capfd.readouterr() == ("", "")
-
-
 def test_of_one_file_all_layers_are_shown(tmp_path, image, rng):
     stack = GradientStack.from_arrays(primal=image, dx=image, albedo=image / 9, motion=image[..., :2])
     stack = with_channels(stack, {"diagnostics.discarded": image[..., 0]})
@@ -80,28 +67,6 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
     words = [str(tmp_path / folder / "reference.exr") for folder in ("spp16", "spp64")]
     assert main(["report", *words, "--ref", words[1], "-o", str(tmp_path / "page.html")]) == 0
     assert facts(tmp_path / "page.html")["pictures"] == ["spp16/reference", "spp64/reference", "reference"]
-
-
-def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
-    monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda module: None)
-    write(tmp_path / "a.exr", image * 4)
-    write(tmp_path / "truth.exr", image)
-    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
-    assert main(["report", *words, "--verbose"]) == 0
-    output, messages = capfd.readouterr()
-    assert "without SSIM and FLIP" in messages
-    assert f"FLIP needs flip-evaluator: {install_command('peers')}" in messages and "FLIP" not in output
-    assert "a.exr: 2.0 stops brighter than" in messages
-    assert facts(tmp_path / "page.html")["maps"] == []
-
-
-def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image[:5, :7])
-    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]
-    assert main(["report", *words]) == 0
-    assert "without SSIM: --verbose says why" in capfd.readouterr().err
-    assert main(["report", *words, "-v", "--force"]) == 0
-    assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err
 
 
 def test_folders_of_frames_are_shots(tmp_path, rng, capsys):

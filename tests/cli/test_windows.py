@@ -94,13 +94,6 @@ def test_errors_of_results_are_those_of_the_place(stack, tmp_path, capfd):
         assert report["compared"] == str(window) and f"of the pixels that both have: {window}" in err
 
 
-def test_a_report_shows_what_all_have(stack, tmp_path, capfd):
-    paths = [written(tmp_path / f"{x}.exr", stack, x, 0, 30, 30) for x in (0, 10, 14)]
-    assert main(["report", *paths, "-o", str(tmp_path / "page.html"), "--ref", written(tmp_path / "r.exr", stack)]) == 0
-    assert "compared are the pixels that all images have: 16x30 at (14, 0)" in capfd.readouterr().err
-    assert "16x30" in (tmp_path / "page.html").read_text()
-
-
 def test_a_report_of_a_shot_shows_display_windows(stack, tmp_path, capfd):
     """The subject rests and is cut in another way in each frame: nothing changes, and nothing is wrong."""
     shot, refs = tmp_path / "shot", tmp_path / "refs"
@@ -114,18 +107,6 @@ def test_a_report_of_a_shot_shows_display_windows(stack, tmp_path, capfd):
     out, err = capfd.readouterr()
     assert "3 of 3 frames: compared are the pixels that all images have" in err
     assert re.search(r"shot +0 +0 ", out) and out.split()[-1] == "0" and f"{WIDTH}x{HEIGHT}" in page.read_text()
-
-
-def test_pictures_leave_overscan_out(stack, tmp_path):
-    inner = Window(8, 6, 30, 20)
-    over = written(tmp_path / "over.exr", stack, display=inner)
-    crop = written(tmp_path / "crop.exr", stack, 8, 6, 30, 20)
-    for name in ("over", "crop"):
-        assert main(["picture", str(tmp_path / f"{name}.exr"), "-o", str(tmp_path / f"{name}.png")]) == 0
-    assert main(["denoise", over, "-m", "primal", "-o", str(tmp_path / "denoised.png")]) == 0
-    seen = [pixels(tmp_path / f"{name}.png") for name in ("over", "crop", "denoised")]
-    assert all(np.array_equal(image, seen[0]) for image in seen) and seen[0].shape == (20, 30, 3)
-    assert main(["denoise", crop, "-m", "primal", "-o", str(tmp_path / "crop2.png")]) == 0
 
 
 @pytest.mark.parametrize("target", ["film.webp", "frames"])

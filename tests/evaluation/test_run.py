@@ -159,17 +159,6 @@ def test_bad_scenes_are_named_and_the_others_go_on(tmp_path, rng, spoil, message
     assert message in (tmp_path / "out" / "results.md").read_text()
 
 
-def test_a_stack_without_features_is_an_absent_cell(room):
-    folder, _ = room
-    config = read(CONFIG.format(folder=folder / "room").replace("nfor", "nlm"), folder)
-    for path in (folder / "room").glob("features-*.exr"):
-        path.unlink()
-        shutil.copy(path.with_name(path.name.replace("features", "path")), path)
-    results = evaluate(config, folder / "out", QUIET, "", service)
-    rows = {cell["method"]: cell["absent"] for cell in results["cells"]}
-    assert "method 'nlm' needs layers 'albedo'" in rows["nlm"] and rows["l2"] is None
-
-
 @pytest.mark.parametrize(
     ("entry", "message"),
     [
@@ -197,15 +186,6 @@ def test_errors_of_the_configuration(tmp_path, entry, message):
     with pytest.raises(NgptError) as error:
         read(text, tmp_path)
     assert message in str(error.value) and "config.toml" in str(error.value)
-
-
-def test_the_configurations_that_ship_are_legal():
-    paths = sorted(Path(__file__).parents[2].glob("configs/eval-*.toml"))
-    assert len(paths) >= 7
-    for path in paths:
-        config = read_config(path)
-        named = [column.name for column in config.columns()]
-        assert not set(config.variants) - set(named), path
 
 
 def test_the_command(room, capsys):

@@ -8,7 +8,6 @@ import sys
 
 import pytest
 from capi import HEADER, PRIMAL, SOURCE, Network, command, example, result, those, tool
-from processes import left_in_home
 
 import ngpt
 
@@ -70,14 +69,6 @@ def test_the_program_of_the_docs(renderer_project, program):
     assert outcome.stderr.endswith("\n  0 %\n100 %\n") and outcome.stderr.count("%") == 2
     outcome = subprocess.run([renderer_project / program, "none.onnx"], capture_output=True, text=True, timeout=100)
     assert outcome.returncode == 1 and outcome.stderr == "none.onnx: cannot be read, or is empty\n"
-
-
-def test_nothing_is_left_in_a_home(renderer_project, tmp_path):
-    """ONNX Runtime's telemetry is off before it begins."""
-    call = renderer_project / "in-c", PRIMAL.with_name("ngpt-fast.onnx")
-    assert left_in_home(tmp_path, *call) == []
-    if not left_in_home(tmp_path / "on", *call, ORT_DISABLE_TELEMETRY="0"):
-        pytest.skip("this build of ONNX Runtime sends no telemetry")
 
 
 def test_pkg_config_tells_where_it_is(prefix, tmp_path):

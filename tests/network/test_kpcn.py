@@ -7,13 +7,10 @@ from full_stack import full_stack
 from torch.nn.functional import avg_pool2d
 
 from ngpt.errors import NgptError
-from ngpt.network import inputs
 from ngpt.network.kpcn import EPSILON, SplitKernels
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.run_torch import reconstruct
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.weights import load_weights, save_weights
-from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.training.settings import from_dict, read_settings
 
@@ -88,31 +85,6 @@ def test_a_network_reads_its_own_part_alone(part, other):
     assert torch.equal(own[0], own[1]) and halves[0].shape[1] == halves[1].shape[1] == 25
 
 
-@pytest.mark.parametrize("kernel", [3, 21])
-def test_tiles_do_not_show(kernel):
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small(kernel=kernel)).eval())
-    assert model.radius == max(4, kernel // 2) and model.alignment == 1
-    layers = random_layers(40, 70)
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, layers, tile=32), model(layers), rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 16)])
-def test_any_size_and_any_exposure(size):
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small(kernel=21)))
-    layers = random_layers(*size)
-    light = ("primal", "diffuse", "specular", "diffuse_se", "specular_se")
-    with torch.no_grad():
-        image = model(layers)
-        assert image.shape == (1, 3, *size) and torch.isfinite(image).all()
-        brighter = model(layers | {name: 1024 * layers[name] for name in light})
-        assert torch.allclose(brighter, 1024 * image, rtol=1e-3)
-        layers["diffuse"][..., 0, 0] = layers["primal"][..., 0, 0] = 1e12
-        assert torch.isfinite(model(layers)).all()
-
-
 def test_it_learns(tmp_path):
     """Noise on a diffuse wall with paint and a highlight: far below the input, and below equal kernels."""
     torch.manual_seed(0)
@@ -175,15 +147,6 @@ def test_a_stack_is_reconstructed_by_its_weights(tmp_path):
     assert np.isfinite(repaired).all() and np.abs(repaired - image).max() < 1
     with pytest.raises(NgptError, match="need layers diffuse, specular, diffuse_var, specular_var, which"):
         ngpt.denoise(full_stack(20, 26), "ngpt", weights=str(tmp_path / "w.safetensors"))
-
-
-def test_what_it_reads_of_a_stack():
-    stack = split_stack()
-    config = small()
-    given = inputs.gather(repair(stack), config.layers, "")
-    assert config.needs == ("primal", "albedo", "normal", "diffuse", "specular", "diffuse_var", "specular_var")
-    assert np.array_equal(given["diffuse"], stack["diffuse"])
-    assert np.allclose(given["specular_se"], np.sqrt(stack["specular_var"]))
 
 
 @pytest.mark.parametrize(

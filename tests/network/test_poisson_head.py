@@ -11,7 +11,6 @@ from ngpt.errors import NgptError
 from ngpt.network import poisson
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.poisson import solved
-from ngpt.network.run_torch import reconstruct
 
 H, W = 16, 24
 INPUTS = ("primal", "albedo", "base", "dx_base", "dy_base", "primal_noise", "dx_noise", "dy_noise")
@@ -120,20 +119,6 @@ def test_coarser_differences_are_those_of_the_coarser_image(axis):
 def config(**changes):
     values = {"network": "plain", "channels": (4, 4, 4, 4), "units": (), "inputs": INPUTS, "base": "wcv", "sweeps": 2}
     return ModelConfig(**values | changes)
-
-
-@pytest.mark.parametrize("start", [("base",), ("primal", "base"), ("primal",)])
-def test_tiles_do_not_show_and_exposure_goes_through(start):
-    torch.manual_seed(0)
-    pyramid = {"kernel": 3, "scales": 2, "demodulate": True} if start == ("primal",) else {}
-    model = Reconstructor(config(start=start, **pyramid)).eval()
-    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.3)
-    layers = {name: torch.rand(1, 3, 80, 150) for name in model.config.layers}
-    with torch.no_grad():
-        whole = model(layers)
-        assert torch.allclose(reconstruct(model, layers, tile=64), whole, rtol=1e-4, atol=1e-5)
-        bright = {n: layer * (1 if n == "albedo" else 1024) for n, layer in layers.items()}
-        assert torch.allclose(model(bright), 1024 * whole, rtol=1e-3)
 
 
 def test_training_reaches_what_is_said_of_the_gradients():

@@ -8,7 +8,6 @@ torch = pytest.importorskip("torch")
 from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import features, padding  # noqa: E402
 from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
-from ngpt.network.run_torch import reconstruct  # noqa: E402
 from ngpt.network.transfer import signed_log  # noqa: E402
 from ngpt.network.unet import POOLING, Convolution, DenseUNet, PlainUNet, Resampling  # noqa: E402
 from ngpt.training.cost import per_pixel  # noqa: E402
@@ -43,11 +42,6 @@ def test_the_papers_network_has_the_papers_parameters():
     assert parameters(net.head) == 1_254
     assert len([m for m in model.modules() if isinstance(m, Convolution)]) == 51
     assert round(per_pixel(model)[0] / 1000) == 830
-
-
-def test_without_gradients_it_has_fewer():
-    model = Reconstructor(ModelConfig(**PAPER, inputs=("primal", "albedo", "normal", "depth")))
-    assert parameters(model) == 4_350_836
 
 
 @pytest.mark.parametrize("kind", ["1x1", "3x3", "pool", "unpool"])
@@ -114,43 +108,6 @@ def test_models_of_any_pooling_know_their_cost(pooling):
     assert macs > 0
 
 
-def test_a_pooling_that_is_none():
-    with pytest.raises(NgptError, match="pooling 'lanczos': choose one of: convolution, average, maximum, bilinear"):
-        ModelConfig(**PAPER, inputs=NGPT, pooling="lanczos")
-
-
-@pytest.mark.parametrize("network", ["dense", "plain"])
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 16), (37, 53)])
-def test_any_size_goes_in(network, size):
-    model = tiny(network)
-    with torch.no_grad():
-        assert model(layers(*size)).shape == (1, 3, *size)
-
-
-def test_tiles_do_not_show():
-    model = tiny(base="wcv")
-    data = layers(90, 130, model.config.inputs)
-    with torch.no_grad():
-        whole = model(data)
-    assert model.network.radius < 40
-    tiled = reconstruct(model, data, tile=96)
-    assert torch.allclose(tiled, whole, rtol=1e-5, atol=1e-6)
-    # The test would see tiles that overlap too little.
-    model.network.radius = 0
-    assert not torch.allclose(reconstruct(model, data, tile=96), whole, rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("base", ["", "wcv"])
-@pytest.mark.parametrize("stops", [-10, -1, 10, 40])
-def test_exposure_changes_nothing(base, stops):
-    model = tiny(base=base)
-    data = layers(24, 40, model.config.inputs)
-    k = 2.0**stops
-    scaled = {name: layer * k if name in features.RADIANCE else layer for name, layer in data.items()}
-    with torch.no_grad():
-        assert torch.allclose(model(scaled), k * model(data), rtol=1e-4)
-
-
 def test_a_firefly_stays_local():
     model = tiny()
     data = layers(64, 256)
@@ -166,17 +123,6 @@ def test_a_firefly_stays_local():
     assert torch.isfinite(after).all()
 
 
-@pytest.mark.parametrize("value", [0.0, 65504.0, 1e12])
-def test_extreme_radiance_is_bounded_by_itself(value):
-    model = tiny()
-    data = layers(16, 24)
-    data["primal"] = torch.full_like(data["primal"], value)
-    data["dx"], data["dy"] = torch.randn_like(data["dx"]) * value, torch.randn_like(data["dy"]) * value
-    with torch.no_grad():
-        image = model(data)
-    assert torch.isfinite(image).all() and image.min() >= 0 and image.max() <= value * 1.0001
-
-
 @pytest.mark.parametrize(("precision", "bound"), [("bfloat16", 0.1), ("float16", 0.02)])
 def test_sixteen_bits_are_close(precision, bound):
     model = tiny()
@@ -188,14 +134,6 @@ def test_sixteen_bits_are_close(precision, bound):
     assert rounded.dtype == torch.float32
     error = ((rounded - exact).abs() / exact.abs().clamp(min=0.1)).max()
     assert 0 < error < bound
-
-
-def test_an_untrained_correction_is_its_base():
-    config = ModelConfig("dense", (4, 6), (1, 1), (*NGPT, "base"), "wcv")
-    data = layers(20, 20, config.inputs)
-    data["base"] = data["base"] * data["primal"].amax()
-    with torch.no_grad():
-        assert torch.allclose(Reconstructor(config)(data), data["base"], rtol=1e-4, atol=1e-5)
 
 
 def combiner():
@@ -222,15 +160,6 @@ def test_weights_of_a_combiner_choose():
         head.bias.data[3 + i] = 50
         with torch.no_grad():
             assert torch.allclose(model(data), data[name], rtol=1e-4, atol=1e-5)
-
-
-def test_tiles_of_a_combiner_do_not_show():
-    torch.manual_seed(0)
-    model = Reconstructor(combiner()).eval()
-    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.1)
-    data = layers(50, 90, model.config.layers)
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, data, tile=48), model(data), rtol=1e-5, atol=1e-6)
 
 
 def converging(quiet=0.1):
@@ -287,21 +216,6 @@ def test_unknown_noise_leaves_the_network_alone():
     assert torch.allclose(result[unknown], free[unknown], rtol=1e-5, atol=1e-6)
     base = data["base"].clamp(max=data["primal"].amax())
     assert torch.allclose(result[..., 30 - WINDOW // 2 :], base[..., 30 - WINDOW // 2 :], rtol=1e-4, atol=1e-5)
-
-
-def test_any_light_and_any_noise_has_a_share():
-    data = layers(20, 20, converging().layers)
-    data["primal_se"][0, :, 5, 5], data["base"][0, :, 5, 6] = 1e38, 1e38
-    data["base"][0, :, 15, 15] = -1e38
-    share = anything(converging()).share(data)
-    assert share.shape == (1, 1, 20, 20) and share.min() >= 0 and share.max() <= 1
-
-
-def test_tiles_of_a_converging_network_do_not_show():
-    model, data = anything(converging()), layers(50, 90, converging().layers)
-    data["primal_se"] *= torch.linspace(0, 0.1, 90)
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, data, tile=48), model(data), rtol=1e-5, atol=1e-6)
 
 
 def test_what_is_computed_agrees_with_padding():

@@ -1,11 +1,9 @@
 """Ctrl-C, SIGTERM, and output that nobody takes: one line or none, a status that says so, and no traceback."""
 
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import time
 
 import pytest
 from processes import (
@@ -67,16 +65,6 @@ def test_a_second_sigterm_discards_them():
     assert [signal.getsignal(number) for number in SIGNALS.values()] == before
 
 
-def test_handlers_of_others_stay(capfd):
-    """A host that has one of its own for SIGTERM, and runs a command within itself."""
-    got = []
-    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
-    try:
-        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
 @pytest.fixture(scope="module")
 def stack(tmp_path_factory):
     """A small stack's file."""
@@ -105,20 +93,6 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
 def test_results_that_cannot_be_printed_are_an_error(stack):
     run = shell('"$@" > /dev/full', *NGPT, "info", stack, "--json")
     assert run.returncode == 1 and one_error(run.stderr) and "No space left" in run.stderr
-
-
-def test_a_reader_that_takes_its_time_gets_everything(stack):
-    """More than a pipe holds, to a reader that sleeps first."""
-    whole = complete([*NGPT, "info", "--aliases"]).stdout
-    reader, writer = os.pipe()
-    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    assert len(whole) > 0
-    with start([*NGPT, "info", "--aliases"], stdout=writer) as process:
-        os.close(writer)
-        time.sleep(1)
-        with os.fdopen(reader) as file:
-            assert file.read() == whole
-        assert process.wait(60) == 0
 
 
 def test_an_interrupt_during_import_is_one_line():

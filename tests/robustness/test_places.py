@@ -6,14 +6,11 @@ import sys
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from processes import complete, make_work, one_error, start, temporary_files
+from processes import complete, make_work, one_error, start
 from reliability import record
 
-import ngpt
 from ngpt.errors import NgptError
 from ngpt.system.files import atomic_output
-
-FAST = ["denoise", "merge", "export", "eval"]
 
 
 def test_files_that_may_not_grow(tmp_path):
@@ -49,20 +46,6 @@ def test_of_many_writers_of_one_file_one_wins(tmp_path, writers):
     tried = rounds * writers
     outcomes = {"written": rounds, "one line: exists already": tried - rounds}
     record("Writers of one file at the same time", tried, outcomes)
-
-
-def test_two_commands_with_one_output(tmp_path):
-    job = make_work("merge", tmp_path)
-    arguments = job.arguments(tmp_path / "out")[:-1]
-    statuses = []
-    processes = [start(arguments) for _ in range(3)]
-    for process in processes:
-        _, errors = process.communicate(timeout=120)
-        statuses.append(process.returncode)
-        assert process.returncode == 0 or ("exists already" in errors and one_error(errors)), errors
-    assert statuses.count(0) == 1
-    ngpt.read(tmp_path / "out" / "merged.exr")
-    assert temporary_files(tmp_path) == []
 
 
 @pytest.mark.parametrize("kind", ["eval", pytest.param("train", marks=pytest.mark.slow)])

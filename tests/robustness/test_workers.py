@@ -8,11 +8,8 @@ import pytest
 from processes import (
     ROOT,
     children,
-    complete,
-    make_work,
     running,
     start,
-    temporary_files,
     wait_for,
 )
 
@@ -66,20 +63,6 @@ def test_workers_end_with_an_interrupted_parent_without_a_word(pool, number):
     assert pool.wait(20) == 128 + number
     assert pool.stderr.read() == "ngpt: error: interrupted\n"
     assert wait_for(lambda: not any(running(pid) for pid in workers), 20)
-
-
-@pytest.mark.slow
-def test_workers_of_a_killed_generation_end(tmp_path):
-    arguments = [*make_work("data_gen", tmp_path).arguments(tmp_path / "out"), "--workers", 2]
-    process = start(arguments)
-    assert wait_for(lambda: list(tmp_path.glob("out/shards/[!.]*")), 240)
-    workers = children(process.pid)
-    process.kill()
-    process.wait()
-    assert len(workers) >= 2 and wait_for(lambda: not any(running(pid) for pid in workers), 60)
-    again = complete(arguments)
-    assert again.returncode == 0, again.stderr
-    assert temporary_files(tmp_path / "out") == []
 
 
 def test_a_forked_process_does_not_hold_the_lock_of_a_dead_one(tmp_path):
