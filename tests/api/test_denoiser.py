@@ -223,18 +223,6 @@ def test_channels_of_a_bitmap_may_be_flow_and_previous_frame(renderer, shot):
     assert np.array_equal(made[0], first) and np.allclose(made[1], second, atol=1e-5)
 
 
-def test_frames_are_announced(arrays):
-    for name in ("flow", "previous_denoised"):
-        with pytest.raises(
-            NgptError, match=rf"{name} is given, but was not announced: Denoiser\(size, temporal=True\)"
-        ):
-            ngpt.Denoiser((26, 18))(arrays["noisy"], **{name: arrays["noisy"]})
-    with pytest.raises(NgptError, match="temporal=True announced flow, which is not given"):
-        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"flow has shape \(18, 26, 3\); it must be \(18, 26, 2\)"):
-        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"], flow=arrays["noisy"])
-
-
 def test_transforms_may_scale_and_not_flatten(arrays):
     denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
     arguments = [arrays[name] for name in ("noisy", "albedo", "normals")]
@@ -252,21 +240,3 @@ def test_normals_that_are_not_finite_are_repaired_in_silence(arrays, value):
         warnings.simplefilter("error")
         result = denoiser(*(arrays[name] for name in ("noisy", "albedo", "normals")), 2 * np.eye(4))
     assert np.isfinite(result).all()
-
-
-def test_bad_calls(arrays):
-    with pytest.raises(NgptError, match=r"albedo is given, but was not announced: Denoiser\(size, albedo=True\)"):
-        call(ngpt.Denoiser((26, 18), normals=True), arrays)
-    with pytest.raises(NgptError, match="normals=True announced normals, which is not given"):
-        ngpt.Denoiser((26, 18), normals=True)(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"noisy has shape \(18, 26, 3\); it must be \(26, 18, 3\) or \(26, 18, 4\)"):
-        ngpt.Denoiser((18, 26))(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"dx has shape \(17, 26, 3\)"):
-        ngpt.Denoiser((26, 18))(arrays["noisy"], dx=arrays["dx"][1:], dy=arrays["dy"])
-    for strange in ("dz", "dt", "diffuse"):
-        with pytest.raises(NgptError, match=rf"no layer is called '{strange}'; there are: depth, dx.*, caustic_var$"):
-            ngpt.Denoiser((26, 18))(arrays["noisy"], **{strange: arrays["dx"]})
-    with pytest.raises(NgptError, match="method 'l2' has no option 'alhpa'; did you mean 'alpha'"):
-        ngpt.Denoiser((26, 18), method="l2", alhpa=0.1)
-    with pytest.raises(NgptError, match=r"Denoiser: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):
-        ngpt.Denoiser((26, 18), method="l2")(arrays["noisy"])

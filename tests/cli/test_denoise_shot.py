@@ -182,11 +182,3 @@ def test_each_view_has_a_history_of_its_own(rest, tmp_path, capsys):
         assert main([*words, str(tmp_path / target), *more, "-m", "primal"]) == 1
         assert "has several views, and" in capsys.readouterr().err
         assert main([*words, str(tmp_path / target), *more, "-m", "primal", "--view", "right"]) == 0
-
-
-def test_files_without_gradients_tell_of_none(tmp_path, capsys):
-    image = np.ones((8, 9, 3), np.float32)
-    image[3, 4] = np.nan
-    ngpt.write(tmp_path / "a.exr", image)
-    assert main(["denoise", str(tmp_path / "a.exr"), "-m", "primal"]) == 0
-    assert capsys.readouterr().err.endswith(", repaired 1 pixels\n")

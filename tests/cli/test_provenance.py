@@ -60,12 +60,6 @@ def test_the_result_of_a_result_says_what_made_it_and_no_more(stack, tmp_path):
     assert "ngpt:method" in again.attributes
 
 
-def test_attributes_cannot_change_how_a_file_is_stored(stack, tmp_path):
-    with pytest.raises(ngpt.NgptError, match="attribute 'dataWindow' is OpenEXR's own"):
-        ngpt.write(tmp_path / "o.exr", stack["primal"], like=stack, attributes={"dataWindow": 1})
-    assert not (tmp_path / "o.exr").exists()
-
-
 def test_our_network_is_known_wherever_it_lies(stack, tmp_path):
     copy = shutil.copy(FAST, tmp_path / "copy.onnx")
     result = ngpt.reconstruct(stack, weights=str(copy))

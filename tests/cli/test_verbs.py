@@ -42,16 +42,6 @@ def test_no_help_imports_what_is_heavy():
     assert run.returncode == 0, run.stderr
 
 
-def test_help_has_the_verbs_under_headings_and_what_most_come_for_first(capfd):
-    status, output, _ = stopped(main, ["--help"], capfd)
-    headings = re.findall(r"^(\w[\w ]+):\n((?: .*\n)+)", output, re.M)
-    verbs = {heading: re.findall(r"^  (\w+) ", lines, re.M) for heading, lines in headings}
-    assert status == 0 and list(verbs) == ["images of any renderer", "rendering", "networks", "options"]
-    assert verbs["images of any renderer"] == ["denoise", "info", "diff", "report", "picture", "merge", "unpack"]
-    assert verbs["rendering"] == ["render", "advise", "demo"]
-    assert verbs["networks"] == ["dataset", "train", "evaluate", "export"]
-
-
 def test_a_verb_imports_no_other(tmp_path):
     code = (
         "import sys\n"

@@ -4,17 +4,12 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from ngpt.errors import NgptError
 from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.weights import load_weights, save_weights
 
 HEADS = [Direct(), Residual(("base",)), Mixture(("primal", "base")), Kernels(("primal", "base"), 3)]
-
-
-def by_kernels(size=3, start=("primal",), channels=(6,)):
-    return ModelConfig("plain", channels, (), ("primal", "albedo"), start=start, kernel=size)
 
 
 def images(head, height=9, width=11):
@@ -144,25 +139,3 @@ def test_a_pyramid_learns(tmp_path):
     again, _ = load_weights(tmp_path / "w.safetensors")
     with torch.no_grad():
         assert again.config == model.config and torch.equal(again(layers), model(layers))
-
-
-@pytest.mark.parametrize(
-    "changes, message",
-    [
-        ({"scales": 0}, "must be from 1 to the 3 levels of the network"),
-        ({"scales": 4}, "must be from 1 to the 3 levels of the network"),
-        ({"kernel": 1}, "needs kernels of 3 pixels or more"),
-        ({"start": ()}, "there is no image to average"),
-        ({"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
-        ({"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
-    ],
-)
-def test_pyramids_that_cannot_be(changes, message):
-    with pytest.raises(NgptError, match=message):
-        of_a_pyramid(**changes)
-
-
-@pytest.mark.parametrize("size", [2, -1, 19, True, "3", 3.0])
-def test_sizes_that_no_kernel_has(size):
-    with pytest.raises(NgptError, match="must be an odd number of pixels up to 17, or 0"):
-        by_kernels(size)

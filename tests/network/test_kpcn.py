@@ -149,23 +149,6 @@ def test_a_stack_is_reconstructed_by_its_weights(tmp_path):
         ngpt.denoise(full_stack(20, 26), "ngpt", weights=str(tmp_path / "w.safetensors"))
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"inputs": ("primal", "diffuse", "albedo")}, "network 'kpcn' needs the inputs .*; lacks specular"),
-        ({"kernel": 0}, "must be an odd number from 3 to 21"),
-        ({"kernel": 23}, "must be an odd number from 3 to 21"),
-        ({"channels": (4, 4), "units": (1, 1)}, "'kpcn' has one level"),
-        ({"units": ()}, "give a positive number, up to 32, for each of 1 levels"),
-        ({"start": ("primal",)}, "network 'kpcn' goes without start"),
-        ({"sweeps": 2, "quiet": 1.0}, "network 'kpcn' goes without quiet, sweeps"),
-    ],
-)
-def test_configurations_that_cannot_be(changes, message):
-    with pytest.raises(NgptError, match=message):
-        small(**changes)
-
-
 @pytest.mark.parametrize("made", ["quieter", "rarer"])
 def test_inputs_that_are_made_up_have_no_parts(made):
     tables = {"model": small().to_dict(), "augmentation": {made: [1.0, 1.0]}}

@@ -190,22 +190,6 @@ def test_files_of_another_kind_are_not_made(files, tmp_path, capsys):
     assert main(["export", "-o", str(tmp_path / "l2.tza")]) == 2
 
 
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"channels": (32, 32)}, "they must be"),
-        ({"units": (1,)}, "has none"),
-        ({"inputs": ("primal", "albedo", "normal")}, "must be base, albedo, normal"),
-        ({"base": "oidn"}, "choose one of"),
-        ({"quiet": 0.03, "kernel": 3}, "goes without quiet, kernel"),
-    ],
-)
-def test_configurations_that_make_no_sense(wrong, message):
-    right = {"network": "oidn", "channels": SMALL, "units": (), "inputs": INPUTS, "base": "wcv"}
-    with pytest.raises(NgptError, match=message):
-        ModelConfig(**(right | wrong))
-
-
 def test_it_runs_without_pytorch():
     """The names it reads are known to a process that has imported no torch."""
     source = Path(run_oidn.__file__).read_text() + Path(tza.__file__).read_text()

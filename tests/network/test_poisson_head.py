@@ -7,7 +7,6 @@ from scipy.sparse import coo_matrix, diags
 from scipy.sparse.linalg import spsolve
 from torch.nn.functional import avg_pool2d
 
-from ngpt.errors import NgptError
 from ngpt.network import poisson
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.poisson import solved
@@ -130,18 +129,3 @@ def test_training_reaches_what_is_said_of_the_gradients():
     model(layers).square().mean().backward()
     gradient = model.network.head.convolution.weight.grad
     assert torch.isfinite(gradient).all() and all(gradient[3 + i].abs().max() > 0 for i in range(3 * poisson.SCALES))
-
-
-@pytest.mark.parametrize(
-    "changes, says",
-    [
-        ({"sweeps": -1}, "sweeps = -1"),
-        ({"sweeps": 65}, "whole number up to 64"),
-        ({"sweeps": True}, "sweeps = True"),
-        ({"inputs": INPUTS[:-1]}, "dy_noise"),
-        ({"channels": (4, 4, 4)}, "4 resolutions; the network has 3"),
-    ],
-)
-def test_settings_that_make_no_sense(changes, says):
-    with pytest.raises(NgptError, match=says):
-        config(**changes)

@@ -5,7 +5,6 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from ngpt.errors import NgptError  # noqa: E402
 from ngpt.network import features, padding  # noqa: E402
 from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
 from ngpt.network.transfer import signed_log  # noqa: E402
@@ -272,30 +271,6 @@ def test_channels_are_where_the_paper_has_them():
     assert torch.equal(x[:, :3], torch.log1p(data["primal"].clamp(min=0)))
     assert torch.equal(x[:, 3:6], data["dx"].sign() * torch.log1p(data["dx"].abs()))
     assert torch.equal(x[:, 9:12], data["albedo"]) and torch.equal(x[:, 15:], data["depth"])
-
-
-def test_errors_are_explained():
-    with pytest.raises(NgptError, match="network 'round'"):
-        ModelConfig("round", (4,), (1,), NGPT)
-    with pytest.raises(NgptError, match="input 'colour' is unknown"):
-        ModelConfig("dense", (4,), (1,), ("primal", "colour"))
-    with pytest.raises(NgptError, match="'primal' among them"):
-        ModelConfig("dense", (4,), (1,), ("albedo",))
-    with pytest.raises(NgptError, match="each of 2 levels"):
-        ModelConfig("dense", (4, 4), (1,), NGPT)
-    with pytest.raises(NgptError, match="base is 'l2'"):
-        ModelConfig("dense", (4, 4), (1, 1), NGPT, "l2")
-    with pytest.raises(NgptError, match="there is no base"):
-        ModelConfig("plain", (4,), (), ("primal", "denoised_base"))
-    with pytest.raises(NgptError, match="start 'albedo': must be one of"):
-        ModelConfig("plain", (4,), (), ("primal", "albedo"), start=("albedo",))
-    with pytest.raises(NgptError, match="quiet = 3: goes over to the base"):
-        ModelConfig("plain", (4,), (), ("primal", "base"), "wcv", quiet=3)
-    for quiet in (-1, float("nan"), float("inf"), "very", True):
-        with pytest.raises(NgptError, match="must be a finite relative standard error"):
-            ModelConfig("plain", (4,), (), ("primal", "base", "primal_se"), "wcv", quiet=quiet)
-    with pytest.raises(NgptError, match="start 'denoised'"):
-        ModelConfig("plain", (4,), (), ("primal",), start=("denoised",))
 
 
 def test_what_a_stack_must_hold():
