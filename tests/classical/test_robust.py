@@ -6,7 +6,7 @@ import pytest
 from ngpt.classical.bases import BASES, CLASSICAL
 from ngpt.classical.energy import MOST, keep_energy
 from ngpt.classical.gradients import forward_differences
-from ngpt.classical.variances import smooth_variances
+from ngpt.classical.variances import SHARED, TYPICAL, smooth_variances
 from ngpt.measure.metrics import relmse
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
@@ -108,3 +108,12 @@ def test_what_keeps_the_energy_is_smooth_bounded_and_nothing_where_images_agree(
     assert np.isfinite(kept).all() and kept.max() <= MOST * image.max() * 1.001
     factor = (keep_energy(image, image * (1 + np.arange(50) / 50)[None, :, None]) / image)[..., 0]
     assert np.abs(np.diff(factor, axis=1)).max() < 0.05
+
+
+def test_no_difference_is_believed_for_its_luck():
+    """One whose samples all missed the light has the variance of those around it."""
+    variances = [np.ones((9, 11, 3)) for _ in range(3)]
+    variances[1][4, 5] = 0
+    _, (x, _) = smooth_variances(*variances)
+    assert x[0, 4, 5] > 0.5 * x[0, 0, 0]
+    assert x[0, 0, 0] == pytest.approx(TYPICAL * SHARED * smooth_variances(*variances)[0][0, 0, 0], rel=0.01)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import signal
 import subprocess
 import sys
 
@@ -267,3 +268,15 @@ def test_demo(renderer, tmp_path, capsys):
     rows = {line.split()[1]: float(line.split()[2]) for line in capsys.readouterr().out.splitlines()[1:]}
     assert rows["l1"] < rows["primal"] / 3
     assert main([*arguments, "-q"]) == 1  # the report is there already
+
+
+def test_ctrl_c_is_ignored_where_whoever_started_it_said_so():
+    from data_gen.session import stop_on_ctrl_c
+
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stop_on_ctrl_c() as stop:
+            os.kill(os.getpid(), signal.SIGINT)
+            assert not stop()
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -160,3 +160,12 @@ def test_views_windows_other_formats_and_names_of_frames_go_together(stack, tmp_
     assert read_picture("eye.pfm").pixels.all() and pixels("eye.png").all()
     assert [path.name for path in shot_files("new/c.%03d.exr")][:3] == ["c.-02.exr", "c.-01.exr", "c.000.exr"]
     assert len(list(Path("film").iterdir())) == 6
+
+
+def test_a_display_window_out_of_all_proportion_fills_no_memory(stack, tmp_path, capfd):
+    (tmp_path / "shot").mkdir()
+    written(tmp_path / "shot" / "a.exr", stack, display=Window(0, 0, 2**29, 2**29))
+    for command in (["picture", "-o", str(tmp_path / "f.webp")], ["report", "-o", str(tmp_path / "page.html")]):
+        assert main([*command, str(tmp_path / "shot")]) == 1
+        assert "536870912x536870912 pixels is to be filled" in capfd.readouterr().err
+    assert main(["picture", str(tmp_path / "shot" / "a.exr"), "-o", str(tmp_path / "a.png")]) == 0

@@ -104,3 +104,9 @@ def test_csv_has_a_line_for_each_cell():
 def test_the_pareto_set():
     points = [Point("a", 4, 1, 3), Point("a", 8, 2, 2), Point("b", 4, 2, 2.5), Point("b", 8, 3, 1), Point("c", 4, 3, 3)]
     assert pareto(points) == [True, True, False, True, False]
+
+
+def test_a_mean_is_of_methods_that_are_on_all_scenes():
+    results = make_results({"l1": [0.01], "oidn": [0.03]})
+    results["cells"] = [c for c in results["cells"] if (c["scene"], c["method"]) != ("b", "oidn")]
+    assert {row["method"] for row in summarised(results) if row["scene"] is None} == {"l1"}

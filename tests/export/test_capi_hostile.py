@@ -150,3 +150,10 @@ def test_weights_outside_of_the_file_are_not_read(library, tmp_path):
         model.graph.initializer.append(tensor)
         path.write_bytes(model.SerializeToString())
         assert Network(library, path).handle is None
+
+
+def test_pixels_below_the_first_address(library, fast):
+    job = Job(fast, those(fast, example()))
+    assert library.ngpt_set_layer(job.handle, b"albedo", 4096, 0, 3, 0, 0, -4096) == OK
+    assert job.run() == BAD_ARGUMENT and "albedo: its strides" in job.message()
+    job.free()

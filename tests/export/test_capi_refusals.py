@@ -219,3 +219,12 @@ def test_a_job_outlives_its_network(library):
     network.close()
     assert job.run() == OK and (job.image != -7).any()
     job.free()
+
+
+def test_messages_fit_where_they_go(library, tmp_path):
+    for size in (0, 1, 2, 20):
+        message = ctypes.create_string_buffer(b"?" * 30)
+        assert library.ngpt_open(str(tmp_path / "none.onnx").encode(), 0, message, size) is None
+        assert message.raw[max(size - 1, 0) : size] == b"\0" * min(size, 1) and message.raw[size:30] == b"?" * (
+            30 - size
+        )

@@ -286,3 +286,9 @@ def damaged(path):
     copy = path.with_name("damaged.exr")
     copy.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
     return copy
+
+
+def test_a_stale_chunk_count_is_not_written(tmp_path):
+    source = write_raw(tmp_path / "a.exr", (PIXELS, {"chunkCount": 99}))
+    assert read_raw(source)[0][1]["chunkCount"] == 99, "OpenEXR believes it"
+    assert "chunkCount" not in read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]

@@ -7,6 +7,7 @@ from full_stack import full_stack
 import ngpt
 from ngpt.classical.gradients import forward_differences
 from ngpt.denoisers import oidn
+from ngpt.errors import NgptError
 from ngpt.layers import FEATURE_NOISE
 from ngpt.network import inputs
 from ngpt.network.estimates import with_variances
@@ -85,3 +86,8 @@ def test_features_are_filtered_once_for_a_frame_if_they_are_noisy(absent, noise,
             stack.attributes[FEATURE_NOISE] = noise
         ngpt.denoise(stack, name)
         assert calls == ([] if noise == 0 else [1]), name
+
+
+def test_training_never_reads_estimates():
+    with pytest.raises(NgptError, match="need layers primal_var, dx_var, dy_var"):
+        inputs.gather(repair(without(full_stack(6, 5), *VARIANCES)), ("primal", "base"), "wcv")

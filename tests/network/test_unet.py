@@ -2,14 +2,13 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from ngpt.network import features, padding  # noqa: E402
-from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters  # noqa: E402
-from ngpt.network.transfer import signed_log  # noqa: E402
-from ngpt.network.unet import POOLING, Convolution, DenseUNet, PlainUNet, Resampling  # noqa: E402
-from ngpt.training.cost import per_pixel  # noqa: E402
+from ngpt.network import features, padding
+from ngpt.network.model import WINDOW, ModelConfig, Reconstructor, parameters
+from ngpt.network.transfer import signed_log
+from ngpt.network.unet import POOLING, Convolution, DenseUNet, PlainUNet, Resampling
+from ngpt.training.cost import per_pixel
 
 NGPT = ("primal", "dx", "dy", "albedo", "normal", "depth")
 PAPER = {"network": "dense", "channels": (40, 80, 80, 80), "units": (4, 3, 2, 2)}

@@ -12,8 +12,9 @@ import pytest
 
 from ngpt.report import live
 from ngpt.report.live import LivePage
-from ngpt.report.preview import preview
+from ngpt.report.preview import Preview, preview
 from ngpt.stack import GradientStack
+from ngpt.system.text import printable
 
 
 def stack(level, seed=0):
@@ -159,3 +160,14 @@ def test_what_is_shown_of_a_stack_follows_its_layers():
     assert full.most == 16 and all(set(maps) == {"std. error", "samples"} for maps in full.maps.values())
     # A standard error of 22 % is two thirds of the way from 1 % to 100 %.
     assert np.median(full.maps["noisy"]["std. error"]) == pytest.approx(np.log10(22.4) / 2, abs=0.1)
+
+
+def test_names_turn_no_text_around_and_hide_nothing(page):
+    evil = "gnp.\u202egpj\u2066 \u200f\u061c\u3164"
+    image = np.ones((8, 8, 3), np.float32)
+    page.title = page.command = evil
+    page.show(Preview({evil: image}), evil)
+    text = asked(page, "GET", "/")[2]
+    assert "\\u202egpj\\u2066 \\u200f\\u061c\\u3164" in text and not set(evil[4:]) & set(text) - set("gpj ")
+    page.tell(f"ended: {evil} is written")
+    assert json.loads(asked(page, "GET", "/status")[2])["text"] == f"ended: {printable(evil)} is written"

@@ -126,3 +126,13 @@ def test_a_handler_prints_amid_a_line(tmp_path):
     with open(tmp_path / "log", "wb") as file:
         print_line("interrupted", Entered(file))
     assert (tmp_path / "log").read_text() == "interrupted\n"
+
+
+def test_handlers_of_others_stay(capfd):
+    """A host that has one of its own for SIGTERM, and runs a command within itself."""
+    got = []
+    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
+    try:
+        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -2,6 +2,7 @@
 
 import os
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from threading import get_ident
 
@@ -162,3 +163,15 @@ def test_a_limit_of_threads_holds_for_oidn(limit):
     assert np.allclose(ngpt.denoise(stack(0), "oidn"), free, rtol=1e-5, atol=1e-6)
     device = oidn_filters._devices["auto", 1]
     assert device.type.name != "CPU" or device.num_threads == 1
+
+
+def test_writers_in_threads_leave_the_mask_of_new_files_as_it_is(tmp_path, monkeypatch):
+    real, before = os.umask, os.umask(0o027)
+    monkeypatch.setattr(os, "umask", lambda mask: (real(mask), time.sleep(0.005))[0])
+    try:
+        with ThreadPoolExecutor(4) as pool:
+            list(pool.map(lambda i: ngpt.write(tmp_path / f"{i}.exr", stack(0)), range(12)))
+    finally:
+        after = real(before)
+    assert after == 0o027
+    assert {path.stat().st_mode & 0o777 for path in tmp_path.iterdir()} == {0o640}

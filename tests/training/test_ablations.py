@@ -3,10 +3,8 @@
 import numpy as np
 import pytest
 
-torch = pytest.importorskip("torch")
 pytest.importorskip("flip_evaluator")
 
-# ruff: noqa: E402
 from crops import SyntheticCrop
 
 from bench.ablations import VARIANTS, judged, mean, table

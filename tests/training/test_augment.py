@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from ngpt.network import padding  # noqa: E402
-from ngpt.stack import GradientStack  # noqa: E402
-from ngpt.training import augment  # noqa: E402
-from ngpt.training.augment import Augmentation, quieter, rarer  # noqa: E402
+from ngpt.network import padding
+from ngpt.stack import GradientStack
+from ngpt.training import augment
+from ngpt.training.augment import Augmentation, quieter, rarer
 
 
 def differences(image):
@@ -138,3 +137,13 @@ def test_padding_reflects_and_keeps_the_differences(size):
     assert torch.allclose(padded["dx_se"][..., :-1], dx[..., :-1].abs(), atol=1e-6)
     assert torch.equal(padding.crop(image, pads), layers["primal"])
     assert torch.equal(padding.crop(padded["depth"], pads), layers["depth"])
+
+
+def test_colors_and_brightness_change_light_and_surfaces_alike():
+    before = example()
+    after = augment.scale(augment.color(before, np.array([2, 0, 1]), np.array([0.5, 1.0, 1.5])), 3)
+    dx, dy = differences(after["primal"])
+    assert torch.allclose(after["dx"], dx, atol=1e-6) and torch.allclose(after["dy"], dy, atol=1e-6)
+    assert torch.allclose(after["primal"][0], 1.5 * before["primal"][2])
+    assert torch.allclose(after["albedo"][2], 1.5 * before["albedo"][1])
+    assert torch.equal(after["normal"], before["normal"])

@@ -12,7 +12,7 @@ from ngpt.cli import main
 from ngpt.errors import NgptError
 from ngpt.stack import GradientStack
 from ngpt.training.dataset import FORMAT, VERSION, Crop, Dataset, problems
-from ngpt.training.shards import CropData, Shard, write_shard
+from ngpt.training.shards import MAX_LOSS, CropData, Shard, smallest_float, write_shard
 
 pytest.importorskip("safetensors")
 
@@ -303,3 +303,29 @@ def test_pairs_without_noise_of_their_own_are_named(tmp_path, rng):
     assert Dataset(tmp_path)[0].paired and np.allclose(
         Dataset(tmp_path)[0].stack(1)["dx"], good.stacks[1]["dx"], atol=2e-3
     )
+
+
+@pytest.mark.parametrize(("scale", "dtype"), [(1, np.float16), (1e5, np.float32), (1e-7, np.float32)])
+def test_half_floats_only_where_safe(rng, scale, dtype):
+    """Neither overflow nor underflow, and one bad crop is enough."""
+    tensor = np.stack([rng.random((8, 8)), scale * rng.random((8, 8))])
+    small = smallest_float(tensor)
+    assert small.dtype == dtype
+    assert np.all(np.abs(small - tensor).sum(axis=(1, 2)) <= MAX_LOSS * tensor.sum(axis=(1, 2)))
+
+
+def test_numbers_that_are_not_finite_are_refused(tmp_path, rng):
+    crop = crop_data(rng)
+    crop.reference[0, 0, 0] = np.nan
+    with pytest.raises(NgptError, match="reference_indirect"):
+        write_shard(tmp_path / "x.safetensors", [crop], {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_arrays_in_any_order_of_memory(tmp_path, rng):
+    crop = crop_data(rng)
+    turned = np.ascontiguousarray(crop.reference_direct.transpose(2, 0, 1)).transpose(1, 2, 0)
+    told = CropData(crop.stacks, crop.spp, crop.reference, turned)
+    write_shard(tmp_path / "a.safetensors", [told], {"scene": "a"})
+    read = Crop(Shard(tmp_path / "a.safetensors"), 0, "a", (2, 9))
+    np.testing.assert_allclose(read.reference_direct, crop.reference_direct, rtol=2e-3)

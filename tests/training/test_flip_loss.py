@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
+from scipy.ndimage import gaussian_filter
 
-torch = pytest.importorskip("torch")
-
-from scipy.ndimage import gaussian_filter  # noqa: E402
-
-from ngpt.measure.distances import flip  # noqa: E402
-from ngpt.network.transfer import srgb  # noqa: E402
+from ngpt.measure.distances import flip
+from ngpt.network.transfer import srgb
 
 
 def picture(seed, blur, size=(48, 64)):

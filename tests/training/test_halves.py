@@ -4,18 +4,16 @@ import json
 
 import numpy as np
 import pytest
+import torch
+from crops import SyntheticCrop
 
-torch = pytest.importorskip("torch")
-
-from crops import SyntheticCrop  # noqa: E402
-
-from ngpt.errors import NgptError  # noqa: E402
-from ngpt.training.augment import Augmentation  # noqa: E402
-from ngpt.training.examples import Examples, collated  # noqa: E402
-from ngpt.training.halves import halves  # noqa: E402
-from ngpt.training.loss import make_loss  # noqa: E402
-from ngpt.training.settings import from_dict  # noqa: E402
-from ngpt.training.trainer import Trainer  # noqa: E402
+from ngpt.errors import NgptError
+from ngpt.training.augment import Augmentation
+from ngpt.training.examples import Examples, collated
+from ngpt.training.halves import halves
+from ngpt.training.loss import make_loss
+from ngpt.training.settings import from_dict
+from ngpt.training.trainer import Trainer
 
 
 class PairedCrop:

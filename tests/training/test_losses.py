@@ -373,3 +373,19 @@ def test_the_loss_of_oidn_is_zero_for_equal_images_and_looks_at_them_at_their_ow
     assert 0.1 < value < 1
     # The exposure is that of the target: an image a hundred times as bright looks the same.
     assert loss(100 * a, 100 * b, generator())[0].item() == pytest.approx(value, rel=1e-4)
+
+
+def test_tone_mapping_is_that_of_ngpt():
+    grey, red = torch.full((1, 3, 1, 1), 1e9), torch.zeros(1, 3, 1, 1)
+    red[:, 0] = 1e9
+    assert pixelwise.tone_mapped(grey).flatten().tolist() == pytest.approx([1, 1, 1])
+    assert pixelwise.tone_mapped(red).flatten().tolist() == pytest.approx([3, 0, 0])
+
+
+def test_autocast_does_not_reach_the_features():
+    distance = random_elpips(backbones.SqueezeNet)
+    a, b = images(1, 3, 64, 64), images(1, 3, 64, 64, seed=1)
+    near = a + 1e-3 * (b - a)
+    with torch.autocast("cpu", torch.bfloat16):
+        inside = distance(a, near)
+    assert inside == distance(a, near)

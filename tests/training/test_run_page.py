@@ -8,20 +8,17 @@ from types import SimpleNamespace
 from urllib.parse import quote
 
 import pytest
+from crops import SyntheticCrop
 
-torch = pytest.importorskip("torch")
-
-from crops import SyntheticCrop  # noqa: E402
-
-from ngpt.cli import main  # noqa: E402
-from ngpt.errors import NgptError  # noqa: E402
-from ngpt.network import weights  # noqa: E402
-from ngpt.system import configs  # noqa: E402
-from ngpt.training import trainer as trainers  # noqa: E402
-from ngpt.training.run_record import write_record  # noqa: E402
-from ngpt.training.settings import from_dict  # noqa: E402
-from ngpt.training.trainer import Trainer  # noqa: E402
-from ngpt.training.validation import Scores  # noqa: E402
+from ngpt.cli import main
+from ngpt.errors import NgptError
+from ngpt.network import weights
+from ngpt.system import configs
+from ngpt.training import trainer as trainers
+from ngpt.training.run_record import write_record
+from ngpt.training.settings import from_dict
+from ngpt.training.trainer import Trainer
+from ngpt.training.validation import Scores
 
 CROPS = [SyntheticCrop(f"<scene> {i}", i) for i in range(4)]
 MODEL = {"network": "dense", "channels": [4], "units": [1], "inputs": ["primal"]}

@@ -9,21 +9,22 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import torch
+from crops import SyntheticCrop
 
-torch = pytest.importorskip("torch")
-
-from crops import SyntheticCrop  # noqa: E402
-
-import ngpt  # noqa: E402
-from ngpt.errors import NgptError  # noqa: E402
-from ngpt.network import weights  # noqa: E402
-from ngpt.stack import GradientStack  # noqa: E402
-from ngpt.training import examples, folders  # noqa: E402
-from ngpt.training.augment import Augmentation  # noqa: E402
-from ngpt.training.schedule import learning_rate  # noqa: E402
-from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
-from ngpt.training.trainer import Trainer  # noqa: E402
-from ngpt.windows import Place, Window  # noqa: E402
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.network import weights
+from ngpt.stack import GradientStack
+from ngpt.training import examples, folders
+from ngpt.training.augment import Augmentation
+from ngpt.training.schedule import learning_rate
+from ngpt.training.settings import OptimizerSettings, from_dict, read_settings
+from ngpt.training.trainer import (
+    Trainer,
+    published,
+)
+from ngpt.windows import Place, Window
 
 CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
 SETTINGS = {
@@ -407,3 +408,10 @@ def test_two_processes_do_what_one_does(tmp_path):
     ours, _ = weights.read_tensors(tmp_path / "one" / "weights.safetensors")
     theirs, _ = weights.read_tensors(tmp_path / "two" / "weights.safetensors")
     assert all(torch.allclose(ours[name], theirs[name], rtol=1e-3, atol=1e-4) for name in ours)
+
+
+def test_weights_do_not_tell_where_things_lie(tmp_path):
+    values = SETTINGS | {"initial": "/home/me/a.safetensors", "loss": {"kind": "l1", "backbone": "/home/me/b.pth"}}
+    values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
+    told = published(from_dict(values, "test"))
+    assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
