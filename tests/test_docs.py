@@ -8,6 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from verbs import parser_of
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("export/**/*.md")])
@@ -57,15 +58,6 @@ def test_commands_exist(page, capsys):
     verbs = set(re.findall(r"^ {2,4}([a-z]+)(?: {2}|$)", capsys.readouterr().out, re.M))
     for verb in re.findall(r"(?:`|^ {4})ngpt ([a-z]+)", text, re.M):
         assert verb in verbs, f"ngpt {verb}"
-
-
-def parser_of(verb):
-    """The real parser of a verb, which refuses a line by leaving with status 2."""
-    from ngpt.cli import _filled, _Parser, all_verbs
-
-    verbs = all_verbs()
-    assert verb in verbs, f"ngpt {verb}"
-    return _filled(_Parser(prog=f"ngpt {verb}"), verb, verbs[verb])
 
 
 def unknown_options(line):

@@ -6,11 +6,13 @@ import subprocess
 import sys
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 from crops import SyntheticCrop
+from runs import CROPS, SETTINGS, loss, settings, trainer
 
 import ngpt
 from ngpt.errors import NgptError
@@ -20,45 +22,10 @@ from ngpt.training import examples, folders
 from ngpt.training.augment import Augmentation
 from ngpt.training.schedule import learning_rate
 from ngpt.training.settings import OptimizerSettings, from_dict, read_settings
-from ngpt.training.trainer import (
-    Trainer,
-    published,
-)
+from ngpt.training.trainer import Trainer, published
 from ngpt.windows import Place, Window
 
-CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
-SETTINGS = {
-    "model": {
-        "network": "dense",
-        "channels": [4, 6],
-        "units": [1, 1],
-        "inputs": ["primal", "dx", "dy", "albedo", "normal", "depth"],
-    },
-    "data": {"crop": 32},
-    "augmentation": {"brightness": 0.0},
-    "optimizer": {"learning_rate": 1e-2, "schedule": "cosine", "warmup": 5, "ema": 0.9},
-    "run": {"steps": 12, "batch": 2, "log": 2, "save": 5, "validate": 6},
-}
-
-
-def loss(prediction, target, generator):
-    """Random, so that resuming must restore the generator too."""
-    weight = 1 + 0.1 * torch.rand(target.shape, generator=generator)
-    parts = {"l1": (weight * (prediction - target).abs()).mean()}
-    return parts["l1"], parts
-
-
-def settings(**changes):
-    values = json.loads(json.dumps(SETTINGS))
-    for name, value in changes.items():
-        table, _, key = name.partition("_")
-        values[table][key] = value
-    return from_dict(values, "test")
-
-
-def trainer(out, crops=CROPS, **changes):
-    out.mkdir(exist_ok=True)
-    return Trainer(settings(**changes), crops[:4], crops[4:], loss, out, say=lambda text: None)
+HERE = str(Path(__file__).parent)
 
 
 def test_it_learns_and_its_weights_can_be_used(tmp_path):
@@ -395,14 +362,14 @@ def test_checkpoints_that_do_not_fit_are_explained(tmp_path):
 def test_two_processes_do_what_one_does(tmp_path):
     """Gradients of two processes with half the batch each, averaged, are those of one; their examples are the same."""
     program = (
-        "import sys; from pathlib import Path; sys.path[:0] = ['tests/training']; import test_training as t;"
+        "import sys; from pathlib import Path; sys.path[:0] = [sys.argv[2]]; import runs as t;"
         "t.loss = lambda p, q, g: ((p - q).abs().mean(), {});"
         "r = t.trainer(Path(sys.argv[1]), run_steps=3); r.run(); r.processes.close()"
     )
     environment = os.environ | {"PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
     (tmp_path / "run.py").write_text(program)
-    one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one")]
-    two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two")]
+    one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one"), HERE]
+    two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two"), HERE]
     subprocess.run(one, env=environment, check=True)
     subprocess.run(two, env=environment, check=True)
     ours, _ = weights.read_tensors(tmp_path / "one" / "weights.safetensors")
