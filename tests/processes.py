@@ -36,6 +36,8 @@ def _hear_interrupts() -> None:
 
 def complete(arguments, **options) -> subprocess.CompletedProcess:
     options = {"capture_output": True, "text": True, "cwd": ROOT, "timeout": 300} | options
+    if os.name == "posix":
+        options.setdefault("preexec_fn", _hear_interrupts)
     return subprocess.run([str(a) for a in arguments], env=ENVIRONMENT, check=False, **options)
 
 

@@ -1,4 +1,4 @@
-"""Versions by rule, and what a release is made of: the changelog, the recipe, the workflows, and the extras tried."""
+"""Workflows call what is there, and a release tries every extra."""
 
 import re
 import tomllib
@@ -8,8 +8,6 @@ from scripts.release import __main__ as release
 
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-# What the recipe calls otherwise, and what conda's channel lacks, where `auto` does without.
-CONDA, LACKING = {"openexr": "openexr-python"}, {"mitsuba-oidn"}
 
 
 def test_every_extra_for_users_is_tried():

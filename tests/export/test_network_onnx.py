@@ -14,6 +14,7 @@ torch = pytest.importorskip("torch")
 import onnx
 import onnxruntime
 from full_stack import full_layers
+from networks import ALL, GRAPHED, untrained
 from scipy.ndimage import uniform_filter
 
 from export.__main__ import main
@@ -22,7 +23,7 @@ from ngpt.export.vector import example_layers, quiet
 from ngpt.methods import reconstruct
 from ngpt.network import inputs
 from ngpt.network.exposure import statistics
-from ngpt.network.features import SOURCES, exposure
+from ngpt.network.features import exposure
 from ngpt.network.model import ModelConfig, Reconstructor
 from ngpt.network.run import WEIGHTS
 from ngpt.network.weights import save_weights
@@ -30,45 +31,6 @@ from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
 FAST = Path(__file__).parents[2] / "export" / "weights" / "ngpt-fast.safetensors"
-ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
-CONFIGS = {
-    "with a base": ModelConfig("dense", (4, 6), (1, 1), (*ALL, "base", "primal_se", "dx_se", "dy_se"), "wcv"),
-    "with a choice": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "denoised", *SOURCES), "wcv"), start=("base", "denoised", "denoised_base")
-    ),
-    "relative to its base": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "base", "primal_change", "dx_base", "dy_base", "dx_noise"), "wcv"),
-        start=("primal", "base"),
-    ),
-    "converging": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "base", "primal_noise", "dx_se"), "wcv"),
-        start=("primal", "base"),
-        quiet=1.0,
-    ),
-    "of a primal alone": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "primal_change", "primal_noise")), start=("primal", "denoised")
-    ),
-    "by kernels": ModelConfig(
-        *("dense", (4, 6), (1, 1), ("primal", "base", "dx_se", "primal_se"), "wcv"),
-        start=("primal", "base"),
-        quiet=1.0,
-        kernel=5,
-    ),
-    "as published": ModelConfig("dense", (4, 4, 4), (2, 1, 1), ALL),
-    "without gradients": ModelConfig("dense", (4, 4), (1, 1), ("primal", "albedo", "normal", "depth")),
-    "without features": ModelConfig("plain", (6, 8), (), ("primal", "dx", "dy")),
-    "by a pyramid of kernels": ModelConfig(
-        *("dense", (4, 6, 6), (1, 1, 1), ("primal", "albedo", "normal")),
-        start=("primal",),
-        kernel=3,
-        scales=3,
-        demodulate=True,
-    ),
-    "by a pyramid, colour alone": ModelConfig(
-        "dense", (4, 6), (1, 1), ("primal",), start=("primal",), kernel=5, scales=2
-    ),
-    "primal alone": ModelConfig("plain", (4, 4, 4, 4, 4), (), ("primal",)),
-}
 
 
 def session(model):
@@ -86,13 +48,8 @@ def fast():
 def weights(tmp_path_factory):
     """Files of untrained weights, none of which is zero."""
     folder = tmp_path_factory.mktemp("weights")
-    torch.manual_seed(0)
-    for name, config in CONFIGS.items():
-        model = Reconstructor(config)
-        with torch.no_grad():
-            for parameter in model.parameters():
-                parameter += 0.1 * torch.randn_like(parameter)
-        save_weights(folder / f"{name}.safetensors", model, {})
+    for name, config in GRAPHED.items():
+        save_weights(folder / f"{name}.safetensors", untrained(config), {})
     return folder
 
 
@@ -124,10 +81,10 @@ def assert_close(ours, theirs, tolerance=1e-4):
 
 
 # Of what others have parts of
-MORE = ("with a choice", "relative to its base", "converging", "without gradients")
+MORE = ("with a choice", "relative to its base", "converging", "halved by maxima", "halved by lines")
 
 
-@pytest.fixture(scope="module", params=[pytest.param(c, marks=pytest.mark.slow) if c in MORE else c for c in CONFIGS])
+@pytest.fixture(scope="module", params=[pytest.param(n, marks=pytest.mark.slow) if n in MORE else n for n in GRAPHED])
 def pair(request, weights):
     """A file of weights and its ONNX session."""
     path = weights / f"{request.param}.safetensors"

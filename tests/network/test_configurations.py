@@ -8,7 +8,6 @@ from ngpt.network.model import ModelConfig
 from ngpt.network.oidnet import SHAPES
 from ngpt.training.augment import Augmentation
 
-ALL = ("primal", "dx", "dy", "albedo", "normal", "depth")
 DENSE = {"network": "dense", "channels": (4,), "units": (1,), "inputs": ("primal",)}
 PLAIN = {"network": "plain", "channels": (4,), "units": (), "inputs": ("primal",)}
 OF_KERNELS = PLAIN | {"channels": (6, 6, 6), "inputs": ("primal", "albedo")} | PYRAMID
