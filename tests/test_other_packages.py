@@ -187,17 +187,6 @@ def test_a_package_that_is_broken_costs_one_line_and_nothing_else(site, stack_fi
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_broken_verbs_cost_one_line(site, capsys):
-    (site / "brokenverbs.py").write_text("import nosuchmodule")
-    install(site, "broken-verbs", {"ngpt.verbs": {"more": "brokenverbs:VERBS"}})
-    with pytest.raises(SystemExit, match="0"):
-        main(["--help"])
-    output = capsys.readouterr()
-    assert "denoise" in output.out
-    (line,) = output.err.splitlines()
-    assert line.startswith("ngpt: ngpt.verbs: 'more' of the package 'broken-verbs' cannot be imported: ModuleNotFound")
-
-
 def test_names_of_ours_are_refused(site, capsys):
     (site / "own.py").write_text(
         "from ngpt.methods import METHODS\nfrom ngpt.measure.metrics import METRICS\n"

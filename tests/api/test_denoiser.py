@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import get_overloads
@@ -210,19 +209,6 @@ def test_the_previous_frame_is_taken_as_it_was_given(shot):
         assert mse(result, truth[1]) < 0.95 * mse(second, truth[1])
 
 
-def test_channels_of_a_bitmap_may_be_flow_and_previous_frame(renderer, shot):
-    stacks, _ = shot
-    first, second = frames(stacks[:2], over_time())
-    names = [*"RGB", *(f"albedo.{c}" for c in "RGB"), "flow.X", "flow.Y", *(f"last.{c}" for c in "RGB")]
-    denoiser, made = over_time(), []
-    for stack, last in zip(stacks[:2], (stacks[0]["primal"], first), strict=True):
-        pixels = np.concatenate([stack["primal"], stack["albedo"], -stack["motion"], last], axis=-1)
-        bitmap = renderer.Bitmap(pixels, channel_names=names)
-        result = denoiser(bitmap, "albedo", flow_ch="flow", previous_denoised_ch="last", primal_var=stack["primal_var"])
-        made.append(np.array(result))
-    assert np.array_equal(made[0], first) and np.allclose(made[1], second, atol=1e-5)
-
-
 def test_transforms_may_scale_and_not_flatten(arrays):
     denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
     arguments = [arrays[name] for name in ("noisy", "albedo", "normals")]
@@ -230,13 +216,3 @@ def test_transforms_may_scale_and_not_flatten(arrays):
     for flat in (np.diag([1, 1, 0]), np.full((3, 3), np.nan)):
         with pytest.raises(NgptError, match="to_sensor has determinant"):
             denoiser(*arguments, flat)
-
-
-@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 3.4e38])
-def test_normals_that_are_not_finite_are_repaired_in_silence(arrays, value):
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    arrays["normals"][3, 4] = value
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        result = denoiser(*(arrays[name] for name in ("noisy", "albedo", "normals")), 2 * np.eye(4))
-    assert np.isfinite(result).all()

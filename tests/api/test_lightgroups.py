@@ -87,12 +87,6 @@ def test_groups_are_found_by_the_names_of_renderers(lights, tmp_path):
         lightgroups.find(ngpt.read(own))
 
 
-def test_groups_of_another_view_layer_are_left_alone(lights, tmp_path):
-    _, noisy = lights
-    path = cycles(tmp_path / "two.exr", noisy, {"Other.Combined_Key": noisy["Key"]})
-    assert set(lightgroups.find(ngpt.read(path))) == {"ViewLayer.Combined_Key", "ViewLayer.Combined_Fill"}
-
-
 def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
     _, noisy = lights
     mist = {"ViewLayer.Mist": noisy["Key"]}

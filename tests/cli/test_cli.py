@@ -172,18 +172,6 @@ def test_render_denoise_diff(renderer, tmp_path, capsys):
     assert errors[1] < errors[0] / 3
 
 
-def test_render_for_a_given_time(renderer, tmp_path, capsys):
-    stack = str(tmp_path / "s.exr")
-    assert main(["render", "diffuse", "-o", stack, "--time", "1", "--size", "16x12", "--diagnostics", "--json"]) == 0
-    captured = capsys.readouterr()
-    assert json.loads(captured.out)["spp"] == ngpt.read(stack).attributes["ngpt:spp"] > 1
-    assert "render diffuse: 0/1 s, compiling kernels ...\n" in captured.err and "render diffuse: 1/1 s" in captured.err
-    assert main(["info", stack, "--json"]) == 0
-    report = json.loads(capsys.readouterr().out)
-    assert report["diagnostics"]["discarded"] == {"mean": 0.0, "max": 0.0, "pixels above 0": 0}
-    assert report["other channels"] == []
-
-
 def test_lines_of_progress_tell_the_time_left(capsys, monkeypatch):
     import ngpt.system.console as console
 

@@ -102,13 +102,6 @@ def test_ctrl_c_says_what_becomes_of_the_work(verb, arguments, message, capfd, m
     assert capfd.readouterr().err.endswith(f": error: {message}\n")
 
 
-def test_results_name_the_command_that_made_them(monkeypatch):
-    told, arguments = [], ["--config", "x", "--out", "a folder"]
-    monkeypatch.setattr("ngpt.cli.evaluate.run", lambda args, console: told.append(args.command) or 0)
-    assert main(["evaluate", *arguments]) == 0 == runpy.run_path("eval.py")["main"](arguments)
-    assert told == [f"{program} --config x --out 'a folder'" for program in ("ngpt evaluate", "python eval.py")]
-
-
 @pytest.mark.parametrize(
     ("lacking", "arguments", "extra"),
     [

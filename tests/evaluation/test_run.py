@@ -2,8 +2,6 @@
 
 import csv
 import json
-import shutil
-import weakref
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +12,7 @@ import ngpt
 from data_gen import service
 from eval import main as command
 from ngpt.errors import NgptError
-from ngpt.evaluation import cells, run
+from ngpt.evaluation import cells
 from ngpt.evaluation.config import read_config
 from ngpt.evaluation.run import evaluate, picture_path
 from ngpt.evaluation.stability import flicker_and_bias, rolling_shutter, study
@@ -86,25 +84,6 @@ def test_what_is_done_is_not_done_again(room, monkeypatch):
     assert evaluate(config, folder / "out", QUIET, "", service)["cells"] == first["cells"]
 
 
-def test_a_scene_goes_before_the_next_one_comes(tmp_path, rng, monkeypatch):
-    """Beside another scene, kernels of some cannot be recorded once: its samples would seem dear."""
-    alive: list[weakref.ref] = []
-
-    class Watched(run.SceneStacks):
-        def __init__(self, *args, **options):
-            assert not any(other() for other in alive)
-            super().__init__(*args, **options)
-            alive.append(weakref.ref(self))
-
-    monkeypatch.setattr(run, "SceneStacks", Watched)
-    for i in range(3):
-        write_scene(tmp_path / f"room-{i}", rng)
-    config = read(CONFIG.format(folder=tmp_path / "room-*"), tmp_path)
-    (tmp_path / "room-1" / "reference.exr").write_bytes(b"no picture")
-    evaluate(config, tmp_path / "out", QUIET, "", service)
-    assert len(alive) == 3
-
-
 def test_killed_half_way_goes_on(room, monkeypatch):
     folder, config = room
     real, calls = cells.reconstruct, []
@@ -125,15 +104,6 @@ def test_killed_half_way_goes_on(room, monkeypatch):
     assert sum(not cell["absent"] for cell in results["cells"]) == 16
     # One warm-up for each method, and the cells that were left.
     assert len(calls) - 8 == 4 + 16 - done
-
-
-def test_a_changed_stack_is_another_cell(room, rng):
-    folder, config = room
-    first = evaluate(config, folder / "out", QUIET, "", service)
-    shutil.rmtree(folder / "room")
-    write_scene(folder / "room", rng)
-    second = evaluate(config, folder / "out", QUIET, "", service)
-    assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]
 
 
 @pytest.mark.parametrize(

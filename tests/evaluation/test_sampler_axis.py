@@ -76,21 +76,6 @@ def test_tables_of_samplers_are_their_options(tmp_path):
         read_config(tmp_path / "eval.toml")
 
 
-def test_a_variant_names_its_own_sampler():
-    variants = {
-        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
-        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
-        "photons": {"method": "primal", "sampler": "ppm"},
-    }
-    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
-        "wcv (gpt)": ("wcv", "gradients gpt"),
-        "wcv (toy)": ("wcv", "gradients toy"),
-        "wcv-replayed": ("wcv", "gradients gpt-basic"),
-        "raw": ("primal", "gradients gpt"),
-        "photons": ("primal", "features ppm"),
-    }
-
-
 def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monkeypatch):
     """Any names: nobody asks the registry."""
     monkeypatch.setattr(SceneStacks, "load", lambda self: pytest.fail("asked for the renderer"))

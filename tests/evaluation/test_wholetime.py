@@ -10,7 +10,7 @@ from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.curves import REACH, error_at
 from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.wholetime import against_rivals, envelope
+from ngpt.evaluation.wholetime import against_rivals
 from ngpt.report.evaluation import write_evaluation_report
 from ngpt.system.console import Console
 
@@ -85,19 +85,6 @@ def test_means_and_counts_are_of_what_was_measured():
     assert (every["scenes"], every["less"], every["scenes FLIP"], every["less FLIP"]) == (3, 2, 2, 0)
     assert every["error"] == pytest.approx(0.7 / 2**0.5 * 4 ** (1 / 3))
     assert found["all", 16]["scenes"] == 2
-
-
-def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():
-    results = made({"ours": [(4, 0.7, 0.9)], **RIVALS}, ("a", "b"))
-    points = envelope(results, "oidn", ["a", "b"])
-    assert points[0] == pytest.approx((2, 2.0)) and points[-1] == pytest.approx((64, 0.125))
-    quick = [2 * (2 / t) ** 0.5 for t, _ in points]
-    best = [min(q, 8 / t) if t >= 16 else q for q, (t, _) in zip(quick, points, strict=True)]
-    assert [error for _, error in points] == pytest.approx(best)
-    assert envelope(made({"ours": [(4, 0.7, 0.9)]}), "oidn", ["a"]) == []
-    # A mean over one scene is no rival of means over two.
-    results["summary"] = [row for row in results["summary"] if row["scene"] == "a" or row["method"] == "ours"]
-    assert envelope(results, "oidn", ["a", "b"]) == [] != envelope(results, "oidn", ["a"])
 
 
 CONFIG = """

@@ -232,13 +232,6 @@ def test_a_result_replaces_the_layer_that_its_input_came_from(tmp_path, name, pa
         assert same_bits(stack["primal"], again["primal"])
 
 
-def test_what_is_called_noisy_stays_noisy(tmp_path):
-    before = small(*(f"V.{layer}.{c}" for layer in ("Noisy Image", "Combined") for c in "RGB"))
-    path = write(tmp_path / "b.exr", RESULT, like=read(write_raw(tmp_path / "a.exr", (before,))))
-    ((_, header, channels),) = read_raw(path)
-    assert all(same_bits(channels[name], before[name]) for name in before) and "ngpt:pass" not in header
-
-
 def test_channels_in_the_units_of_others_stay_as_they_are(tmp_path):
     before = small(*ROOT, "V.Vector.X", "V.Vector.Y", "V.Vector.Z", "V.Vector.W")
     stack = read(write_raw(tmp_path / "a.exr", (before,)))

@@ -176,21 +176,6 @@ def test_parts_of_every_kind_keep_their_names_and_order(tmp_path):
         assert header["lineOrder"] == old_header["lineOrder"]
 
 
-def test_perceptual_linearity_is_kept_and_empty_lists_are_dropped(tmp_path):
-    source = write_raw(tmp_path / "a.exr", (PIXELS,))
-    channels = {name: OpenEXR.Channel(pixels, 1, 1, name == "G") for name, pixels in PIXELS.items()}
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(source))
-    image = read_exr(source)
-    image.parts[0].header["nothing"] = []
-    header = read_raw(write_exr(tmp_path / "b.exr", image))[0][1]
-    assert {channel.name: bool(channel.pLinear) for channel in header["channels"]} == {
-        "R": False,
-        "G": True,
-        "B": False,
-    }
-    assert "nothing" not in header
-
-
 @pytest.mark.parametrize(
     ("part", "expected"),
     [

@@ -57,18 +57,6 @@ def test_a_kernel_picks_the_pixel_it_points_to():
         assert torch.allclose(signed_exp(head.forward(prediction, [diffuse, specular, albedo])), expected, rtol=1e-4)
 
 
-def test_texture_of_the_albedo_stays():
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small()))
-    layers = random_layers()
-    albedo = 0.05 + 0.9 * torch.rand(1, 3, 24, 30)
-    light = 3 * (albedo + EPSILON)
-    nothing = torch.zeros_like(light)
-    with torch.no_grad():
-        result = model(layers | {"primal": light, "diffuse": light, "specular": nothing, "albedo": albedo})
-    assert torch.allclose(result, light, rtol=1e-4)
-
-
 @pytest.mark.parametrize(("part", "other"), [("diffuse", "specular"), ("specular", "diffuse")])
 def test_a_network_reads_its_own_part_alone(part, other):
     torch.manual_seed(0)

@@ -4,7 +4,7 @@ import io
 
 import numpy as np
 import pytest
-from errormap import error_map, relative_squared_error
+from errormap import error_map
 
 from ngpt.report import display
 from ngpt.report.png import encode_png
@@ -52,11 +52,6 @@ def test_auto_exposure_brings_the_average_to_middle_grey():
         assert display.auto_exposure(gain * image) == pytest.approx(stops - np.log2(gain))
 
 
-@pytest.mark.parametrize("value", [0.0, -1.0, np.nan, np.inf])
-def test_auto_exposure_of_nothing_visible_is_zero(value):
-    assert display.auto_exposure(constant(value, value, value)) == 0.0
-
-
 def test_error_map_runs_from_one_percent_to_all():
     reference = constant(0.18, 0.18, 0.18).astype(np.float64)  # whose automatic exposure is 0
     root = np.sqrt(0.18**2 + display.ERROR_EPSILON)
@@ -65,13 +60,6 @@ def test_error_map_runs_from_one_percent_to_all():
         colour = error_map(reference + error * root, reference)[0, 0]
         assert np.abs(colour.astype(int) - table[index]).max() <= 3, error
     assert tuple(error_map(reference * np.nan, reference)[0, 0]) == display.MAGENTA
-
-
-def test_error_map_does_not_depend_on_the_unit_of_radiance():
-    image, reference = np.random.default_rng(0).gamma(2.0, 0.3, (2, 8, 8, 3))
-    error = relative_squared_error(image, reference)
-    for gain in (2.0**-20, 2.0**20):
-        np.testing.assert_allclose(relative_squared_error(gain * image, gain * reference), error)
 
 
 def test_heat_table_grows_lighter_all_the_way():
