@@ -8,7 +8,7 @@ from folders import read, write_scene
 
 from data_gen import service
 from ngpt.errors import NgptError
-from ngpt.evaluation.curves import REACH, error_at
+from ngpt.evaluation.curves import REACH, error_at, first_at
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.wholetime import against_rivals
 from ngpt.report.evaluation import write_evaluation_report
@@ -169,3 +169,16 @@ def test_a_configuration_may_build_on_another(tmp_path):
     (tmp_path / "main.toml").write_text('base = "config.toml"\n')
     with pytest.raises(NgptError, match=r"main\.toml: base = 'config\.toml': .* which is not built on this one"):
         read('base = "main.toml"\n', tmp_path)
+
+
+def test_two_renders_of_nearly_the_same_time_say_little_of_later_ones():
+    """Short renders take what recording takes: the slope between them is no law, outside it is at most 1/x."""
+    points = [(1.0, 1.0), (1.01, 0.5)]
+    assert error_at(2.02, points) == (pytest.approx(0.25), "~") and error_at(0.5, points) == (pytest.approx(2), "~")
+    assert first_at(0.25, points) == (pytest.approx(2.02), "~")
+
+
+def test_who_has_more_time_could_have_taken_less():
+    """A point that noise put above the one before counts as that; beyond it, the slope that fell goes on."""
+    points = [(1, 1.0), (4, 0.25), (16, 0.5)]
+    assert error_at(8, points) == (pytest.approx(0.25), "") and error_at(32, points) == (pytest.approx(0.125), "~")

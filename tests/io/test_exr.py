@@ -316,3 +316,11 @@ def test_layers_in_parts_of_other_size_or_place_are_refused(tmp_path):
     )
     with pytest.raises(NgptError, match=r"b\.exr: layer 'normal' is 4x4 but 'primal' is 3x2"):
         read(path)
+
+
+def test_uint_channels_are_read_as_numbers(tmp_path):
+    channels = {name: np.array([[0, 7, 2**24]], np.uint32) for name in ROOT}
+    stack = read(write_raw(tmp_path / "a.exr", (channels,)))
+    assert np.array_equal(stack["primal"][0, :, 1], [0, 7, 2**24])
+    written = read_raw(write(tmp_path / "b.exr", stack["primal"], like=stack))[0][2]
+    assert written["R"].dtype == np.float32 and written["primal.R"].dtype == np.uint32
