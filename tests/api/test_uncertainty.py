@@ -137,3 +137,11 @@ def test_the_command_takes_halves(stack, tmp_path, rng):
     expected = ngpt.reconstruct_with_error(stack, "wcv", halves=(ngpt.read(a), ngpt.read(b)))
     assert np.allclose(ngpt.read(tmp_path / "out.exr")["error"], expected.error, rtol=1e-5)
     assert main([*command[:2], a, b, *command[2:], "-o", str(tmp_path)]) == 2
+
+
+def test_it_says_how_far_the_truth_is(stack):
+    """Of a method that removes noise, on a flat image, where there is no bias: never too little."""
+    result = ngpt.reconstruct_with_error(stack, "wcv")
+    within = np.mean(np.abs(result.image - 1) <= result.error)
+    assert 0.6 < within < 0.95
+    assert np.mean(result.error) < 0.5 * np.mean(np.sqrt(stack["primal_var"]))

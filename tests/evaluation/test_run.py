@@ -2,6 +2,7 @@
 
 import csv
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -220,3 +221,12 @@ def test_the_tiny_configuration(renderer, tmp_path):
         evaluate(config, tmp_path, QUIET, "", service)["cells"] == results["cells"]
         and stack.stat().st_mtime_ns == stamp
     )
+
+
+def test_a_changed_stack_is_another_cell(room, rng):
+    folder, config = room
+    first = evaluate(config, folder / "out", QUIET, "", service)
+    shutil.rmtree(folder / "room")
+    write_scene(folder / "room", rng)
+    second = evaluate(config, folder / "out", QUIET, "", service)
+    assert first["cells"][0]["metrics"] != second["cells"][0]["metrics"]

@@ -168,3 +168,18 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     # Another clock: the nominal samples are those of gpt-basic, of which gpt has more.
     slow = evaluate(read(SETTINGS + 'clock = "gpt-basic"\n', tmp_path), out, QUIET, "", service)
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
+
+
+def test_a_variant_names_its_own_sampler():
+    variants = {
+        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
+        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
+        "photons": {"method": "primal", "sampler": "ppm"},
+    }
+    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
+        "wcv (gpt)": ("wcv", "gradients gpt"),
+        "wcv (toy)": ("wcv", "gradients toy"),
+        "wcv-replayed": ("wcv", "gradients gpt-basic"),
+        "raw": ("primal", "gradients gpt"),
+        "photons": ("primal", "features ppm"),
+    }

@@ -10,7 +10,7 @@ from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.curves import REACH, error_at, first_at
 from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.wholetime import against_rivals
+from ngpt.evaluation.wholetime import against_rivals, envelope
 from ngpt.report.evaluation import write_evaluation_report
 from ngpt.system.console import Console
 
@@ -182,3 +182,16 @@ def test_who_has_more_time_could_have_taken_less():
     """A point that noise put above the one before counts as that; beyond it, the slope that fell goes on."""
     points = [(1, 1.0), (4, 0.25), (16, 0.5)]
     assert error_at(8, points) == (pytest.approx(0.25), "") and error_at(32, points) == (pytest.approx(0.125), "~")
+
+
+def test_an_envelope_goes_from_the_quickest_to_the_slowest_setting():
+    results = made({"ours": [(4, 0.7, 0.9)], **RIVALS}, ("a", "b"))
+    points = envelope(results, "oidn", ["a", "b"])
+    assert points[0] == pytest.approx((2, 2.0)) and points[-1] == pytest.approx((64, 0.125))
+    quick = [2 * (2 / t) ** 0.5 for t, _ in points]
+    best = [min(q, 8 / t) if t >= 16 else q for q, (t, _) in zip(quick, points, strict=True)]
+    assert [error for _, error in points] == pytest.approx(best)
+    assert envelope(made({"ours": [(4, 0.7, 0.9)]}), "oidn", ["a"]) == []
+    # A mean over one scene is no rival of means over two.
+    results["summary"] = [row for row in results["summary"] if row["scene"] == "a" or row["method"] == "ours"]
+    assert envelope(results, "oidn", ["a", "b"]) == [] != envelope(results, "oidn", ["a"])

@@ -11,7 +11,7 @@ import ngpt
 from data_gen import service
 from ngpt.evaluation.curves import REACH, first_at
 from ngpt.evaluation.run import evaluate
-from ngpt.evaluation.worth import worth_of_gradients
+from ngpt.evaluation.worth import worth_of_gradients, worth_tables
 from ngpt.evaluation.worthplots import block_errors, block_size
 from ngpt.report.evaluation import write_evaluation_report
 from ngpt.stack import GradientStack
@@ -170,3 +170,20 @@ def test_blocks_sum_the_error_and_halves_take_its_noise_off(rng):
     one, two = (block_errors(image, *reference, block=8)[1:, :4].mean() for reference in (halves[:1], halves))
     assert one == pytest.approx(48 * 0.1**2, rel=0.2) and abs(two) < 0.2 * one
     assert block_size(100) == 8 and block_size(1280) == 32
+
+
+def test_means_over_scenes_are_geometric_and_carry_marks(room):
+    folder, text = room
+    results = evaluate(read(text, folder), folder / "out", QUIET, "", service)
+    results["settings"]["groups"] = {"rooms": ["b", "c"]}
+    row = {"spp": 4, "method": "ours", "sampler": "gpt", "best": True, "error": 1.0, "rival": "primal", "C": 2.0}
+    rows = [row | {"scene": s, "W": w, "W/C": w / 2, "mark": m} for s, w, m in (("a", 1.0, ""), ("b", 4.0, ">"))]
+    from ngpt.evaluation.worth import _means
+
+    one, best = [mean for mean in _means(results, rows) if mean["method"] is None]
+    assert (one["group"], one["scenes"], one["W"]) == ("rooms", 1, pytest.approx(4.0))
+    assert (best["group"], best["scenes"], best["mark"]) == ("all", 2, ">")
+    assert (best["W"], best["C"], best["W/C"]) == pytest.approx((2.0, 2.0, 1.0))
+    results["worth"] = {"rows": rows, "means": _means(results, rows)}
+    table = next(iter(worth_tables(results).values()))
+    assert table[2][:5] == ["all (2)", "4", ">2.00", "2.00", ">1.00"]

@@ -4,10 +4,12 @@ Not run there: run here, with what they lack taken away (``lesser_system``).
 """
 
 import ast
+import ctypes
 import os
 import shutil
 import subprocess
 import sys
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ from full_stack import full_stack
 from processes import ENVIRONMENT, ROOT, one_error, temporary_files
 
 import ngpt
-from ngpt.system import files
+from ngpt.system import files, limits
 
 POSIX = {"crypt", "fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty"}
 
@@ -129,3 +131,17 @@ def test_old_temporary_files_are_swept_where_none_can_be_locked(tmp_path, monkey
     with files.atomic_output(tmp_path / "a.txt") as temporary:
         temporary.write_text("done")
     assert sorted(os.listdir(tmp_path)) == [young.name, "a.txt"]
+
+
+def test_memory_where_only_windows_tells(monkeypatch):
+    monkeypatch.delattr(os, "sysconf")
+    monkeypatch.setattr(limits, "resource", None)
+    assert limits.memory() == limits._ASSUMED
+
+    def installed(pointer):
+        pointer._obj.value = 3 * 2**20
+        return 1
+
+    kernel = SimpleNamespace(GetPhysicallyInstalledSystemMemory=installed)
+    monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
+    assert limits.memory() == 3 * 2**30

@@ -366,3 +366,26 @@ def test_autocast_does_not_reach_the_features():
     with torch.autocast("cpu", torch.bfloat16):
         inside = distance(a, near)
     assert inside == distance(a, near)
+
+
+def test_draws_are_stratified_over_the_batch():
+    for transform in draws(50, batch=12):
+        assert np.bincount(transform.flip, minlength=4).tolist() == [3, 3, 3, 3]
+        assert all(
+            sorted(((column - 0.2) / 0.8 * 12).int().tolist()) == list(range(12)) for column in transform.factor.T
+        )
+        counts = np.unique(transform.order.numpy(), axis=0, return_counts=True)[1]
+        assert counts.tolist() == [2] * 6
+
+
+def test_of_errors_of_one_size_the_pyramid_sees_the_wide_ones():
+    """A patch that is off counts as much at every resolution; a checkerboard of the same error only at the finest."""
+    target = torch.full((1, 3, 64, 64), 0.2)
+    y, x = torch.meshgrid(torch.arange(64), torch.arange(64), indexing="ij")
+    sign = 1 - 2.0 * ((x + y) % 2)
+    fine, wide = (pixelwise.pyramid(target + 0.01 * s, target).item() for s in (sign, torch.ones_like(sign)))
+    assert pixelwise.pyramid(target, target).item() == 0
+    assert fine == pytest.approx(wide / 4, rel=0.1)
+    assert pixelwise.l1(target + 0.01 * sign, target).item() == pytest.approx(
+        pixelwise.l1(target + 0.01, target).item(), rel=0.1
+    )

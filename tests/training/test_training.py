@@ -5,6 +5,7 @@ import os
 import subprocess
 import sys
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -374,3 +375,10 @@ def test_weights_do_not_tell_where_things_lie(tmp_path):
     values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
     told = published(from_dict(values, "test"))
     assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
+
+
+def test_the_cosine_schedule():
+    s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
+    rates = [learning_rate(s, i, 110) for i in range(110)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
+    assert all(a >= b for a, b in pairwise(rates[10:]))
