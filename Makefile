@@ -2,27 +2,25 @@
 
 PY = .venv/bin/python
 
-.PHONY: demo quick test test-slow reliability check docs wheel release bench setup-demo setup-dev setup-test setup-quick setup-docs
+.PHONY: demo quick test test-slow campaigns check docs wheel release bench setup-demo setup-dev setup-test setup-quick setup-docs
 
 demo: setup-demo
 	$(PY) -m ngpt demo -o demo --force
 
-# Less than a minute: files, classical methods, denoisers, metrics, losses, docs; little that renders, runs a network or a browser.
+WORKERS = -n auto --maxprocesses 4 --dist worksteal
+
+# Less than a minute: all that needs no renderer, browser, compiler, training or processes of its own. See tests/conftest.py.
 quick: setup-quick
-	$(PY) -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "not slow" \
-		-k "not memory_per_pixel and not half_a_percent" --ignore tests/report/test_report.py \
-		--ignore tests/report/test_report_looks.py --ignore tests/report/test_notebook.py --ignore tests/test_what_auto_takes.py \
-		tests/io tests/classical tests/denoisers tests/measure tests/report tests/system tests/network/test_unet.py \
-		tests/training/test_augment.py tests/training/test_losses.py tests/test_*.py
+	$(PY) -m pytest -q $(WORKERS) -m quick
 
 test: setup-test
-	$(PY) -m pytest -q -n auto --maxprocesses 4 --dist loadfile -m "not slow"
+	$(PY) -m pytest -q $(WORKERS) -m "not slow"
 
 test-slow: setup-test
-	$(PY) -m pytest -q -m slow
+	$(PY) -m pytest -q -m slow --ignore tests/campaigns
 
-# The campaigns against bad inputs, kills and long runs, and the page of what came out (an hour or several).
-reliability: setup-test
+# Bad inputs, kills, full disks and long runs in their long form, and the page of what came out (an hour or several).
+campaigns: setup-test
 	$(PY) scripts/reliability.py
 
 check: setup-dev docs

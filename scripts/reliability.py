@@ -1,6 +1,6 @@
 """docs/lab/RELIABILITY.md: runs the campaigns, which leave a JSON file each, and writes the page of what came out.
 
-python scripts/reliability.py                 what `make reliability` runs: all campaigns, then the page
+python scripts/reliability.py                 what `make campaigns` runs: all campaigns, then the page
 python scripts/reliability.py --from DIR      only the page, of the files in DIR
 python scripts/reliability.py -k "kill or disk"    some of the campaigns, as pytest chooses them, then the page of them
 """
@@ -18,13 +18,14 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+CAMPAIGNS = ("tests/campaigns", "tests/data_gen/test_stress.py")
 PAGE = ROOT / "docs" / "lab" / "RELIABILITY.md"
 
 HEAD = """\
 # Reliability
 
 What was tried against ngpt, how many times, and what came out: {tried} trials in {campaigns} campaigns, {date}, those
-of `make reliability`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
+of `make campaigns`. Every outcome in the table is one that is allowed: a campaign in which anything else comes out (a
 crash, a hang, a traceback, a file half-written under its final name, memory that grows) fails its test, and has no row.
 {failure}
 | campaign | tried | what came out | worst | seconds |
@@ -43,8 +44,8 @@ Versions: {versions}.
 
 
 def run_campaigns(folder: Path, chosen: str | None) -> int:
-    """Runs the slow tests, of which the campaigns are part; the exit status of pytest."""
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow"] + (["-k", chosen] if chosen else [])
+    """Runs the long form of all campaigns; the exit status of pytest."""
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "slow", *CAMPAIGNS] + (["-k", chosen] if chosen else [])
     return subprocess.run(command, cwd=ROOT, env=os.environ | {"NGPT_RELIABILITY": str(folder)}, check=False).returncode
 
 

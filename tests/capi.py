@@ -1,15 +1,18 @@
 """The C library for tests: built by CMake, and called by ctypes with arrays (H, W, C) of any strides and of halves."""
 
 import ctypes
+import hashlib
 import os
 import shutil
 import subprocess
 import sys
 from ctypes import CFUNCTYPE, c_char_p, c_double, c_int, c_size_t, c_ssize_t, c_void_p
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
+from filelock import FileLock
 
 import ngpt
 
@@ -43,6 +46,16 @@ def headers() -> Path:
         if any((folder / name / "onnxruntime_cxx_api.h").exists() for name in ("include", "include/onnxruntime")):
             return folder
     return pytest.skip(f"ONNX Runtime's C++ headers are not in {root}/include: python scripts/headers.py fetches some")
+
+
+@cache
+def built() -> Path:
+    """The prefix of the library, which is built once for all processes and runs of a checkout."""
+    runtime, name = headers(), hashlib.sha256(str(SOURCE).encode()).hexdigest()[:12]
+    folder = SOURCE.parents[1] / "build" / f"capi-{name}"
+    folder.mkdir(parents=True, exist_ok=True)
+    with FileLock(folder / "lock"):
+        return install(runtime, folder)
 
 
 def install(runtime, folder, *options) -> Path:

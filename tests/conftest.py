@@ -5,6 +5,7 @@ import signal
 
 import numpy as np
 import pytest
+from browser import Session, browser_command
 from skips import allowed
 
 from ngpt.classical.gradients import forward_differences
@@ -29,6 +30,27 @@ def pytest_runtest_makereport(item, call):
 @pytest.hookimpl(wrapper=True)
 def pytest_make_collect_report(collector):
     return strictly((yield))
+
+
+# A fixture -> the marker of all tests that stand on it.
+MARKERS = {"renderer": "renders", "chromium": "browser", "toolchain": "hosts", "one_thread": "trains"}
+# Names that a test calls where it starts programs.
+PROGRAMS = {"subprocess", "complete", "start", "shell", "in_a_child"}
+
+
+def pytest_collection_modifyitems(items):
+    """Marks tests by what they use; `quick` are those that use nothing that takes its time."""
+    for item in items:
+        found = {MARKERS[fixture] for fixture in MARKERS.keys() & set(item.fixturenames)}
+        code = getattr(getattr(item, "function", None), "__code__", None)
+        if "campaigns" in item.path.parts or (code and PROGRAMS & set(code.co_names)):
+            found.add("processes")
+        if not found and not item.get_closest_marker("slow"):
+            found.add("quick")
+        for marker in sorted(found):
+            item.add_marker(marker)
+    # What is built goes first, so that it is built beside the rest where tests run in several processes.
+    items.sort(key=lambda item: not item.get_closest_marker("hosts"))
 
 
 @pytest.fixture
@@ -63,6 +85,37 @@ def handlers_of_signals_stay():
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
     yield
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.fixture(scope="session")
+def chromium(tmp_path_factory):
+    """The command of a headless browser; tests of pages skip where there is none."""
+    return browser_command(tmp_path_factory.mktemp("profile"))
+
+
+@pytest.fixture
+def browser(chromium, tmp_path):
+    """Opens a page at an address; in the end it is closed, and must have had nothing to complain of."""
+    sessions = []
+
+    def open_page(url):
+        sessions.append(Session(tmp_path / f"profile{len(sessions)}", url))
+        return sessions[-1]
+
+    yield open_page
+    for session in sessions:
+        session.close()
+    assert [complaint for session in sessions for complaint in session.complaints] == []
+
+
+@pytest.fixture(scope="session")
+def toolchain():
+    """Where ONNX Runtime's headers are: what compiles the C library skips where they, or CMake, are not to be had."""
+    from capi import headers, tool
+
+    tool("cmake")
+    tool("g++", "clang++")
+    return headers()
 
 
 @pytest.fixture(scope="session")

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from capi import headers, install
+from capi import built
 
 HOSTS = Path(__file__).parents[1] / "export" / "hosts"
 LIBRARY = HOSTS.parent / "capi"
@@ -87,7 +87,7 @@ def compiled(source: str, folder: Path, *flags: str) -> list[str]:
     compiler = shutil.which("g++") or shutil.which("clang++")
     if compiler is None:
         pytest.skip("neither g++ nor clang++ is installed")
-    prefix = install(headers(), folder)
+    prefix = built()
     program = folder / Path(source).stem
     command = [compiler, "-std=c++17", "-O1", "-Wall", "-Wextra", "-Werror", HOSTS / "cpp" / source, "-o", program]
     command += [f"-I{prefix}/include", f"-L{prefix}/lib", f"-Wl,-rpath,{prefix}/lib", "-lngpt", *flags]

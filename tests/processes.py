@@ -20,6 +20,9 @@ ROOT = Path(__file__).parents[1]
 ENVIRONMENT = os.environ | {"PYTHONPATH": str(ROOT), "OMP_NUM_THREADS": "1", "PYTHONDONTWRITEBYTECODE": "1"}
 
 
+SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM}
+
+
 def start(arguments, **options) -> subprocess.Popen:
     """A process at the root of the project, its errors in a pipe; it hears Ctrl-C even if we run where nobody does."""
     options = {"stdout": subprocess.DEVNULL, "stderr": subprocess.PIPE, "text": True, "cwd": ROOT} | options
@@ -33,7 +36,14 @@ def _hear_interrupts() -> None:
 
 def complete(arguments, **options) -> subprocess.CompletedProcess:
     options = {"capture_output": True, "text": True, "cwd": ROOT, "timeout": 300} | options
+    if os.name == "posix":
+        options.setdefault("preexec_fn", _hear_interrupts)
     return subprocess.run([str(a) for a in arguments], env=ENVIRONMENT, check=False, **options)
+
+
+def shell(line, *arguments):
+    """Runs a line of shell in which "$@" is a command."""
+    return complete(["bash", "-c", f"set -o pipefail; {line}", "bash", *arguments])
 
 
 needs_forks = pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")

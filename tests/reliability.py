@@ -7,7 +7,14 @@ import re
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
+import pytest
+
 _PACKAGES = ("ngpt-recon", "numpy", "OpenEXR", "onnxruntime", "safetensors", "torch", "mitsuba", "hypothesis")
+
+
+def at_length(*values):
+    """A parameter of the long form of a campaign, which `make campaigns` runs; the others belong to `make test`."""
+    return pytest.param(*values, marks=[pytest.mark.slow, pytest.mark.timeout(7200)])
 
 
 def record(campaign: str, tried: int, outcomes: dict[str, int], **more) -> Path | None:

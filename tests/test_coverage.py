@@ -75,13 +75,6 @@ def test_every_way_in_knows_alpha(tmp_path):
         assert not image[empty].any() and image[~empty].any()
 
 
-def test_alpha_that_is_denoised_itself_bounds_nothing():
-    stack = film("disc")
-    rgba = np.concatenate([stack["primal"], stack["alpha"]], axis=-1)
-    image = ngpt.Denoiser((SIZE, SIZE), denoise_alpha=True, method="nfor")(rgba)
-    assert image[~SHAPES["disc"]][:, :3].any() and image[~SHAPES["disc"]][:, 3].any()
-
-
 def test_light_at_alpha_zero_stays_with_the_darkness_among_it():
     stack = film("disc")
     fire = np.zeros((SIZE, SIZE), bool)

@@ -8,13 +8,11 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
+from verbs import parser_of
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("export/**/*.md")])
 PAGES = [page for page in PAGES if "node_modules" not in page.parts]
-PICTURES = sorted(path for path in ROOT.glob("docs/images/*") if path.suffix in (".png", ".jpg", ".svg", ".webp"))
-# Made by commands, which wrap no lines.
-GENERATED = re.compile(r"RELIABILITY\.md$|RESULTS\.md$")
 
 
 def name(page):
@@ -60,15 +58,6 @@ def test_commands_exist(page, capsys):
     verbs = set(re.findall(r"^ {2,4}([a-z]+)(?: {2}|$)", capsys.readouterr().out, re.M))
     for verb in re.findall(r"(?:`|^ {4})ngpt ([a-z]+)", text, re.M):
         assert verb in verbs, f"ngpt {verb}"
-
-
-def parser_of(verb):
-    """The real parser of a verb, which refuses a line by leaving with status 2."""
-    from ngpt.cli import _filled, _Parser, all_verbs
-
-    verbs = all_verbs()
-    assert verb in verbs, f"ngpt {verb}"
-    return _filled(_Parser(prog=f"ngpt {verb}"), verb, verbs[verb])
 
 
 def unknown_options(line):
@@ -130,23 +119,6 @@ def test_configurations_exist(page):
         assert list(ROOT.glob(f"configs/{config}*.toml")), config
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if not GENERATED.search(page.name)], ids=name)
-def test_prose_keeps_to_120_columns(page):
-    fenced = False
-    for number, line in enumerate(page.read_text().splitlines(), 1):
-        if line.startswith("```"):
-            fenced = not fenced
-        code = fenced or line.startswith("    ")
-        assert code or line.lstrip().startswith("|") or len(line) <= 120, f"{name(page)}:{number}: {len(line)} columns"
-
-
-def test_pictures_are_small_and_used():
-    text = "".join(page.read_text() for page in PAGES)
-    sizes = {path.name: path.stat().st_size for path in PICTURES}
-    assert max(sizes.values()) < 700_000 and sum(sizes.values()) < 2_000_000, sizes
-    assert [picture for picture in sizes if f"images/{picture}" not in text] == []
-
-
 def test_the_tables_of_the_main_evaluation_are_those_of_its_file():
     """`python -m bench.pages` writes them."""
     from bench.pages import RESULT, blocks, marks
@@ -174,17 +146,6 @@ def test_the_numbers_of_the_readme_are_in_the_results():
         assert number in results or number in measured, number
     for pair in re.findall(r"\b\d+ of \d+\b", readme):
         assert pair in results, pair
-
-
-def test_papers_are_those_of_the_bibliography():
-    """Keys of papers.md are entries of references.bib, and the other way round; CITATION.cff names no other papers."""
-    bib = (ROOT / "docs" / "references.bib").read_text()
-    titles = dict(re.findall(r"^@\w+\{(\w+),.*?^ +title += \{\{(.+?)\}\},$", bib, re.M | re.S))
-    cited = re.findall(r"`([a-z]+\d{4}[a-z]+)`", (ROOT / "docs" / "papers.md").read_text())
-    assert set(cited) == set(titles) and len(titles) == bib.count("\n@")
-    named = re.findall(r'^ +title: "(.+)"$', (ROOT / "CITATION.cff").read_text(), re.M)
-    assert set(named) <= set(titles.values()) and len(named) == len(set(named)) > 20
-    assert set(list(titles.values())[:5]) <= set(named)  # the five come first
 
 
 def test_the_example_of_a_renderer_runs(tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 import pytest
-from test_docs import parser_of
+from verbs import parser_of
 
 # It may be installed in an environment that is not in the path.
 OPENJD = shutil.which("openjd") or shutil.which("openjd", path=Path(sys.executable).parent)

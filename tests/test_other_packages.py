@@ -97,26 +97,6 @@ def test_the_metric_of_the_page(site, stack_file, capsys):
     assert re.search(r"^bias +0$", capsys.readouterr().out, re.M)
 
 
-def test_the_page_of_methods_says_what_to_write_into_ngpt():
-    """Its third block of Python, with what the module has."""
-    from types import ModuleType
-
-    from ngpt.methods import Method
-    from ngpt.options import Option
-
-    first, third, _ = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["method"]).read_text(), re.S)
-    module = ModuleType("ngpt.denoisers.median")
-    exec(first, module.__dict__)
-    made = {"Method": Method, "Option": Option}
-    sys.modules[module.__name__] = module
-    try:
-        exec(third, made)
-    finally:
-        del sys.modules[module.__name__]
-    assert made["_OURS"]["median"] == module.METHOD or made["_OURS"]["median"].run is module.median
-    assert "_OURS = {" in (ROOT / "ngpt" / "methods.py").read_text()
-
-
 def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
     """It is random replay, to the last bit."""
     install_page(site, PAGES["sampler"])
@@ -131,15 +111,6 @@ def test_the_sampler_of_the_page(renderer, site, tmp_path, capsys):
     before = code("replay")
     (site / "ngpt_replay" / "replay.py").write_text("changed = 1\n")
     assert code("replay") != before
-
-
-def test_the_page_of_samplers_says_what_to_write_into_ngpt(monkeypatch):
-    from data_gen import samplers
-
-    *_, entry = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["sampler"]).read_text(), re.S)
-    monkeypatch.delitem(samplers.SAMPLERS, "replay", raising=False)
-    exec(entry, {})
-    assert samplers.SAMPLERS.pop("replay").module == "data_gen.samplers.teaching.replay"
 
 
 @pytest.mark.parametrize("changes", [["loss.squared=0.5"], ["loss.kind=squared", "loss.relative=0", "loss.gradient=0"]])
@@ -182,14 +153,6 @@ def test_wrong_weights_of_a_loss_are_refused(site, changes, complaint):
         make_loss({"kind": "l1"} | changes)(torch.ones(2, 3, 16, 16), torch.ones(2, 3, 16, 16), torch.Generator())
 
 
-def test_the_losses_of_the_page_are_called_as_it_says():
-    pytest.importorskip("torch")
-    *_, example = re.findall(r"```python\n(.*?)```", (ROOT / PAGES["loss"]).read_text(), re.S)
-    made: dict = {}
-    exec(example, made)
-    assert made["prediction"].grad is not None and {"perceptual", "relative"} <= made["parts"].keys()
-
-
 FAULTS = {
     "nowhere": ("nowhere.module:X", ""),  # its package is not there any more
     "broken": ("broken:METHOD", "raise RuntimeError('no\\nGPU')"),
@@ -224,17 +187,6 @@ def test_a_package_that_is_broken_costs_one_line_and_nothing_else(site, stack_fi
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
-def test_broken_verbs_cost_one_line(site, capsys):
-    (site / "brokenverbs.py").write_text("import nosuchmodule")
-    install(site, "broken-verbs", {"ngpt.verbs": {"more": "brokenverbs:VERBS"}})
-    with pytest.raises(SystemExit, match="0"):
-        main(["--help"])
-    output = capsys.readouterr()
-    assert "denoise" in output.out
-    (line,) = output.err.splitlines()
-    assert line.startswith("ngpt: ngpt.verbs: 'more' of the package 'broken-verbs' cannot be imported: ModuleNotFound")
-
-
 def test_names_of_ours_are_refused(site, capsys):
     (site / "own.py").write_text(
         "from ngpt.methods import METHODS\nfrom ngpt.measure.metrics import METRICS\n"
@@ -251,13 +203,6 @@ def test_names_of_ours_are_refused(site, capsys):
     for name in ("wcv", "auto", "relMSE", "gpt", "restir"):
         assert f"'{name}' of the package 'own' is left out: ngpt has a" in told
     assert "Traceback" not in told and len(told.splitlines()) == 5
-
-
-def test_two_packages_with_one_name_are_named(site, stack_file):
-    install_page(site, PAGES["method"])
-    install(site, "rival", {"ngpt.methods": {"median": "ngpt_median:METHOD"}})
-    with pytest.raises(NgptError, match=r"method 'median': the packages '.*' and '.*' both bring one"):
-        ngpt.denoise(ngpt.read(stack_file), "median")
 
 
 def test_a_method_of_ours_is_found_without_a_look_at_other_packages(site, stack_file, tmp_path):

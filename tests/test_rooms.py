@@ -144,10 +144,3 @@ def test_a_wrong_import_is_found(name, target, complaint):
     assert target not in graph[name]
     graph[name] = graph[name] | {target}
     assert any(complaint in line for line in faults(graph))
-
-
-def test_late_imports_count(tmp_path):
-    (tmp_path / "ngpt").mkdir()
-    (tmp_path / "ngpt" / "late.py").write_text("def f():\n    from ngpt import methods\n    import ngpt.stack\n")
-    known = {"ngpt": None, "ngpt.late": None, "ngpt.methods": None, "ngpt.stack": None}
-    assert imports("ngpt.late", tmp_path / "ngpt/late.py", known) == {"ngpt.methods", "ngpt.stack"}

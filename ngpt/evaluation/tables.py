@@ -301,4 +301,4 @@ def _absences(results: dict[str, Any]) -> list[str]:
             reasons[cell["absent"]] = [f"`{cell['method']}` on {cell['scene']}, {cell['spp']} spp"]
     if not reasons:
         return []
-    return ["Absent:", "", *(f"- {', '.join(whats)}: {why}" for why, whats in reasons.items()), ""]
+    return ["Absent:", "", *(f"- {', '.join(names)}: {why}" for why, names in reasons.items()), ""]

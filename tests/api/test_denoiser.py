@@ -2,7 +2,6 @@
 
 import ast
 import inspect
-import warnings
 from importlib.util import find_spec
 from pathlib import Path
 from typing import get_overloads
@@ -51,40 +50,6 @@ def test_a_noisy_image_alone(arrays):
     assert np.array_equal(identity(arrays["noisy"]), arrays["noisy"])
     denoised = ngpt.Denoiser((26, 18))(arrays["noisy"])
     assert denoised.shape == arrays["noisy"].shape and not np.array_equal(denoised, arrays["noisy"])
-
-
-def test_methods_and_their_options(arrays):
-    gradients = {name: arrays[name] for name in ("noisy", "dx", "dy")}
-    denoised = call(ngpt.Denoiser((26, 18), method="l2", alpha=0.1), gradients)
-    assert np.array_equal(denoised, ngpt.denoise(full_stack(18, 26), "l2", alpha=0.1))
-    with pytest.raises(NgptError, match="unknown method 'l3'"):
-        ngpt.Denoiser((26, 18), method="l3")
-
-
-def test_torch_tensors(arrays):
-    torch = pytest.importorskip("torch")
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    tensors = {name: torch.tensor(array, requires_grad=name == "noisy") for name, array in arrays.items()}
-    result = call(denoiser, tensors)
-    assert isinstance(result, torch.Tensor) and result.dtype == torch.float32
-    assert np.array_equal(result.numpy(), call(denoiser, arrays))
-    half = call(denoiser, {name: tensor.detach().bfloat16() for name, tensor in tensors.items()})
-    assert half.dtype == torch.bfloat16 and np.allclose(half.float(), result, rtol=0.1, atol=0.1)
-
-
-def test_dr_jit_tensors(renderer, arrays):
-    mi = renderer
-    denoiser = ngpt.Denoiser(mi.ScalarVector2u(26, 18), albedo=True, normals=True)
-    result = call(denoiser, {name: mi.TensorXf(array) for name, array in arrays.items()})
-    assert isinstance(result, mi.TensorXf)
-    assert np.array_equal(np.array(result), call(denoiser, arrays))
-
-
-def test_alpha_is_left_alone(arrays):
-    alpha = np.linspace(0, 1, 18 * 26, dtype=np.float32).reshape(18, 26, 1)
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    result = call(denoiser, arrays | {"noisy": np.concatenate([arrays["noisy"], alpha], axis=-1)})
-    assert np.array_equal(result[..., 3:], alpha) and np.array_equal(result[..., :3], call(denoiser, arrays))
 
 
 @pytest.mark.parametrize("size", [3, 4])
@@ -186,14 +151,6 @@ def test_normals_of_mitsuba_become_those_of_a_stack(renderer, monkeypatch):
     assert (error < 0.05).all()
 
 
-def test_plain_bitmaps(renderer, arrays):
-    image = renderer.Bitmap(arrays["noisy"])
-    result = ngpt.Denoiser((26, 18))(image)
-    assert np.array_equal(np.array(result), ngpt.Denoiser((26, 18))(arrays["noisy"]))
-    with pytest.raises(NgptError, match="the bitmap has no layer 'albedo'; it has: <root>"):
-        ngpt.Denoiser((26, 18), albedo=True)(image, "albedo")
-
-
 def test_alpha_is_denoised_where_that_is_asked_for(arrays, rng):
     coverage = np.float32(np.mgrid[0:18, 0:26][1] > 12)[..., None]
     alpha = np.float32(coverage + rng.normal(0, 0.1, coverage.shape))
@@ -252,31 +209,6 @@ def test_the_previous_frame_is_taken_as_it_was_given(shot):
         assert mse(result, truth[1]) < 0.95 * mse(second, truth[1])
 
 
-def test_channels_of_a_bitmap_may_be_flow_and_previous_frame(renderer, shot):
-    stacks, _ = shot
-    first, second = frames(stacks[:2], over_time())
-    names = [*"RGB", *(f"albedo.{c}" for c in "RGB"), "flow.X", "flow.Y", *(f"last.{c}" for c in "RGB")]
-    denoiser, made = over_time(), []
-    for stack, last in zip(stacks[:2], (stacks[0]["primal"], first), strict=True):
-        pixels = np.concatenate([stack["primal"], stack["albedo"], -stack["motion"], last], axis=-1)
-        bitmap = renderer.Bitmap(pixels, channel_names=names)
-        result = denoiser(bitmap, "albedo", flow_ch="flow", previous_denoised_ch="last", primal_var=stack["primal_var"])
-        made.append(np.array(result))
-    assert np.array_equal(made[0], first) and np.allclose(made[1], second, atol=1e-5)
-
-
-def test_frames_are_announced(arrays):
-    for name in ("flow", "previous_denoised"):
-        with pytest.raises(
-            NgptError, match=rf"{name} is given, but was not announced: Denoiser\(size, temporal=True\)"
-        ):
-            ngpt.Denoiser((26, 18))(arrays["noisy"], **{name: arrays["noisy"]})
-    with pytest.raises(NgptError, match="temporal=True announced flow, which is not given"):
-        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"flow has shape \(18, 26, 3\); it must be \(18, 26, 2\)"):
-        ngpt.Denoiser((26, 18), temporal=True)(arrays["noisy"], flow=arrays["noisy"])
-
-
 def test_transforms_may_scale_and_not_flatten(arrays):
     denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
     arguments = [arrays[name] for name in ("noisy", "albedo", "normals")]
@@ -284,31 +216,3 @@ def test_transforms_may_scale_and_not_flatten(arrays):
     for flat in (np.diag([1, 1, 0]), np.full((3, 3), np.nan)):
         with pytest.raises(NgptError, match="to_sensor has determinant"):
             denoiser(*arguments, flat)
-
-
-@pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan, 3.4e38])
-def test_normals_that_are_not_finite_are_repaired_in_silence(arrays, value):
-    denoiser = ngpt.Denoiser((26, 18), albedo=True, normals=True)
-    arrays["normals"][3, 4] = value
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        result = denoiser(*(arrays[name] for name in ("noisy", "albedo", "normals")), 2 * np.eye(4))
-    assert np.isfinite(result).all()
-
-
-def test_bad_calls(arrays):
-    with pytest.raises(NgptError, match=r"albedo is given, but was not announced: Denoiser\(size, albedo=True\)"):
-        call(ngpt.Denoiser((26, 18), normals=True), arrays)
-    with pytest.raises(NgptError, match="normals=True announced normals, which is not given"):
-        ngpt.Denoiser((26, 18), normals=True)(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"noisy has shape \(18, 26, 3\); it must be \(26, 18, 3\) or \(26, 18, 4\)"):
-        ngpt.Denoiser((18, 26))(arrays["noisy"])
-    with pytest.raises(NgptError, match=r"dx has shape \(17, 26, 3\)"):
-        ngpt.Denoiser((26, 18))(arrays["noisy"], dx=arrays["dx"][1:], dy=arrays["dy"])
-    for strange in ("dz", "dt", "diffuse"):
-        with pytest.raises(NgptError, match=rf"no layer is called '{strange}'; there are: depth, dx.*, caustic_var$"):
-            ngpt.Denoiser((26, 18))(arrays["noisy"], **{strange: arrays["dx"]})
-    with pytest.raises(NgptError, match="method 'l2' has no option 'alhpa'; did you mean 'alpha'"):
-        ngpt.Denoiser((26, 18), method="l2", alhpa=0.1)
-    with pytest.raises(NgptError, match=r"Denoiser: method 'l2' needs dx, dy: pass dx=\.\.\., dy="):
-        ngpt.Denoiser((26, 18), method="l2")(arrays["noisy"])

@@ -58,17 +58,6 @@ def test_groups_add_up_to_the_result(lights, tmp_path, method):
         assert method == "primal" or after < 0.5 * before, name
 
 
-def test_light_in_no_group_is_left_to_none(lights, tmp_path):
-    clean, noisy = lights
-    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
-    stack = ngpt.read(path)
-    groups = {"Key": noisy["Key"]}
-    parts = lightgroups.denoised(stack, groups, ngpt.denoise(stack, "nfor"), "nfor")
-    assert list(parts) == ["Key"]
-    assert np.mean((parts["Key"] - clean["Key"]) ** 2) < 0.5 * np.mean((noisy["Key"] - clean["Key"]) ** 2)
-    assert not out.exists()
-
-
 def test_shares_keep_the_sum_and_the_sign(rng):
     parts = rng.random((3, 8, 9, 3)) * (rng.random((3, 8, 9, 3)) > 0.5)
     parts[:, 2, 3] = 0
@@ -98,12 +87,6 @@ def test_groups_are_found_by_the_names_of_renderers(lights, tmp_path):
         lightgroups.find(ngpt.read(own))
 
 
-def test_groups_of_another_view_layer_are_left_alone(lights, tmp_path):
-    _, noisy = lights
-    path = cycles(tmp_path / "two.exr", noisy, {"Other.Combined_Key": noisy["Key"]})
-    assert set(lightgroups.find(ngpt.read(path))) == {"ViewLayer.Combined_Key", "ViewLayer.Combined_Fill"}
-
-
 def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
     _, noisy = lights
     mist = {"ViewLayer.Mist": noisy["Key"]}
@@ -115,13 +98,6 @@ def test_all_else_in_the_file_stays_and_types_too(lights, tmp_path):
     assert after.attributes["ngpt:groups"] == "ViewLayer.Combined_Fill, ViewLayer.Combined_Key"
     with pytest.raises(NgptError, match="denoised already"):
         lightgroups.find(after)
-
-
-def test_without_being_asked_for_groups_pass_through(lights, tmp_path):
-    _, noisy = lights
-    path, out = cycles(tmp_path / "render.exr", noisy), tmp_path / "out.exr"
-    assert main(["denoise", str(path), "-o", str(out), "-m", "nfor"]) == 0
-    assert np.array_equal(lightgroups.layers_of_light(ngpt.read(out))["ViewLayer.Combined_Key"], noisy["Key"])
 
 
 def test_groups_of_every_view_are_denoised(lights, tmp_path):

@@ -7,7 +7,6 @@ import pytest
 from solvers import METHODS, energy, l1_by_irls, noisy_stack, solve_sparse
 
 from ngpt.classical.controlvariates import cv, wcv
-from ngpt.classical.gradients import adjoint_differences, forward_differences
 from ngpt.classical.leastsquares import Equations, solve_weighted
 from ngpt.classical.poisson import l1, l2, least_norms
 from ngpt.classical.variances import auto_alpha, smooth_variances
@@ -22,17 +21,6 @@ every_method = pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)
 def close(a, b, tolerance):
     """Within ``tolerance`` of the largest value of b."""
     return np.abs(np.asarray(a, np.float64) - b).max() <= tolerance * np.abs(b).max()
-
-
-@pytest.mark.parametrize("size", SIZES)
-def test_differences_and_their_adjoint_are_adjoint(size):
-    random = np.random.default_rng(0)
-    image, x, y = random.standard_normal((3, *size, 2))
-    dx, dy = forward_differences(image)
-    assert np.isclose((dx * x).sum() + (dy * y).sum(), (image * adjoint_differences(x, y)).sum())
-    assert not dx[:, -1].any() and not dy[-1].any()
-    if size[0] > 1:
-        assert np.array_equal(dy[0], image[1] - image[0])
 
 
 # Against independent solvers
@@ -66,9 +54,8 @@ def test_the_same_input_gives_the_same_bits():
 
 
 @pytest.mark.parametrize("alpha", [0.05, 0.2, 1.0])
-@pytest.mark.parametrize("seed", [0, 1])
-def test_l1_is_within_half_a_percent_of_reweighted_least_squares(alpha, seed):
-    _, *data, _ = noisy_stack(48, 40, seed)
+def test_l1_is_within_half_a_percent_of_reweighted_least_squares(alpha):
+    _, *data, _ = noisy_stack(32, 28)
     lowest = energy(l1_by_irls(*data, alpha), *data, alpha)
     assert energy(l1(*data, alpha), *data, alpha) < 1.005 * lowest
     # The reference is no straw man: many more iterations of ours gain next to nothing on it.
@@ -94,12 +81,6 @@ def test_outliers_do_not_hold_l1_up(size):
     assert reached < 1.005 * energy(l1_by_irls(*data, 0.2, steps=100), *data, 0.2)
 
 
-def test_l1_never_ends_above_the_energy_of_l2():
-    for seed in range(5):
-        _, *data, _ = noisy_stack(24, 24, seed)
-        assert energy(l1(*data), *data, 0.2) < energy(l2(*data), *data, 0.2)
-
-
 @pytest.fixture
 def tight_wl2(monkeypatch):
     monkeypatch.setattr("ngpt.classical.weighted.TOLERANCE", 1e-8)
@@ -122,25 +103,6 @@ def test_the_preconditioner_pays():
     r, _ = Equations(*data).scaled_residual()
     _, iterations = solve_weighted(r, 1 / p, 1 / d, 1e-4)
     assert iterations < 60
-
-
-def test_what_is_left_of_the_default_tolerance_does_not_matter():
-    truth, *data, variances = noisy_stack(64, 96)
-    r, scale = Equations(*data).scaled_residual()
-    p, d = smooth_variances(*variances)
-    exact = data[0] + scale * np.moveaxis(solve_weighted(r, 1 / p, 1 / d, 1e-7)[0], 0, -1)
-    assert relmse(wl2(*data, *variances), truth) == pytest.approx(relmse(exact, truth), rel=0.01)
-
-
-def test_equal_variances_make_wl2_an_l2():
-    _, primal, dx, dy, _ = noisy_stack(20, 30, dtype=np.float64)
-    variances = np.ones_like(primal), np.full_like(dx, 0.04), np.full_like(dy, 0.04)
-    assert close(wl2(primal, dx, dy, *variances), l2(primal, dx, dy, _alpha_of_floored(1, 0.04)), 1e-3)
-
-
-def _alpha_of_floored(primal, gradient):
-    p, d = smooth_variances(*(np.full((20, 30, 3), float(v)) for v in (primal, gradient, gradient)))
-    return float(np.sqrt(d[0, 0, 0, 0] / p[0, 0, 0]))
 
 
 def test_cv_is_the_mean_of_what_neighbours_say():
@@ -191,13 +153,6 @@ def test_linear_methods_add_up_over_light_groups(name):
     together = METHODS[name](*map(sum, zip(*groups, strict=True)), None)
     apart = sum(METHODS[name](*group, None) for group in groups)
     assert close(apart, together, 2e-6)
-
-
-def test_wl2_with_shared_variances_adds_up_over_light_groups(tight_wl2):
-    groups = [noisy_stack(40, 33, seed)[1:4] for seed in range(3)]
-    variances = noisy_stack(40, 33)[-1]
-    together = wl2(*map(sum, zip(*groups, strict=True)), *variances)
-    assert close(sum(wl2(*group, *variances) for group in groups), together, 1e-4)
 
 
 @every_method
@@ -264,15 +219,6 @@ def test_auto_alpha_at_the_ends():
     assert auto_alpha(1e30 * some, 1e30 * some, 1e30 * some) == pytest.approx(1)
 
 
-def test_auto_alpha_lowers_the_error_where_gradients_are_noisy():
-    truth, primal, dx, dy, variances = noisy_stack(64, 64)
-    random = np.random.default_rng(3)
-    noise = 1.5 * random.standard_normal((2, *dx.shape)).astype(np.float32)
-    dx, dy = dx + noise[0], dy + noise[1]
-    alpha = auto_alpha(variances[0], variances[1] + 2.25, variances[2] + 2.25)
-    assert relmse(l2(primal, dx, dy, alpha), truth) < 0.7 * relmse(l2(primal, dx, dy), truth)
-
-
 def peak_bytes(function):
     tracemalloc.start()
     try:
@@ -284,7 +230,7 @@ def peak_bytes(function):
 
 @pytest.mark.parametrize(("name", "bound"), [("l2", 35), ("l1", 175), ("cv", 100), ("wcv", 100), ("wl2", 180)])
 def test_memory_per_pixel_is_as_stated(name, bound):
-    height, width = 1000, 1100
+    height, width = 500, 600
     _, *data, variances = noisy_stack(height, width)
     assert peak_bytes(lambda: METHODS[name](*data, variances)) < bound * height * width
 

@@ -35,20 +35,6 @@ def test_exact_gradients_return_the_image(name, size):
     assert np.array_equal(run(name, *data, variances), data[0])
 
 
-@every_alpha
-@pytest.mark.parametrize("method", [l2, l1])
-def test_exact_gradients_return_the_image_for_every_alpha(method, alpha):
-    data, _ = exact_stack(19, 24)
-    assert np.array_equal(method(*data, alpha), data[0])
-
-
-@every_method
-@pytest.mark.parametrize("size", SIZES)
-def test_every_size(name, size):
-    _, *data, variances = noisy_stack(*size)
-    run(name, *data, variances)
-
-
 @every_method
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1.0, 1e12])
 def test_constant_images(name, value):
@@ -83,12 +69,6 @@ def test_gradients_of_pure_curl_change_nothing_in_l2(alpha):
     dx, dy = forward_differences(primal)
     swirl = curl(21, 18)
     assert np.abs(l2(primal, dx + swirl[0], dy + swirl[1], alpha) - primal).max() < 1e-9
-
-
-@every_method
-def test_gradients_of_pure_curl_are_survived(name):
-    _, primal, _, _, variances = noisy_stack(21, 18)
-    run(name, primal, *(c.astype(np.float32) for c in curl(21, 18)), variances)
 
 
 # alpha
@@ -128,18 +108,6 @@ def test_powers_of_two_scale_the_result_exactly(name, exponent):
     assert np.array_equal(result, expected * np.float32(k))
 
 
-@every_method
-@pytest.mark.parametrize("k", [1e-9, 0.7, 3.0, 1e9])
-def test_any_factor_scales_the_result(name, k):
-    _, primal, dx, dy, variances = noisy_stack(33, 29)
-    expected = run(name, primal, dx, dy, variances)
-    k = np.float32(k)
-    result = run(name, *(k * a for a in (primal, dx, dy)), [k * k * v for v in variances])
-    # Iterations may stop one check earlier or later: within their tolerance.
-    tolerance = {"l1": 5e-3, "wl2": 2e-3}.get(name, 2e-5)
-    assert np.abs(result / k - expected).max() < tolerance * expected.max()
-
-
 # Outliers and missing values
 
 
@@ -155,15 +123,6 @@ def test_one_pixel_of_1e12_leaves_the_far_image_alone(name, tolerance):
     after = run(name, hot, dx, dy, hot_variances)
     # exp(-0.2 d) takes 1e12 below 1e-5 of the image in 230 pixels.
     assert np.abs(after - before)[:, 260:].max() < tolerance * before.max()
-
-
-@every_method
-def test_one_pixel_of_1e12_is_survived(name):
-    """l1 and wl2 stop at a share of the whole residual, so their far image may suffer; but nothing blows up."""
-    _, primal, dx, dy, variances = noisy_stack(40, 50)
-    primal[20, 25] = 1e12
-    variances[0][20, 25] = 1e24
-    assert np.abs(run(name, primal, dx, dy, variances)).max() <= 1e12
 
 
 @every_method
@@ -235,14 +194,6 @@ def transposed(primal, dx, dy, variances):
     p, x, y = variances
     swap = (1, 0, 2)
     return primal.transpose(swap), dy.transpose(swap), dx.transpose(swap), [a.transpose(swap) for a in (p, y, x)]
-
-
-def test_mirroring_is_right():
-    image = noisy_stack(5, 7)[0]
-    data, variances = (image, *forward_differences(image)), (image,) * 3
-    flipped, dx, dy, _ = mirrored(*data, variances)
-    expected = forward_differences(flipped)
-    assert np.allclose(dx[:, :-1], expected[0][:, :-1]) and np.allclose(dy, expected[1])
 
 
 @every_method

@@ -66,13 +66,3 @@ def test_any_number_of_sweeps(monkeypatch, sweeps):
         u = one_sweep(u, r, one, never)
     expected = equations.image(u, scale)
     assert np.abs(cv(primal, dx, dy, sweeps=sweeps) - expected).max() <= 2e-6 * np.abs(expected).max()
-
-
-def test_where_strips_are_cut_does_not_show(monkeypatch):
-    _, primal, dx, dy, variances = noisy_stack(300, 50)
-    results = []
-    for strip, pixels in ((300, 1 << 20), (120, 10240), (17, 1)):
-        monkeypatch.setattr(jacobi, "_STRIP", strip)
-        monkeypatch.setattr(jacobi, "_PIXELS", pixels)
-        results.append(wcv(primal, dx, dy, *variances))
-    assert all(np.array_equal(result, results[0]) for result in results)

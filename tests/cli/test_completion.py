@@ -75,15 +75,3 @@ def test_completion_and_manual_know_every_option(verbs, capfd):
             long = action.option_strings[-1]
             assert long in scripts["bash"] and long in scripts["zsh"] and long in manual
             assert f"-{'l' if long.startswith('--') else 's'} {long.lstrip('-')}" in scripts["fish"]
-
-
-def test_man_takes_the_manual_without_a_warning(capfd):
-    page = printed(capfd, "--manual")
-    told = subprocess.run([shell("groff"), "-man", "-Tutf8", "-ww"], input=page, capture_output=True, text=True)
-    assert told.returncode == 0 and told.stderr == ""
-
-
-def test_an_unknown_shell_is_told(capfd):
-    with pytest.raises(SystemExit):
-        main(["--completion", "tcsh"])
-    assert "invalid choice: 'tcsh'" in capfd.readouterr().err

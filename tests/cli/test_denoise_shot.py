@@ -109,12 +109,6 @@ def test_one_frame_without_differences_in_time_makes_it_history_and_is_named(sho
     assert {*made_by(tmp_path / "windows")} == {"windows"} and {*made_by(tmp_path / "history")} == {"history"}
 
 
-@pytest.mark.parametrize("option", [["--error"], ["--groups"], ["--group", "fog*"]])
-def test_what_history_does_not_hold_is_refused(rest, option, tmp_path, capsys):
-    assert denoised(rest, tmp_path / "clean", *option) == 2
-    assert "--temporal goes without" in capsys.readouterr().err
-
-
 def test_frames_are_blended_in_the_order_of_their_numbers(rest, tmp_path, capsys):
     """Names of Houdini and of scripts: f.1 to f.12, without ``ngpt:frame``."""
     plain, folder = ngpt.read(next(rest.iterdir())), tmp_path / "houdini"
@@ -188,11 +182,3 @@ def test_each_view_has_a_history_of_its_own(rest, tmp_path, capsys):
         assert main([*words, str(tmp_path / target), *more, "-m", "primal"]) == 1
         assert "has several views, and" in capsys.readouterr().err
         assert main([*words, str(tmp_path / target), *more, "-m", "primal", "--view", "right"]) == 0
-
-
-def test_files_without_gradients_tell_of_none(tmp_path, capsys):
-    image = np.ones((8, 9, 3), np.float32)
-    image[3, 4] = np.nan
-    ngpt.write(tmp_path / "a.exr", image)
-    assert main(["denoise", str(tmp_path / "a.exr"), "-m", "primal"]) == 0
-    assert capsys.readouterr().err.endswith(", repaired 1 pixels\n")

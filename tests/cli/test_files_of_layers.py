@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from exr_files import window, write_raw
+from exr_files import write_raw
 from full_stack import full_stack
 
 import ngpt
@@ -53,27 +53,6 @@ def test_a_file_of_a_layer_wins_over_the_layer_in_the_stack(apart, tmp_path):
     paths, stack = apart
     whole = ngpt.write(tmp_path / "whole.exr", stack.replace(albedo=stack["albedo"] / 2))
     assert np.array_equal(ngpt.read(whole, files={"albedo": paths["albedo"]})["albedo"], stack["albedo"])
-
-
-def test_what_does_not_fit_is_said_in_one_line(apart, tmp_path, capfd):
-    paths, stack = apart
-    small = str(write_raw(tmp_path / "small.exr", ({c: np.ones((4, 5), np.float32) for c in "RGB"},)))
-    moved = {"dataWindow": window(3, 2, 12, 10)}
-    moved = str(write_raw(tmp_path / "moved.exr", (dict.fromkeys("RGB", stack["albedo"][..., 0]), moved)))
-    for arguments, status, message in (
-        (["--albedo", small], 1, f"{small}: albedo is 5x4 but {paths['primal']} is 12x10; render them at one size"),
-        (["--normal", small], 1, f"{small}: normal is 5x4"),
-        (["--albedo", moved], 1, f"{moved}: albedo starts at pixel (3, 2) but {paths['primal']} at (0, 0)"),
-        (["--normal", paths["depth"]], 1, "depth.exr: no layer with channels X Y Z for 'normal'"),
-        (["--depth", "nowhere.exr"], 1, "nowhere.exr: not found"),
-        ([paths["albedo"], "--albedo", small], 2, "--albedo belongs to one stack, and 2 are given"),
-    ):
-        assert main(["denoise", paths["primal"], *arguments]) == status
-        out, err = capfd.readouterr()
-        assert err.startswith("ngpt: error: ") and message in err and err.count("\n") == 1 and out == ""
-    with pytest.raises(ngpt.NgptError, match="layer 'primal' cannot come from a file of its own"):
-        ngpt.read(paths["primal"], files={"primal": paths["albedo"]})
-    assert not (tmp_path / "primal_denoised.exr").exists()
 
 
 def test_info_proposes_the_option_for_a_layer_that_looks_like_a_missing_one(apart, tmp_path, capsys):

@@ -2,7 +2,6 @@
 
 import json
 import os
-import resource
 import subprocess
 import sys
 import threading
@@ -11,7 +10,7 @@ import weakref
 import numpy as np
 import pytest
 from full_stack import full_stack
-from processes import ENVIRONMENT, ROOT, complete, half_written, temporary_files, timeless
+from processes import ENVIRONMENT, ROOT, complete, timeless
 
 import ngpt
 from ngpt.cli import main
@@ -73,20 +72,6 @@ def test_three_frames_are_in_memory_at_most(frames, tmp_path, monkeypatch):
     assert len(most) == 5 and max(most) <= 3 and not alive
 
 
-def test_frames_that_the_disk_has_no_room_for(frames, tmp_path):
-    """A limit on the size of files stands for a full disk: larger frames fail, smaller ones come after them."""
-    ngpt.write(frames / "1.exr", full_stack(90, 120), overwrite=True)
-    limit = (frames / "1.exr").stat().st_size // 2
-    out = tmp_path / "out"
-    run = complete(
-        [*NGPT, "denoise", frames, "-o", out, "-m", "l2"],
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit)),
-    )
-    assert run.returncode == 1 and "1.exr: cannot be written" in run.stderr
-    assert sorted(os.listdir(out)) == ["0.exr", "2.exr", "3.exr", "4.exr", "5.exr"]
-    assert half_written(out) == [] and temporary_files(out) == []
-
-
 def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
     out = tmp_path / "out"
     words = ["denoise", str(frames), "-o", str(out), "-m", "l2"]
@@ -116,25 +101,6 @@ def test_a_folder_goes_on_past_existing_results(frames, tmp_path, capsys):
     # One of the two, not both.
     with pytest.raises(SystemExit):
         main([*words, "--skip-existing", "--force"])
-
-
-@pytest.mark.parametrize("exists", [False, True])
-def test_several_stacks_are_not_written_into_one_file(frames, tmp_path, capsys, exists):
-    out = tmp_path / "one.exr"
-    if exists:
-        out.write_text("precious")
-    assert main(["denoise", str(frames / "0.exr"), str(frames / "1.exr"), "-o", str(out), "--force"]) == 2
-    assert "file; the results of 2 stacks need a folder" in capsys.readouterr().err
-    assert out.exists() == exists and not out.is_dir()
-    # A folder of such a name is one if it is there, or if the name says so.
-    assert main(["denoise", str(frames), "-o", f"{tmp_path / 'two.exr'}/", "-m", "primal", "-q"]) == 0
-    assert main(["denoise", str(frames), "-o", str(tmp_path / "two.exr"), "-m", "primal", "-q", "--force"]) == 0
-
-
-def test_a_name_that_cannot_be_written_is_an_error_before_any_work(frames, tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr("ngpt.cli.denoise.reconstruct", lambda *_, **__: pytest.fail("worked"))
-    assert main(["denoise", str(frames / "0.exr"), "-o", str(tmp_path / "o.tiff")]) == 2
-    assert "let the name end in .exr" in capsys.readouterr().err
 
 
 def on_terminal(*words):

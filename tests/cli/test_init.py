@@ -1,7 +1,6 @@
 """--init of train, dataset and evaluate: a configuration of one's own, with all that could be set."""
 
 import re
-import tomllib
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -9,7 +8,6 @@ import pytest
 
 from ngpt.cli import main
 from ngpt.system import configs
-from ngpt.system.templates import template
 
 pytest.importorskip("torch")
 
@@ -81,23 +79,3 @@ def test_without_a_configuration_it_begins_with_one_that_is_shipped(verb, tmp_pa
     assert main([verb, "--out", "x"]) == 2 and "--config is missing: a TOML file, or" in capsys.readouterr().err
     assert main([verb, "--config", "mine.toml"]) == 2 and "--out is missing" in capsys.readouterr().err
     assert [path.name for path in Path().iterdir()] == ["mine.toml"]
-
-
-def test_what_no_docstring_explains_is_offered_too():
-    """Such as a weight that somebody adds to the loss."""
-    from dataclasses import make_dataclass
-
-    kind = make_dataclass("Kind", [("told", int, 1), ("untold", tuple, (2.5, "x"))])
-    kind.__doc__ = "Something.\n\n``told``  is told\n"
-    text = template("# Mine.\n[a]\n# b\nx = [\n  [1],\n]\n[[b]]\nz = 1\n", {"": kind, "a": kind})
-    assert tomllib.loads(text) == {"a": {"x": [[1]]}, "b": [{"z": 1}]}
-    offered = tomllib.loads(re.sub(r"^# (\w+ = .*)$", r"\1", text, flags=re.M))
-    default = {"told": 1, "untold": [2.5, "x"]}
-    assert offered == default | {"a": {"x": [[1]]} | default, "b": [{"z": 1}]}
-    assert text.count("# is told\n# told = 1\n# untold = ") == 2
-
-
-def test_what_builds_on_another_configuration_is_no_start(tmp_path, capsys):
-    path = tmp_path / "mine.toml"
-    assert main(["evaluate", "--config", "eval-640", "--init", str(path)]) == 2 and not path.exists()
-    assert "eval-640 is eval-main.toml with other numbers: give --init that one" in capsys.readouterr().err

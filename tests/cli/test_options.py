@@ -1,7 +1,6 @@
 """Options of methods from the command line, and methods that are others with options of their own."""
 
 import json
-import shutil
 
 import numpy as np
 import pytest
@@ -43,15 +42,6 @@ def test_an_option_of_any_method(source):
 
 
 @needs_oidn
-def test_quality_and_features_of_oidn(source):
-    stack = ngpt.read(source)
-    image, header = denoise(source, "-m", "oidn", "-O", "auxiliary=noisy", "-O", "quality=fast")
-    assert header["ngpt:options"] == "auxiliary=noisy, quality=fast" and header["ngpt:method"] == "oidn"
-    assert np.array_equal(image, ngpt.denoise(stack, "oidn", auxiliary="noisy", quality="fast"))
-    assert not np.array_equal(image, ngpt.denoise(stack, "oidn"))
-
-
-@needs_oidn
 @pytest.mark.parametrize("name", [name for name, method in METHODS.items() if method.variant])
 def test_rows_of_tables_are_methods(source, name):
     image, header = denoise(source, "-m", name)
@@ -75,36 +65,3 @@ def test_help_and_lists_have_methods_by_standing(source, capsys):
     assert main(["info", source, "--json"]) == 0
     able = json.loads(capsys.readouterr().out)["methods"]
     assert {"l2", "wcv"} <= set(able) <= set(by_standing("use", "niche"))
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (
-            ["-m", "oidn", "-O", "quality=best"],
-            "option 'quality': 'best' is not allowed; it takes high, balanced, fast",
-        ),
-        (["-m", "oidn", "-O", "auxiliary=7"], "option 'auxiliary': '7' is not allowed; it takes prefiltered, clean"),
-        (["-m", "oidn", "-O", "alpha=1"], "method 'oidn' has no option 'alpha'; it has: auxiliary, quality"),
-        (["-m", "wcv", "-O", "alpha=1"], "method 'wcv' has no option 'alpha'; it has: none"),
-        (
-            ["-m", "l1", "-O", "alpha=much"],
-            "method 'l1', option 'alpha': 'much' is not allowed; it takes a number from 1e-15 to 1e+15, or auto",
-        ),
-        (["-m", "ngpt-fast", "-O", "memory=much"], "option 'memory': 'much' is not allowed; it takes a whole number"),
-    ],
-)
-def test_errors_are_those_of_the_method(source, tmp_path, arguments, message, capfd):
-    if "oidn" in arguments and "alpha=1" not in arguments and oidn.missing():
-        pytest.skip(oidn.missing())
-    other = shutil.copy(source, tmp_path / "other.exr")
-    # That of all stacks: said once, and the others are not tried.
-    assert main(["denoise", source, str(other), *arguments, "-o", f"{tmp_path}/out/"]) == 2
-    errors = capfd.readouterr().err
-    assert message in errors and errors.count("error:") == 1
-
-
-def test_an_option_without_a_value_is_wrong_usage(source, capfd):
-    with pytest.raises(SystemExit):
-        main(["denoise", source, "-O", "memory"])
-    assert "'memory' is not of the form NAME=VALUE" in capfd.readouterr().err

@@ -11,7 +11,6 @@ from ngpt.io.exr import read, with_channels, write, write_exr
 from ngpt.io.openexr import ExrImage, ExrPart
 from ngpt.measure.metrics import METRICS
 from ngpt.stack import GradientStack
-from ngpt.system.install import install_command
 
 
 @pytest.fixture
@@ -47,18 +46,6 @@ def test_images_of_two_renderers_on_one_page(tmp_path, image, capfd):
     assert messages.endswith(f"{page}: open it in a browser\n") and "errors: 2/2 images" in messages
 
 
-def test_without_a_reference_there_is_nothing_to_measure(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image)
-    write(tmp_path / "b.exr", image)
-    words = [str(tmp_path / name) for name in ("a.exr", "b.exr")]
-    assert main(["report", "-q", *words, "-o", str(tmp_path / "page.html")]) == 0
-    shown = facts(tmp_path / "page.html")
-    assert shown["pictures"] == ["a", "b"] and not shown["reference"] and shown["maps"] == []
-    text = (tmp_path / "page.html").read_text()
-    assert "no reference: with --ref" in text and "<h3>Measurements</h3>" not in text
-    assert capfd.readouterr() == ("", "")
-
-
 def test_of_one_file_all_layers_are_shown(tmp_path, image, rng):
     stack = GradientStack.from_arrays(primal=image, dx=image, albedo=image / 9, motion=image[..., :2])
     stack = with_channels(stack, {"diagnostics.discarded": image[..., 0]})
@@ -80,53 +67,6 @@ def test_files_of_one_name_are_told_apart_by_their_folders(tmp_path, image):
     words = [str(tmp_path / folder / "reference.exr") for folder in ("spp16", "spp64")]
     assert main(["report", *words, "--ref", words[1], "-o", str(tmp_path / "page.html")]) == 0
     assert facts(tmp_path / "page.html")["pictures"] == ["spp16/reference", "spp64/reference", "reference"]
-
-
-def test_what_cannot_be_compared_is_refused_in_one_line(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image)
-    write(tmp_path / "small.exr", image[:20])
-    write(tmp_path / "nothing.exr", image * np.float32(np.nan))
-    a, small, nothing = (str(tmp_path / name) for name in ("a.exr", "small.exr", "nothing.exr"))
-    page = tmp_path / "page.html"
-
-    def refused(*words, status=1):
-        assert main(["report", "-q", *words, "-o", str(page)]) == status
-        _, message = capfd.readouterr()
-        assert message.count("\n") == 1 and not page.exists()
-        return message
-
-    assert f"{small} is 32x20 but {a} is 32x24; render or crop them to one size" in refused(a, small)
-    assert f"{small} is 32x20 but {a} is 32x24" in refused(a, "--ref", small)
-    assert f"{a}: is given twice" in refused(a, a, status=2)
-    assert f"{nothing} and {a}: none of 768 pixels is finite in both images" in refused(nothing, "--ref", a)
-    assert "nowhere.exr" in refused("nowhere.exr")
-    page.touch()
-    assert main(["report", a, "-o", str(page)]) == 1
-    assert "exists already" in capfd.readouterr().err and page.read_text() == ""
-    assert main(["report", a, "-o", str(page.with_suffix(""))]) == 2
-    assert "let it end in .html" in capfd.readouterr().err and not page.with_suffix("").exists()
-
-
-def test_it_says_what_may_be_wrong_or_is_left_out(tmp_path, image, capfd, monkeypatch):
-    monkeypatch.setattr("ngpt.measure.perceptual.find_spec", lambda module: None)
-    write(tmp_path / "a.exr", image * 4)
-    write(tmp_path / "truth.exr", image)
-    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "truth.exr"), "-o", str(tmp_path / "page.html")]
-    assert main(["report", *words, "--verbose"]) == 0
-    output, messages = capfd.readouterr()
-    assert "without SSIM and FLIP" in messages
-    assert f"FLIP needs flip-evaluator: {install_command('peers')}" in messages and "FLIP" not in output
-    assert "a.exr: 2.0 stops brighter than" in messages
-    assert facts(tmp_path / "page.html")["maps"] == []
-
-
-def test_images_too_small_for_ssim_are_compared_without(tmp_path, image, capfd):
-    write(tmp_path / "a.exr", image[:5, :7])
-    words = [str(tmp_path / "a.exr"), "--ref", str(tmp_path / "a.exr"), "-o", str(tmp_path / "page.html")]
-    assert main(["report", *words]) == 0
-    assert "without SSIM: --verbose says why" in capfd.readouterr().err
-    assert main(["report", *words, "-v", "--force"]) == 0
-    assert "SSIM needs images of 11x11 pixels, and these are 7x5" in capfd.readouterr().err
 
 
 def test_folders_of_frames_are_shots(tmp_path, rng, capsys):
@@ -174,15 +114,3 @@ def test_frames_play_in_the_order_of_numbers_and_results_beside_them_are_compare
         assert list(dict.fromkeys(re.findall(r"f\.\d+", text))) == ["f.1", "f.2", "f.10"]
         played = json.loads(re.search(r'id="page">(.*?)</script>', text).group(1))
         assert [len(scene["pictures"]) for scene in played["scenes"]] == [count] * 3
-
-
-def test_flicker_without_motion_is_explained(tmp_path, capsys):
-    for folder in ("a", "truth"):
-        (tmp_path / folder).mkdir()
-        for i in range(2):
-            write(tmp_path / folder / f"{i}.exr", np.full((12, 16, 3), 1 + i, np.float32))
-    words = ["report", str(tmp_path / "a"), "--ref", str(tmp_path / "truth"), "-o", str(tmp_path / "page.html")]
-    assert main(words) == 0
-    told = capsys.readouterr()
-    assert told.out.splitlines()[-1].split()[-1] == "nan"
-    assert told.err.count("flicker is nan: no frame after the first has motion vectors (layer 'motion')") == 1

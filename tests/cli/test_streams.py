@@ -38,23 +38,6 @@ def test_one_end_may_be_a_file(noisy, tmp_path, monkeypatch, capfd):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "complaint"),
-    [
-        (["-"], "standard input has no name to go by"),
-        (["-", "noisy.exr", "-o", "x/"], "'-' is one stack, and 2 are given"),
-        (["noisy.exr", "noisy.exr", "-o", "-"], "'-' is one result, and 2 stacks are given"),
-        (["noisy.exr", "-o", "-", "--json"], "both want standard output"),
-        (["-", "-o", "-"], "error: standard input: is empty"),
-    ],
-)
-def test_what_makes_no_sense_is_said_and_nothing_is_written(noisy, arguments, complaint, monkeypatch, capfd):
-    monkeypatch.setattr(sys, "stdin", io.TextIOWrapper(io.BytesIO()))
-    assert main(["denoise", *arguments]) != 0
-    output, errors = capfd.readouterr()
-    assert complaint in errors and output == ""
-
-
-@pytest.mark.parametrize(
     ("arguments", "said"),
     [
         (["info", "-"], "file: standard input"),
@@ -83,8 +66,3 @@ def test_every_verb_that_reads_one_file_takes_it_by_standard_input(
         assert message in output + errors and tempfile.gettempdir() + "/ngpt-" not in output + errors
     for page in tmp_path.glob("made/*.html"):
         assert tempfile.gettempdir() + "/ngpt-" not in page.read_text()
-
-
-def test_standard_input_is_one_image(noisy, capfd):
-    assert main(["diff", "-", "-"]) == 2
-    assert "'-' is one image, and is given 2 times" in capfd.readouterr().err

@@ -1,9 +1,6 @@
 """``ngpt unpack``: the layers of any renderer's file as raw files with our names."""
 
-import json
-
 import numpy as np
-import pytest
 from exr_files import write_raw
 from full_stack import full_stack
 from hosts import read_layers
@@ -36,21 +33,3 @@ def test_names_are_ours_whatever_wrote_the_file(tmp_path, rng):
     assert set(layers) == {"primal", "albedo", "normal"}
     for name, layer in (("primal", image), ("albedo", albedo), ("normal", normal)):
         assert np.array_equal(layers[name][0].transpose(1, 2, 0), layer)
-
-
-@pytest.mark.parametrize("what", ["a file", "an older layer"])
-def test_nothing_is_overwritten_unasked(tmp_path, what, capsys):
-    ngpt.write(tmp_path / "s.exr", full_stack(4, 4))
-    folder = tmp_path / "raw"
-    if what == "a file":
-        folder.write_text("mine")
-    else:
-        folder.mkdir()
-        (folder / "dy.f32").write_text("mine")
-    assert main(["unpack", str(tmp_path / "s.exr"), str(folder)]) == 1
-    error = capsys.readouterr().err
-    assert error.count("\n") == 1 and "raw" in error
-    if what == "an older layer":
-        assert [path.name for path in folder.iterdir()] == ["dy.f32"]
-        assert main(["unpack", str(tmp_path / "s.exr"), str(folder), "--force"]) == 0
-        assert json.loads((folder / "layers.json").read_text())["dy"]["shape"] == [1, 3, 4, 4]

@@ -42,16 +42,6 @@ def test_no_help_imports_what_is_heavy():
     assert run.returncode == 0, run.stderr
 
 
-def test_help_has_the_verbs_under_headings_and_what_most_come_for_first(capfd):
-    status, output, _ = stopped(main, ["--help"], capfd)
-    headings = re.findall(r"^(\w[\w ]+):\n((?: .*\n)+)", output, re.M)
-    verbs = {heading: re.findall(r"^  (\w+) ", lines, re.M) for heading, lines in headings}
-    assert status == 0 and list(verbs) == ["images of any renderer", "rendering", "networks", "options"]
-    assert verbs["images of any renderer"] == ["denoise", "info", "diff", "report", "picture", "merge", "unpack"]
-    assert verbs["rendering"] == ["render", "advise", "demo"]
-    assert verbs["networks"] == ["dataset", "train", "evaluate", "export"]
-
-
 def test_a_verb_imports_no_other(tmp_path):
     code = (
         "import sys\n"
@@ -112,13 +102,6 @@ def test_ctrl_c_says_what_becomes_of_the_work(verb, arguments, message, capfd, m
     assert capfd.readouterr().err.endswith(f": error: {message}\n")
 
 
-def test_results_name_the_command_that_made_them(monkeypatch):
-    told, arguments = [], ["--config", "x", "--out", "a folder"]
-    monkeypatch.setattr("ngpt.cli.evaluate.run", lambda args, console: told.append(args.command) or 0)
-    assert main(["evaluate", *arguments]) == 0 == runpy.run_path("eval.py")["main"](arguments)
-    assert told == [f"{program} --config x --out 'a folder'" for program in ("ngpt evaluate", "python eval.py")]
-
-
 @pytest.mark.parametrize(
     ("lacking", "arguments", "extra"),
     [
@@ -131,14 +114,6 @@ def test_a_package_that_is_not_installed_is_named_with_its_extra(lacking, argume
     run = run_python(code, *(a.format(out=tmp_path / "x.onnx") for a in arguments))
     told = f"ngpt: error: {arguments[0]} needs the package '{lacking}'; `{install_command(extra)}`\n"
     assert (run.returncode, run.stderr) == (1, told)
-
-
-@pytest.mark.parametrize("verb", ["dataset", "train", "evaluate"])
-def test_a_configuration_that_is_not_there_is_told_what_there_is(verb, tmp_path, capfd):
-    assert main([verb, "--config", "nowhere", "--out", str(tmp_path / "out")]) == 1
-    errors = capfd.readouterr().err
-    assert errors.startswith("ngpt: error: nowhere: cannot be read: no such file; configurations that come with ngpt: ")
-    assert "tiny" in errors and errors.count("\n") == 1 and not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -1,9 +1,8 @@
 """The map of where gradients hurt, on variances that are known."""
 
 import numpy as np
-import pytest
 
-from ngpt.evaluation.gradientmap import log_ratio, variances_of_differences, write_map
+from ngpt.evaluation.gradientmap import log_ratio, variances_of_differences
 from ngpt.stack import GradientStack
 
 
@@ -25,11 +24,3 @@ def test_variances_of_differences_leave_out_lights_and_borders():
 def test_ratio_is_that_of_the_variances():
     ratio = log_ratio(known_stack())
     assert np.allclose(ratio[2:, 1:5], np.log2(4)) and np.allclose(ratio[2:, 7:-1], np.log2(1 / 8))
-
-
-def test_map_is_a_png_with_a_legend(tmp_path):
-    imageio = pytest.importorskip("imageio.v3")
-    write_map(tmp_path / "map.png", known_stack())
-    image = imageio.imread(tmp_path / "map.png")
-    assert image.shape == (9 * 4 + 48, 12 * 4, 3)
-    assert image[20, 12, 2] > image[20, 12, 0] and image[20, 36, 0] > image[20, 36, 2]  # blue pays, orange hurts

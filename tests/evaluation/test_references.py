@@ -12,7 +12,6 @@ from ngpt.errors import NgptError
 from ngpt.evaluation.references import find_reference, read_reference, reference_noise
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.stability import flicker_and_bias, study
-from ngpt.io.exr import read_image
 from ngpt.system.console import Console
 
 QUIET = Console(quiet=True)
@@ -86,33 +85,6 @@ def test_the_noise_of_the_reference_is_not_in_the_errors(tmp_path):
 
 def error_of(results: dict) -> float:
     return next(r["error"] for r in results["summary"] if r["method"] == "l2" and r["scene"])
-
-
-def test_tables_say_what_halves_do(tmp_path, rng):
-    write_scene(tmp_path / "room", rng)
-    write_halves(tmp_path / "room", rng, 0.1)
-    out = tmp_path / "out"
-    results = evaluate(read(CONFIG.format(folder=tmp_path / "room"), tmp_path), out, QUIET, "", service)
-    entry = results["scenes"]["room"]["reference"]
-    assert entry["halves"] and entry["spp"] == 200
-    a, b = (read_image(tmp_path / "room" / f"reference-{half}.exr").astype(np.float64) for half in "ab")
-    # The floor of a metric that is not made of squares is that between the halves.
-    assert entry["floors"] == {"SMAPE": pytest.approx(np.mean(2 * np.abs(a - b) / (np.abs(a) + np.abs(b))))}
-    assert np.allclose(read_image(out / entry["image"]), (a + b) / 2, rtol=2e-3)
-    text = (out / "results.md").read_text()
-    assert "two independent halves" in text and "three standard errors" in text
-    line = next(line for line in text.splitlines() if line.startswith("| SMAPE | 16 "))
-    assert line.endswith(f"| {entry['floors']['SMAPE']:.4g} |")
-    assert next(line for line in text.splitlines() if line.startswith("| PSNR | 16 ")).endswith("|  |")
-
-
-def test_two_files_named_in_the_configuration_are_halves(tmp_path, rng):
-    write_scene(tmp_path / "room", rng)
-    write_halves(tmp_path, rng, 0.1, "mine")
-    files = [str(tmp_path / f"mine-{half}.exr") for half in "ab"]
-    text = CONFIG.format(folder=tmp_path / "room") + f"[references]\nroom = {files}\n"
-    results = evaluate(read(text, tmp_path), tmp_path / "out", QUIET, "", service)
-    assert results["scenes"]["room"]["reference"]["halves"]
 
 
 def test_stability_takes_the_noise_off_the_bias(tmp_path, rng):

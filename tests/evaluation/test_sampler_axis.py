@@ -11,7 +11,6 @@ import ngpt
 from data_gen import service
 from ngpt.errors import NgptError
 from ngpt.evaluation.config import Config, read_config
-from ngpt.evaluation.renders import Render
 from ngpt.evaluation.run import evaluate
 from ngpt.evaluation.stacks import SceneStacks
 from ngpt.report.evaluation import write_evaluation_report
@@ -75,62 +74,6 @@ def test_tables_of_samplers_are_their_options(tmp_path):
     (tmp_path / "eval.toml").write_text(text.replace('sampler = "gpt"', 'sampler = "gtp"'))
     with pytest.raises(NgptError, match=r"samplers\.gpt-followed: unknown sampler 'gtp'; did you mean 'gpt'"):
         read_config(tmp_path / "eval.toml")
-
-
-def test_samplers_that_variants_name_are_theirs_alone(tmp_path):
-    text = """
-        scenes = ["diffuse"]
-        methods = ["wcv", "wcv-before"]
-        [samplers.gpt-before]
-        sampler = "gpt"
-        points = "independent"
-        [variants.wcv-before]
-        method = "wcv"
-        sampler = "gpt-before"
-    """
-    (tmp_path / "eval.toml").write_text(text)
-    columns = read_config(tmp_path / "eval.toml").columns()
-    assert {column.name: column.render.name for column in columns} == {
-        "wcv": "gradients",
-        "wcv-before": "gradients gpt points=independent",
-    }
-
-
-def test_options_of_samplers_reach_the_stacks(renderer, tmp_path):
-    config = Config(
-        scenes=("diffuse",),
-        size=(16, 12),
-        spp=(4,),
-        seeds=1,
-        methods=("wcv",),
-        metrics=("relMSE",),
-        primary="relMSE",
-        samplers=("gpt", "joined"),
-        clock="gpt",
-        reference_spp=16,
-        timing_spp=4,
-        timing_repeats=1,
-        sampler_options={"joined": {"sampler": "gpt", "reuse": True}},
-    )
-    cells = evaluate(config, tmp_path, QUIET, "", service)["cells"]
-    assert {cell["method"] for cell in cells} == {"wcv (gpt)", "wcv (joined)"} and not any(c["absent"] for c in cells)
-    stacks = sorted((tmp_path / "cache").rglob("gradients-*reuse*.exr"))
-    assert stacks and all(ngpt.read(file).attributes["ngpt:samplerOptions"] == "reuse=true" for file in stacks)
-
-
-def test_a_variant_names_its_own_sampler():
-    variants = {
-        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
-        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
-        "photons": {"method": "primal", "sampler": "ppm"},
-    }
-    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
-        "wcv (gpt)": ("wcv", "gradients gpt"),
-        "wcv (toy)": ("wcv", "gradients toy"),
-        "wcv-replayed": ("wcv", "gradients gpt-basic"),
-        "raw": ("primal", "gradients gpt"),
-        "photons": ("primal", "features ppm"),
-    }
 
 
 def test_folders_of_stacks_have_samplers_without_a_renderer(tmp_path, rng, monkeypatch):
@@ -227,29 +170,16 @@ def test_two_samplers_at_equal_time(renderer, tmp_path):
     assert next(c["spp used"] for c in slow["cells"] if c["method"] == "wcv") == round(8 / ratio)
 
 
-def test_processor_time_and_a_reference_by_another_sampler(renderer, tmp_path, monkeypatch):
-    from itertools import count
-
-    from data_gen.choosing import costs
-
-    ticks = count()
-    monkeypatch.setitem(costs.CLOCKS, "processor", lambda: float(next(ticks)))
-    config = read(SETTINGS + 'time = "processor"\nreference_sampler = "gpt"\n', tmp_path)
-    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, service)
-    stacks.reference()
-    halves = [ngpt.read(path) for path in sorted(stacks.folder("gpt").glob("reference-gpt-128spp*"))]
-    assert [half.attributes["ngpt:sampler"] for half in halves] == ["gpt", "gpt"]
-    # Every render takes a tick of that clock, so samples cost the same; so does a stack.
-    assert {cost["median"] for cost in stacks.costs().values()} == {1 / 8}
-    assert stacks.stack(stacks.clock, 4, 0).attributes["ngpt:seconds"] == 1
-    with pytest.raises(NgptError, match="time = 'cpu': choose one of: wall, processor"):
-        read(SETTINGS + 'time = "cpu"\n', tmp_path)
-
-
-def test_a_sampler_of_the_other_kind_is_refused_with_the_entry_it_belongs_to(renderer, tmp_path):
-    config = read(SETTINGS, tmp_path)
-    stacks = SceneStacks("diffuse", "diffuse", config, tmp_path, service)
-    with_gradients, without = Render("features", "gpt"), Render("gradients", "primal")
-    assert not stacks._can(with_gradients) and not stacks._can(without)
-    assert stacks.lacks[with_gradients.name] == "sampler 'gpt' renders gradients: list it under samplers"
-    assert stacks.lacks[without.name] == "sampler 'primal' renders no gradients: list it under rivals"
+def test_a_variant_names_its_own_sampler():
+    variants = {
+        "wcv-replayed": {"method": "wcv", "sampler": "gpt-basic"},
+        "raw": {"method": "primal", "stack": "gradients", "sampler": "gpt"},
+        "photons": {"method": "primal", "sampler": "ppm"},
+    }
+    assert columns(methods=("wcv", *variants), samplers=("gpt", "toy"), variants=variants) == {
+        "wcv (gpt)": ("wcv", "gradients gpt"),
+        "wcv (toy)": ("wcv", "gradients toy"),
+        "wcv-replayed": ("wcv", "gradients gpt-basic"),
+        "raw": ("primal", "gradients gpt"),
+        "photons": ("primal", "features ppm"),
+    }

@@ -1,20 +1,12 @@
 """Fixtures of the C library; it wants a compiler, CMake and ONNX Runtime's headers, see docs/embed/c-library.md."""
 
-from pathlib import Path
-
 import pytest
-from capi import PRIMAL, Network, headers, install, load
+from capi import PRIMAL, Network, built, load
 
 
 @pytest.fixture(scope="session")
-def runtime() -> Path:
-    """Where ONNX Runtime is."""
-    return headers()
-
-
-@pytest.fixture(scope="session")
-def prefix(runtime, tmp_path_factory):
-    return install(runtime, tmp_path_factory.mktemp("capi"))
+def prefix(toolchain):
+    return built()
 
 
 @pytest.fixture(scope="session")

@@ -115,34 +115,6 @@ def test_sizes_from_one_pixel(fast):
         agree(result(fast, layers), in_python(FAST, layers))
 
 
-def test_a_base_may_be_given(fast):
-    assert "base" in fast.names and "statistics" not in fast.names
-    layers = example()
-    base = np.nan_to_num(0.8 * layers["primal"], posinf=1)
-    layers = those(fast, layers)
-    with_base = result(fast, layers | {"base": base})
-    agree(with_base, in_python(FAST, layers | {"base": base}))
-    assert np.abs(result(fast, layers) - with_base).max() > 1e-3
-
-
-def test_layers_that_are_not_there(fast):
-    layers = those(fast, example())
-    without = {name: layer for name, layer in layers.items() if not name.endswith("_var")}
-    unknown = {name: np.full_like(layer, -1) for name, layer in layers.items() if name.endswith("_var")}
-    agree(result(fast, without), in_python(FAST, without | unknown))
-
-
-def test_a_layer_can_be_taken_away(library, primal):
-    layers = those(primal, example())
-    job = Job(primal, layers)
-    assert library.ngpt_set_layer(job.handle, b"direct", None, 0, 0, 0, 0, 0) == OK
-    assert job.run() == OK
-    agree(job.image, result(primal, {name: layer for name, layer in layers.items() if name != "direct"}))
-    assert library.ngpt_set_layer(job.handle, b"primal", None, 0, 0, 0, 0, 0) == OK
-    assert job.run() == MISSING_LAYER and "primal" in job.message()
-    job.free()
-
-
 # --- where pixels lie ------------------------------------------------------------------------------------------------
 
 
@@ -181,18 +153,6 @@ def test_layouts_give_the_same(fast, layout):
     assert (image[..., 3:] == 99).all()
     for name in given:
         np.testing.assert_array_equal(before[name], given[name])
-
-
-def test_strides_of_nought_are_those_without_gaps(library, fast):
-    layers = those(fast, example())
-    job = Job(fast, layers)
-    for name, layer in layers.items():
-        data, form, channels, *_ = place(layer)
-        assert library.ngpt_set_layer(job.handle, name.encode(), data, form, channels, 0, 0, 0) == OK
-    assert library.ngpt_set_output(job.handle, b"image", job.image.ctypes.data, 0, 3, 0, 0, 0) == OK
-    assert job.run() == OK
-    np.testing.assert_array_equal(job.image, result(fast, layers))
-    job.free()
 
 
 def test_halves(primal):

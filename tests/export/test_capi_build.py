@@ -8,7 +8,6 @@ import sys
 
 import pytest
 from capi import HEADER, PRIMAL, SOURCE, Network, command, example, result, those, tool
-from processes import left_in_home
 
 import ngpt
 
@@ -72,14 +71,6 @@ def test_the_program_of_the_docs(renderer_project, program):
     assert outcome.returncode == 1 and outcome.stderr == "none.onnx: cannot be read, or is empty\n"
 
 
-def test_nothing_is_left_in_a_home(renderer_project, tmp_path):
-    """ONNX Runtime's telemetry is off before it begins."""
-    call = renderer_project / "in-c", PRIMAL.with_name("ngpt-fast.onnx")
-    assert left_in_home(tmp_path, *call) == []
-    if not left_in_home(tmp_path / "on", *call, ORT_DISABLE_TELEMETRY="0"):
-        pytest.skip("this build of ONNX Runtime sends no telemetry")
-
-
 def test_pkg_config_tells_where_it_is(prefix, tmp_path):
     environment = os.environ | {"PKG_CONFIG_PATH": f"{prefix}/lib/pkgconfig"}
     words = [tool("pkg-config"), "--print-errors", "ngpt"]
@@ -103,9 +94,9 @@ def configured(folder, *options) -> str:
     return " ".join((outcome.stdout + outcome.stderr).split())
 
 
-def test_cmake_tells_where_to_get_what_is_missing(runtime, tmp_path):
+def test_cmake_tells_where_to_get_what_is_missing(toolchain, tmp_path):
     tool("g++", "clang++")
-    (tmp_path / "include").symlink_to(runtime / "include")
+    (tmp_path / "include").symlink_to(toolchain / "include")
     told = configured(tmp_path / "none")
     assert "headers (onnxruntime_cxx_api.h, of 1.21 or newer) are not found. Pass -DORT_ROOT=FOLDER" in told
     assert "libonnxruntime-dev" in told and "docs/embed/c-library.md" in told

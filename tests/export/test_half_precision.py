@@ -60,13 +60,6 @@ def test_half_the_bytes_the_same_model_and_the_curve_until_its_step(run, tmp_pat
     assert losses[0] == pytest.approx(np.mean(1 / np.arange(1, 11)), rel=1e-3) and losses[0] > losses[1]
 
 
-def test_a_curve_once_kept_stays(run, tmp_path):
-    (tmp_path / "elsewhere").mkdir()
-    assert export(run, tmp_path / "elsewhere/a.safetensors") == 0
-    assert export(tmp_path / "elsewhere/a.safetensors", tmp_path / "elsewhere/b.safetensors") == 0
-    assert (tmp_path / "elsewhere/a.safetensors").read_bytes() == (tmp_path / "elsewhere/b.safetensors").read_bytes()
-
-
 def test_what_reads_them_computes_in_32_bits(run, tmp_path):
     half, onnx = tmp_path / "half.safetensors", tmp_path / "half.onnx"
     assert export(run, half) == 0 and export(half, onnx) == 0
@@ -98,14 +91,6 @@ def test_numbers_that_16_bits_cannot_hold_are_refused(model, tmp_path, capsys, c
     save_weights(tmp_path / "w.safetensors", model, {})
     assert export(tmp_path / "w.safetensors", tmp_path / "half.safetensors") == 1
     assert message in capsys.readouterr().err and not (tmp_path / "half.safetensors").exists()
-
-
-def test_other_files_and_other_outputs_are_refused(run, tmp_path, capsys):
-    write_tensors(tmp_path / "c.safetensors", {"a": torch.zeros(1)}, {"kind": "checkpoint"})
-    assert export(tmp_path / "c.safetensors", tmp_path / "half.safetensors") == 1
-    assert "holds a checkpoint, not weights" in capsys.readouterr().err
-    assert export(run, tmp_path / "half.safetensors", "--vector", tmp_path / "vector") == 2
-    assert main(["export", "-o", str(tmp_path / "half.safetensors")]) == 2
 
 
 @pytest.mark.parametrize("path", sorted((Path(__file__).parents[2] / "export" / "weights").glob("*.safetensors")))

@@ -18,7 +18,6 @@ import pytest
 from browser import Session
 from exr_files import noise, same_bits, window, write_raw
 from hosts import HOSTS, VECTOR, agree, caller, cpp_host, node, node_host, node_modules, read_layers, read_pfm
-from processes import left_in_home
 
 import ngpt
 from ngpt.cli import main
@@ -71,16 +70,8 @@ def wide(tmp_path_factory, python):
 
 
 @pytest.fixture(scope="module", params=[cpp_host, node_host], ids=["cpp", "node"])
-def host(request, tmp_path_factory):
+def host(request, toolchain, tmp_path_factory):
     return caller(request.param(tmp_path_factory.mktemp("host")))
-
-
-def test_node_leaves_nothing_in_a_home(tmp_path):
-    """ONNX Runtime's telemetry is off before it is loaded; that of C and C++ is tested with the C library."""
-    call = [*node_host(tmp_path), MODEL, VECTOR, tmp_path / "image.pfm"]
-    assert left_in_home(tmp_path / "home", *call) == []
-    if not left_in_home(tmp_path / "on", *call, ORT_DISABLE_TELEMETRY="0"):
-        pytest.skip("this build of ONNX Runtime sends no telemetry")
 
 
 def test_the_vector_is_what_denoise_makes_of_all_that_goes_wrong():
@@ -106,13 +97,6 @@ def test_tiles_of_a_host_agree_with_the_whole(host, wide, tmp_path):
     agree(read_pfm(tmp_path / "image.pfm"), expected)
 
 
-def test_a_host_needs_no_direct_emission(host, python, tmp_path):
-    layers = {name: layer for name, layer in read_layers(VECTOR).items() if name not in ("image", "direct")}
-    result = host(MODEL, write_vector(tmp_path / "layers", layers), tmp_path / "image.pfm")
-    assert result.returncode == 0, result.stderr
-    agree(read_pfm(tmp_path / "image.pfm"), python(layers | {"direct": np.zeros_like(layers["primal"])}))
-
-
 def test_a_host_says_what_is_wrong(host, tmp_path):
     def refused(status, message, *arguments):
         result = host(*arguments)
@@ -131,35 +115,6 @@ def test_a_host_says_what_is_wrong(host, tmp_path):
     )
     other = write_vector(tmp_path / "b", layers | {"depth": layers["depth"][..., 1:]})
     refused(1, "depth", MODEL, other, output)
-
-
-@pytest.mark.slow
-def test_a_host_at_640x360(host, python, tmp_path, capsys, request):
-    layers = repeated(360, 640)
-    folder = write_vector(tmp_path / "layers", layers)
-    host_times, times = [], []
-    for _ in range(3):
-        warm = host(MODEL, folder, tmp_path / "image.pfm", 0, 2).stdout.splitlines()[-1]
-        host_times.append(float(warm.removesuffix(" ms")))
-        start = time.perf_counter()
-        expected = python(layers)
-        times.append(1000 * (time.perf_counter() - start))
-    tell(capsys, request.node.name, host_times, times, read_pfm(tmp_path / "image.pfm"), expected)
-
-
-def tell(capsys, name, host_times, times, image, expected):
-    """What docs/embed/hosts.md publishes; medians."""
-    agree(image, expected)
-    worst = np.abs(image - expected).max() / np.abs(expected).max()
-    with capsys.disabled():
-        print(
-            f"\n{name}: {np.median(host_times):.0f} ms, Python {np.median(times):.0f} ms, worst difference {worst:.1e}"
-        )
-
-
-@pytest.mark.parametrize("path", [*HOSTS.glob("*/*.?pp"), *HOSTS.glob("*/*.mjs")], ids=lambda path: path.name)
-def test_hosts_are_short(path):
-    assert path.read_text().count("\n") < 200
 
 
 # --- the browser's reader of stacks, in Node -------------------------------------------------------------------------
@@ -320,7 +275,7 @@ class Page(Session):
 
 
 @pytest.fixture(scope="module")
-def page(tmp_path_factory):
+def page(chromium, tmp_path_factory):
     from export.hosts.web.build import build
 
     runtime, folder = node_modules("onnxruntime-web", "web"), tmp_path_factory.mktemp("page")
@@ -336,13 +291,6 @@ def test_the_page_agrees_with_python(page):
     assert re.fullmatch(r"example.exr: 29x23 in .* s, after .* s of loading", page.ask("$('status').textContent"))
     assert same_bits(page.pixels("stack.layers.primal"), layers["primal"])
     agree(page.pixels("clean"), layers["image"])
-
-
-def test_the_page_needs_no_direct_emission(page, python, tmp_path):
-    layers = {name: layer for name, layer in read_layers(VECTOR).items() if name not in ("image", "direct")}
-    page.give(write_stack(tmp_path / "lamp.exr", layers))
-    assert page.ask("$('status').textContent").startswith("lamp.exr: 29x23")
-    agree(page.pixels("clean"), python(layers | {"direct": np.zeros_like(layers["primal"])}))
 
 
 def test_tiles_of_the_page_agree_with_the_whole(page, wide):
@@ -389,35 +337,6 @@ def test_the_page_says_what_is_wrong_and_goes_on(page, tmp_path):
     assert page.ask("$('problem').hidden") is True and page.ask("root.dataset.error ?? null") is None
     agree(page.pixels("clean"), layers["image"])
     assert page.complaints == []
-
-
-def test_a_file_may_be_dropped(page):
-    page.ask("""root.dataset.ready = 'false'; delete root.dataset.error; dropped = new DataTransfer();
-        dropped.items.add(new File(['not an image'], 'dropped.exr'));
-        document.body.dispatchEvent(new DragEvent('drop', {dataTransfer: dropped, bubbles: true}))""")
-    page.settle()
-    assert page.ask("$('problem').textContent") == "dropped.exr: it is not an OpenEXR file"
-
-
-def test_a_bad_file_does_not_end_the_work_on_a_good_one(page, wide):
-    folder, expected = wide
-    page.send(read_layers(folder), 0, "open('bad.exr', new ArrayBuffer(3)).then(() => delete root.dataset.error)")
-    assert page.ask("$('problem').textContent") == "bad.exr: it is not an OpenEXR file"
-    agree(page.pixels("clean"), expected)
-
-
-@pytest.mark.slow
-def test_the_page_at_640x360(page, python, tmp_path, capsys):
-    layers = repeated(360, 640)
-    stack = write_stack(tmp_path / "stack.exr", layers)
-    page_times, times = [], []
-    for _ in range(3):
-        page.give(stack)
-        page_times.append(1000 * float(re.search(r"in ([\d.]+) s", page.ask("$('status').textContent"))[1]))
-        start = time.perf_counter()
-        expected = python(layers)
-        times.append(1000 * (time.perf_counter() - start))
-    tell(capsys, "page", page_times, times, page.pixels("clean"), expected)
 
 
 @pytest.mark.slow

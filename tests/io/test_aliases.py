@@ -1,5 +1,8 @@
 """Layer names: each producer's files, overrides, ambiguities, and what is refused."""
 
+import re
+from pathlib import Path
+
 import pytest
 
 from ngpt.errors import NgptError
@@ -17,212 +20,30 @@ def names(*layers: str) -> list[str]:
     return channels
 
 
-CYCLES = names(
-    "ViewLayer.Combined.RGBA",
-    "ViewLayer.Combined_key light.RGB",
-    "ViewLayer.Noisy Image.RGBA",
-    "ViewLayer.Depth.Z",
-    "ViewLayer.Normal.XYZ",
-    "ViewLayer.Vector.XYZW",
-    "ViewLayer.Diffuse Color.RGB",
-    "ViewLayer.Denoising Albedo.RGB",
-    "ViewLayer.Denoising Normal.XYZ",
-    "ViewLayer.Denoising Depth.Z",
-    "ViewLayer.CryptoObject00.rgba",
-)
-PRODUCERS = {
-    "Cycles": (
-        [("", CYCLES)],
-        {
-            "primal": ["ViewLayer.Noisy Image.R", "ViewLayer.Noisy Image.G", "ViewLayer.Noisy Image.B"],
-            "albedo": ["ViewLayer.Denoising Albedo.R", "ViewLayer.Denoising Albedo.G", "ViewLayer.Denoising Albedo.B"],
-            "normal": ["ViewLayer.Denoising Normal.X", "ViewLayer.Denoising Normal.Y", "ViewLayer.Denoising Normal.Z"],
-            "depth": ["ViewLayer.Denoising Depth.Z"],
-            "motion": ["ViewLayer.Vector.X", "ViewLayer.Vector.Y"],
-            "alpha": ["ViewLayer.Noisy Image.A"],
-        },
-    ),
-    "Cycles, older": (
-        [("", names("RenderLayer.Combined.RGBA", "RenderLayer.Depth.V", "RenderLayer.DiffCol.RGB"))],
-        {
-            "primal": names("RenderLayer.Combined.RGB"),
-            "albedo": names("RenderLayer.DiffCol.RGB"),
-            "depth": ["RenderLayer.Depth.V"],
-            "alpha": ["RenderLayer.Combined.A"],
-        },
-    ),
-    "Cycles, multi-part": (
-        [
-            ("ViewLayer.Depth", ["ViewLayer.Depth.V"]),
-            ("ViewLayer.Combined", names("ViewLayer.Combined.RGBA")),
-            ("ViewLayer.Denoising Albedo", list("RGB")),
-        ],
-        {
-            "primal": names("ViewLayer.Combined.RGB"),
-            "albedo": list("RGB"),
-            "depth": ["ViewLayer.Depth.V"],
-            "alpha": ["ViewLayer.Combined.A"],
-        },
-    ),
-    "Arnold": (
-        [("", names("RGBA", "RGBA_key.RGB", "Z", "N.XYZ", "P.XYZ", "denoise_albedo.RGB", "diffuse.RGB", "direct.RGB"))],
-        {
-            "primal": list("RGB"),
-            "albedo": names("denoise_albedo.RGB"),
-            "normal": names("N.XYZ"),
-            "depth": ["Z"],
-            "alpha": ["A"],
-        },
-    ),
-    "Arnold, multi-part": (
-        [("RGBA", list("RGBA")), ("N", list("XYZ")), ("Z", ["Z"]), ("diffuse_albedo", list("RGB"))],
-        {"primal": list("RGB"), "albedo": list("RGB"), "normal": list("XYZ"), "depth": ["Z"], "alpha": ["A"]},
-    ),
-    "RenderMan": (
-        [
-            (
-                "",
-                [
-                    *names("Ci.rgb", "albedo.rgb", "albedo_var.rgb", "normal.xyz", "diffuse.rgb", "mse.rgb"),
-                    "a",
-                    "zfiltered",
-                    "zfiltered_var",
-                    "sampleCount",
-                ],
-            )
-        ],
-        {
-            "primal": names("Ci.rgb"),
-            "albedo": names("albedo.rgb"),
-            "normal": names("normal.xyz"),
-            "depth": ["zfiltered"],
-            "alpha": ["a"],
-        },
-    ),
-    "V-Ray": (
-        [
-            (
-                "",
-                [
-                    *"RGBA",
-                    "diffuse.red",
-                    "diffuse.green",
-                    "diffuse.blue",
-                    *names("bump_normals.XYZ"),
-                    "other.noiseLevel",
-                ],
-            )
-        ],
-        {
-            "primal": list("RGB"),
-            "albedo": ["diffuse.red", "diffuse.green", "diffuse.blue"],
-            "normal": names("bump_normals.XYZ"),
-            "alpha": ["A"],
-        },
-    ),
-    "Mitsuba 3": (
-        [("", names("RGB", "img.RGBA", "albedo.RGB", "nn.XYZ", "dd.y.T", "position.XYZ", "uv.UV", "m2_nested.XYZ"))],
-        {
-            "primal": list("RGB"),
-            "albedo": names("albedo.RGB"),
-            "normal": names("nn.XYZ"),
-            "depth": ["dd.y.T"],
-        },
-    ),
-    "Mitsuba 3, as its denoiser is shown": (
-        [("", names("RGB", "albedo.RGB", "normals.XYZ", "dd.T"))],
-        {
-            "primal": list("RGB"),
-            "albedo": names("albedo.RGB"),
-            "normal": names("normals.XYZ"),
-            "depth": ["dd.T"],
-        },
-    ),
-    "V-Ray for 3ds Max": (
-        [
-            (
-                "",
-                names(
-                    "RGBA",
-                    "VRayDiffuseFilter.RGB",
-                    "VRayNormals.RGB",
-                    "VRayBumpNormals.RGB",
-                    "VRayZDepth.RGB",
-                    "VRayLighting.RGB",
-                ),
-            )
-        ],
-        {
-            "primal": list("RGB"),
-            "albedo": names("VRayDiffuseFilter.RGB"),
-            "normal": names("VRayBumpNormals.RGB"),
-            "alpha": ["A"],
-        },
-    ),
-    "Redshift": (
-        [("", names("RGBA", "DiffuseFilter.RGB", "N.RGB", "BumpNormals.RGB", "DiffuseLighting.RGB", "Z"))],
-        {
-            "primal": list("RGB"),
-            "albedo": names("DiffuseFilter.RGB"),
-            "normal": names("BumpNormals.RGB"),
-            "depth": ["Z"],
-            "alpha": ["A"],
-        },
-    ),
-    "Karma": (
-        [("", names("C.RGBA", "albedo.RGB", "N.XYZ", "directdiffuse.RGB", "C_key.RGB"))],
-        {
-            "primal": names("C.RGB"),
-            "albedo": names("albedo.RGB"),
-            "normal": names("N.XYZ"),
-            "alpha": ["C.A"],
-        },
-    ),
-    "Karma, multi-part": (
-        [("albedo", list("RGB")), ("C", list("RGBA"))],
-        {"primal": list("RGB"), "albedo": list("RGB"), "alpha": ["A"]},
-    ),
-    "LuxCore in Blender": (
-        [
-            (
-                "",
-                names(
-                    "View Layer.Combined.RGBA",
-                    "View Layer.Depth.Z",
-                    "View Layer.ALBEDO.RGB",
-                    "View Layer.GEOMETRY_NORMAL.XYZ",
-                    "View Layer.SHADING_NORMAL.XYZ",
-                    "View Layer.AVG_SHADING_NORMAL.XYZ",
-                    "View Layer.DIRECT_DIFFUSE.RGB",
-                ),
-            )
-        ],
-        {
-            "primal": names("View Layer.Combined.RGB"),
-            "albedo": names("View Layer.ALBEDO.RGB"),
-            "normal": names("View Layer.AVG_SHADING_NORMAL.XYZ"),
-            "depth": ["View Layer.Depth.Z"],
-            "alpha": ["View Layer.Combined.A"],
-        },
-    ),
-    "pbrt-v4": (
-        [("", names("RGB", "Albedo.RGB", "P.XYZ", "N.XYZ", "Ns.XYZ", "Variance.RGB", "RelativeVariance.RGB", "u"))],
-        {"primal": list("RGB"), "albedo": names("Albedo.RGB"), "normal": names("Ns.XYZ")},
-    ),
-    "ngpt": (
-        [("", names("RGBA", "primal.RGB", "dx.RGB", "dy.RGB", "direct.RGB", "dx_var.RGB", "depth.Z", "normal.XYZ"))],
-        {
-            "primal": names("primal.RGB"),
-            "direct": names("direct.RGB"),
-            "dx": names("dx.RGB"),
-            "dy": names("dy.RGB"),
-            "normal": names("normal.XYZ"),
-            "depth": ["depth.Z"],
-            "dx_var": names("dx_var.RGB"),
-            "alpha": ["A"],
-        },
-    ),
-}
+def spelled(text: str, separator: str) -> list[str]:
+    """The channels of a list in ``producers.txt``."""
+    words = text.split(separator)
+    return [channel for word in words for channel in ([word[1:]] if word.startswith("=") else names(word))]
+
+
+def producers() -> dict[str, tuple[list, dict]]:
+    """What ``producers.txt`` holds: name -> (parts, layer -> channels)."""
+    found: dict[str, tuple[list, dict]] = {}
+    text = re.sub(r"^#.*\n", "", Path(__file__).with_name("producers.txt").read_text(), flags=re.M)
+    for line in text.replace("\n        ", " ").splitlines():
+        if not line.startswith(" "):
+            parts, layers = found[line] = [], {}
+        elif line.startswith("    -> "):
+            for entry in line.removeprefix("    -> ").split(", "):
+                layer, _, channels = entry.partition(" = ")
+                layers[layer] = spelled(channels, " + ")
+        else:
+            part, colon, channels = line.strip().rpartition(": ")
+            parts.append((part if colon else "", spelled(channels, ", ")))
+    return found
+
+
+PRODUCERS = producers()
 
 
 @pytest.mark.parametrize("producer", PRODUCERS)
@@ -234,24 +55,26 @@ def test_each_producer_is_understood(producer):
         assert set(where.channels) <= set(parts[where.part][1]), name
 
 
-def test_one_channel_with_two_names_is_not_ambiguous():
-    found = resolve([("beauty", list("RGB")), ("View.Z", ["Z"])])
-    assert found["depth"][:2] == (1, ("Z",))
+EYE = [*"RGBAZ", *names("albedo.RGB")]
 
 
-def test_parts_are_told_apart():
-    found = resolve(PRODUCERS["Arnold, multi-part"][0])
-    assert {name: where.part for name, where in found.items()} == {
-        "primal": 0, "normal": 1, "depth": 2, "albedo": 3, "alpha": 0,
-    }  # fmt: skip
-
-
-def test_normals_may_be_spelled_as_colours():
-    assert resolve([("", names("RGB", "normal.RGB"))])["normal"].channels == ("normal.R", "normal.G", "normal.B")
-
-
-def test_channel_order_is_canonical_whatever_the_order_in_the_file():
-    assert resolve([("", ["B", "G", "R", "dx.G", "dx.B", "dx.R"])])["dx"].channels == ("dx.R", "dx.G", "dx.B")
+@pytest.mark.parametrize(
+    ("parts", "layer", "part", "channels"),
+    [
+        ([("beauty", "RGB"), ("View.Z", "Z")], "depth", 1, "Z"),
+        (PRODUCERS["Arnold, multi-part"][0], "albedo", 3, "RGB"),
+        ([("", names("RGB", "normal.RGB"))], "normal", 0, names("normal.RGB")),
+        ([("", ["B", "G", "R", "dx.G", "dx.B", "dx.R"])], "dx", 0, names("dx.RGB")),
+        ([("", names("RGB", "dx.RGB", "shadow.dx.RGB"))], "dx", 0, names("dx.RGB")),
+        ([("", names("C.rgba", "albedo.RGB"))], "alpha", 0, ["C.a"]),
+        ([("left", EYE), ("right", EYE)], "albedo", 0, names("albedo.RGB")),
+        ([("albedo", "RGB"), ("Combined", "RGB")], "primal", 1, "RGB"),
+    ],
+)
+def test_which_channels_a_layer_is_found_in(parts, layer, part, channels):
+    """One name for two layers, parts, other letters, any order, whole names before tails, and the first of two eyes."""
+    found = resolve([(name, list(listed)) for name, listed in parts])[layer]
+    assert (found.part, list(found.channels)) == (part, list(channels))
 
 
 TWO_VIEWS = [("", names("Near.Combined.RGBA", "Far.Combined.RGBA", "Near.Denoising Albedo.RGB", "Far.Depth.Z"))]
@@ -293,18 +116,6 @@ def test_an_ambiguous_feature_is_settled_by_its_own_override_only():
     with pytest.raises(NgptError, match="layer 'albedo' could be any of"):
         resolve(parts, {"albedo": "Denoising Albedo"})
     assert resolve(parts, {"albedo": "b.Denoising Albedo"})["albedo"].channels[1] == "b.Denoising Albedo.G"
-
-
-def test_a_whole_name_beats_a_tail():
-    found = resolve([("", names("RGB", "dx.RGB", "shadow.dx.RGB"))])
-    assert found["dx"].channels[0] == "dx.R"
-
-
-def test_of_two_eyes_the_one_that_holds_primal_counts():
-    found = resolve([("left", [*"RGBAZ", *names("albedo.RGB")]), ("right", [*"RGBAZ", *names("albedo.RGB")])])
-    assert {name: where.part for name, where in found.items()} == {"primal": 0, "albedo": 0, "depth": 0, "alpha": 0}
-    found = resolve([("left", [*"RGBAZ"]), ("right", [*"RGBAZ"])], {"primal": "right"})
-    assert {name: where.part for name, where in found.items()} == {"primal": 1, "depth": 1, "alpha": 1}
 
 
 def test_overrides_beat_aliases_and_match_tails():
@@ -353,12 +164,6 @@ def test_files_that_make_no_stack(channels, expected):
     assert str(caught.value).startswith("a.exr: ") and expected in str(caught.value)
 
 
-def test_the_root_of_a_part_called_albedo_is_no_primal():
-    with pytest.raises(NgptError, match="no primal image"):
-        resolve([("albedo", list("RGB")), ("N", list("XYZ"))])
-    assert resolve([("albedo", list("RGB")), ("Combined", list("RGB"))])["primal"].part == 1
-
-
 @pytest.mark.parametrize("name", ["beauty", "rgba", "fog", "ViewLayer.Bild", "Normal lights.beauty"])
 def test_the_only_layer_of_colour_is_the_colour(name):
     more = names("albedo.RGB", "N.XYZ", "CryptoObject00.rgba", "worldPosition.RGB", "albedo_var.RGB", "diffuse.RGB")
@@ -367,11 +172,6 @@ def test_the_only_layer_of_colour_is_the_colour(name):
     assert found["albedo"].name == "albedo"
     parts = [("albedo", list("RGB")), (name, list("RGBA"))]
     assert resolve(parts)["primal"].part == 1
-
-
-def test_small_letters_are_alpha_too():
-    found = resolve([("", names("C.rgba", "albedo.RGB"))])
-    assert found["primal"].channels == ("C.r", "C.g", "C.b") and found["alpha"].channels == ("C.a",)
 
 
 def test_motion_of_cycles_is_turned_to_ours():

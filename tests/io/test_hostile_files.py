@@ -2,8 +2,6 @@
 
 import os
 import struct
-import subprocess
-import sys
 import threading
 import time
 from pathlib import Path
@@ -19,7 +17,7 @@ import ngpt.cli
 from ngpt.errors import NgptError
 from ngpt.io import header, isolated, openexr
 from ngpt.io.isolated import read_exr_isolated
-from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
+from ngpt.io.openexr import read_exr
 
 PIXELS = {name: np.arange(80, dtype=np.float32).reshape(8, 10) for name in "RGB"}
 
@@ -105,13 +103,6 @@ def test_headers_that_ask_for_too_much_or_contradict_themselves(tmp_path, monkey
     assert expected in refused(path)
 
 
-def test_many_parts_of_many_channels(tmp_path):
-    several = [({f"c{i:03d}": PIXELS["R"] for i in range(100)}, {}, f"part {p}") for p in range(41)]
-    assert "has 4100 channels in 41 parts, and 4096 are read at most" in refused(
-        write_raw(tmp_path / "a.exr", *several)
-    )
-
-
 def test_more_than_half_of_the_memory_is_not_decoded(tmp_path, monkeypatch):
     path = write_raw(tmp_path / "a.exr", (PIXELS,))
     need = 3 * 80 * 4
@@ -119,14 +110,6 @@ def test_more_than_half_of_the_memory_is_not_decoded(tmp_path, monkeypatch):
     read_exr(path)
     monkeypatch.setattr(header, "memory", lambda: 2 * need - 2)
     assert "its 3 channels take 0.0 GiB, more than half of" in refused(path)
-
-
-def test_memory_is_what_the_process_may_have():
-    code = (
-        "import resource as r; from ngpt.io.header import memory; whole = memory();"
-        "r.setrlimit(r.RLIMIT_AS, (2**33, 2**33)); assert memory() == min(whole, 2**33); print('fine')"
-    )
-    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "fine\n"
 
 
 @pytest.mark.parametrize(
@@ -146,23 +129,6 @@ def test_a_part_that_openexr_reads_otherwise_than_its_header_is_refused(tmp_path
     fewer = OpenEXR.File(str(write_raw(tmp_path / "b.exr", ({"R": PIXELS["R"]},))), separate_channels=True)
     monkeypatch.setattr(openexr.OpenEXR, "File", lambda *args, **kwargs: fewer)
     assert "damaged or incomplete" in refused(path)
-
-
-def test_names_that_collide_with_layers_keep_their_channels(tmp_path):
-    """OpenEXR's own grouping of channels has had memory errors on these."""
-    names = ("R", "G", "B", "left", "left.R", "left.G", "left.B", "left.R.R", "A.B", "A")
-    channels = {name: np.full((4, 5), i, np.float32) for i, name in enumerate(names)}
-    stack = ngpt.read(write_raw(tmp_path / "a.exr", (channels,)))
-    assert np.array_equal(stack["primal"][0, 0], [0, 1, 2])
-    assert ngpt.read(ngpt.write(tmp_path / "b.exr", stack)).source.image.parts[0].channels.keys() == channels.keys()
-
-
-def test_parts_of_one_name_are_refused(tmp_path):
-    def rename(exr):
-        setting(b"name", b"same")(exr)
-
-    path = changed(tmp_path, rename, (PIXELS, {}, "one!"), (PIXELS, {}, "two!"))
-    assert "damaged or incomplete (two parts are called 'same')" in refused(path)
 
 
 @pytest.mark.parametrize("kind", ["fifo", "device", "loop", "zero", "long"])
@@ -274,14 +240,6 @@ def test_isolated_is_the_same(tmp_path, compression):
             assert comparable(part.header[name]) == comparable(expected.header[name]), name
 
 
-def test_isolated_errors_are_those_of_reading(tmp_path):
-    path = changed(tmp_path, setting(b"compression", b"\x63"))
-    assert refused(path) == refused(path, read_exr_isolated)
-    path = write_raw(tmp_path / "b.exr", ({name: np.random.rand(40, 40).astype("f4") for name in "RGB"},))
-    os.truncate(path, path.stat().st_size - 100)
-    assert refused(path) == refused(path, read_exr_isolated)
-
-
 @pytest.mark.parametrize(
     ("body", "expected"),
     [
@@ -300,13 +258,6 @@ def test_a_decoder_that_crashes_or_stalls_is_an_error(tmp_path, monkeypatch, bod
     assert expected in refused(path, read_exr_isolated)
 
 
-def test_programs_beside_the_file_are_not_run(tmp_path, monkeypatch):
-    path = write_raw(tmp_path / "a.exr", (PIXELS,))
-    (tmp_path / "numpy.py").write_text("raise SystemExit('run')")
-    monkeypatch.chdir(tmp_path)
-    assert read_exr_isolated(path).parts[0].channels.keys() == set("RGB")
-
-
 def test_the_command_line_isolates_on_request(tmp_path, monkeypatch, capsys):
     path = write_raw(tmp_path / "a.exr", (PIXELS,))
     (tmp_path / "lib").mkdir()
@@ -317,8 +268,17 @@ def test_the_command_line_isolates_on_request(tmp_path, monkeypatch, capsys):
     assert ngpt.cli.main(["denoise", "-m", "primal", str(path)]) == 0
 
 
-def test_images_too_large_to_read_again_can_be_written(tmp_path, monkeypatch):
-    """Limits are for what comes in."""
-    monkeypatch.setattr(header, "MAX_PIXELS", 10)
-    path = write_exr(tmp_path / "a.exr", ExrImage([ExrPart("", {}, PIXELS)]))
-    assert "10x8 pixels" in refused(path)
+def test_names_that_collide_with_layers_keep_their_channels(tmp_path):
+    """OpenEXR's own grouping of channels has had memory errors on these."""
+    names = ("R", "G", "B", "left", "left.R", "left.G", "left.B", "left.R.R", "A.B", "A")
+    channels = {name: np.full((4, 5), i, np.float32) for i, name in enumerate(names)}
+    stack = ngpt.read(write_raw(tmp_path / "a.exr", (channels,)))
+    assert np.array_equal(stack["primal"][0, 0], [0, 1, 2])
+    assert ngpt.read(ngpt.write(tmp_path / "b.exr", stack)).source.image.parts[0].channels.keys() == channels.keys()
+
+
+def test_programs_beside_the_file_are_not_run(tmp_path, monkeypatch):
+    path = write_raw(tmp_path / "a.exr", (PIXELS,))
+    (tmp_path / "numpy.py").write_text("raise SystemExit('run')")
+    monkeypatch.chdir(tmp_path)
+    assert read_exr_isolated(path).parts[0].channels.keys() == set("RGB")

@@ -1,9 +1,5 @@
 """OpenEXR files, verbatim: every attribute type, tiles and levels, lossy sources, memory layouts, and bad files."""
 
-import copy
-import multiprocessing
-import os
-import pickle
 from fractions import Fraction
 
 import numpy as np
@@ -11,7 +7,6 @@ import OpenEXR
 import pytest
 from exr_files import comparable, noise, read_raw, same_bits, window, write_levels, write_raw
 
-import ngpt
 from ngpt.errors import NgptError
 from ngpt.io.openexr import ExrImage, ExrPart, read_exr, write_exr
 
@@ -80,13 +75,6 @@ def test_attributes_of_every_type_pass_through(tmp_path, name):
     assert repr(comparable_header(new)) == repr(comparable_header(old))
 
 
-@pytest.mark.parametrize("again", [copy.deepcopy, lambda image: pickle.loads(pickle.dumps(image))])
-def test_what_was_read_is_the_same_when_copied_or_pickled(tmp_path, again):
-    image = read_exr(write_raw(tmp_path / "in.exr", (PIXELS, ATTRIBUTES)))
-    files = [write_exr(tmp_path / name, one) for name, one in (("a.exr", image), ("b.exr", again(image)))]
-    assert files[0].read_bytes() == files[1].read_bytes()
-
-
 def comparable_header(header):
     return {name: comparable(value) for name, value in header.items()}
 
@@ -136,13 +124,6 @@ def test_strided_arrays_are_not_written_as_garbage(tmp_path, layout, dtype):
     path = write_exr(tmp_path / "a.exr", ExrImage([ExrPart("", {}, views)]))
     for name, pixels in read_raw(path)[0][2].items():
         assert same_bits(pixels, np.ascontiguousarray(views[name]))
-
-
-def test_interleaved_and_foreign_byte_order_arrays_are_not_written_as_garbage(tmp_path):
-    image = np.arange(60, dtype=">f4").reshape(4, 5, 3)
-    path = write_exr(tmp_path / "a.exr", ExrImage([ExrPart("", {}, {c: image[..., i] for i, c in enumerate("RGB")})]))
-    for i, name in enumerate("RGB"):
-        assert np.array_equal(read_raw(path)[0][2][name], image[..., i])
 
 
 @pytest.mark.parametrize("compression", ["PXR24", "B44", "B44A", "DWAA", "DWAB"])
@@ -195,27 +176,6 @@ def test_parts_of_every_kind_keep_their_names_and_order(tmp_path):
         assert header["lineOrder"] == old_header["lineOrder"]
 
 
-def test_a_stale_chunk_count_is_not_written(tmp_path):
-    source = write_raw(tmp_path / "a.exr", (PIXELS, {"chunkCount": 99}))
-    assert read_raw(source)[0][1]["chunkCount"] == 99, "OpenEXR believes it"
-    assert "chunkCount" not in read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]
-
-
-def test_perceptual_linearity_is_kept_and_empty_lists_are_dropped(tmp_path):
-    source = write_raw(tmp_path / "a.exr", (PIXELS,))
-    channels = {name: OpenEXR.Channel(pixels, 1, 1, name == "G") for name, pixels in PIXELS.items()}
-    OpenEXR.File({"type": OpenEXR.scanlineimage}, channels).write(str(source))
-    image = read_exr(source)
-    image.parts[0].header["nothing"] = []
-    header = read_raw(write_exr(tmp_path / "b.exr", image))[0][1]
-    assert {channel.name: bool(channel.pLinear) for channel in header["channels"]} == {
-        "R": False,
-        "G": True,
-        "B": False,
-    }
-    assert "nothing" not in header
-
-
 @pytest.mark.parametrize(
     ("part", "expected"),
     [
@@ -234,12 +194,6 @@ def test_what_openexr_cannot_hold_leaves_no_file(tmp_path, part, expected):
         write_exr(tmp_path / "a.exr", ExrImage([part]))
     assert expected in str(caught.value) and str(tmp_path / "a.exr") in str(caught.value)
     assert "\n" not in str(caught.value) and not list(tmp_path.iterdir())
-
-
-def test_the_image_to_write_is_not_modified(tmp_path):
-    header, channels = {"owner": "me"}, dict(PIXELS)
-    write_exr(tmp_path / "a.exr", ExrImage([ExrPart("a", header, channels)]))
-    assert header == {"owner": "me"} and all(channels[name] is PIXELS[name] for name in "RGB")
 
 
 def deep(path):
@@ -278,14 +232,6 @@ def test_files_that_cannot_be_read(tmp_path, make, expected):
     with pytest.raises(NgptError) as caught:
         read_exr(path)
     assert str(caught.value).startswith(f"{path}: ") and expected in str(caught.value) and "\n" not in str(caught.value)
-
-
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may read anything")
-def test_files_without_permission(tmp_path):
-    path = write_raw(tmp_path / "a.exr", (PIXELS,))
-    path.chmod(0)
-    with pytest.raises(NgptError, match=r"cannot be read: Permission denied"):
-        read_exr(path)
 
 
 def test_truncated_files_are_refused_wherever_they_end(tmp_path, capsys):
@@ -327,14 +273,7 @@ def damaged(path):
     return copy
 
 
-@pytest.mark.skipif("fork" not in multiprocessing.get_all_start_methods(), reason="no fork here")
-@pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_forked_child_reads_what_its_parent_read(tmp_path):
-    path = ngpt.write(tmp_path / "a.exr", np.ones((40, 30, 3), np.float32))
-    ngpt.read(path)
-    child = multiprocessing.get_context("fork").Process(target=ngpt.read, args=(path,))
-    child.start()
-    child.join(30)
-    alive = child.is_alive()
-    child.kill()
-    assert not alive and child.exitcode == 0
+def test_a_stale_chunk_count_is_not_written(tmp_path):
+    source = write_raw(tmp_path / "a.exr", (PIXELS, {"chunkCount": 99}))
+    assert read_raw(source)[0][1]["chunkCount"] == 99, "OpenEXR believes it"
+    assert "chunkCount" not in read_raw(write_exr(tmp_path / "b.exr", read_exr(source)))[0][1]

@@ -6,7 +6,6 @@ import pytest
 from ngpt.errors import NgptError
 from ngpt.measure.metrics import (
     METRICS,
-    Metric,
     compare,
     exposure_mismatch,
     relative_squared_error,
@@ -49,12 +48,6 @@ def test_nonfinite_pixels_are_left_out_and_counted(rng):
     assert metrics == pytest.approx(expected)
 
 
-def test_equal_images(rng):
-    image = rng.random((4, 4, 3)).astype(np.float32)
-    metrics = compare(image, image)
-    assert metrics["relMSE"] == 0 and metrics["PSNR"] == float("inf")
-
-
 def test_errors(rng):
     with pytest.raises(NgptError, match="5x4 and 4x4"):
         compare(np.zeros((4, 5, 3)), np.zeros((4, 4, 3)))
@@ -72,12 +65,6 @@ def test_exposure_mismatch_is_in_stops_and_survives_fireflies(rng):
 
 
 SQUARED = [name for name, metric in METRICS.items() if metric.squared]
-
-
-def test_one_image_twice_is_one_reference(rng):
-    """The formula of halves, written once, is that of a single reference where the two are the same."""
-    x, r = rng.random((2, 40, 50, 3))
-    assert scores(SQUARED, x, r, r) == scores(SQUARED, x, r)
 
 
 def draws_of(name: str, count: int, noise: float) -> tuple[float, np.ndarray, np.ndarray]:
@@ -113,12 +100,6 @@ def test_halves_take_the_noise_off_psnr():
     assert one.mean() == pytest.approx(true - 10 * np.log10(1 + 0.03**2 / 2 / 0.02**2), abs=0.1)
 
 
-def test_an_error_too_small_to_tell_may_be_negative(rng):
-    a, b = 1 + 0.1 * rng.standard_normal((2, 20, 30, 3))
-    values = scores(SQUARED, (a + b) / 2, a, b)
-    assert values["relMSE"] < 0 and values["relMSE trimmed"] < 0 and values["PSNR"] == float("inf")
-
-
 def test_the_pixels_trimmed_are_those_far_from_the_mean_of_the_halves(rng):
     """Whatever the sign of their products."""
     truth = np.ones((50, 40, 3))
@@ -152,10 +133,3 @@ def test_every_metric_says_what_is_better(name, rng):
     noise = rng.normal(0, 0.05, reference.shape)
     equal, less, more = (scores([name], reference + k * noise, reference)[name] for k in (0, 1, 4))
     assert (equal < less < more) if metric.better == "lower" else (equal > less > more)
-
-
-def test_a_new_metric_is_one_entry(monkeypatch, rng):
-    x, r = rng.random((2, 4, 4, 3))
-    monkeypatch.setitem(METRICS, "bias", Metric("mean of x - r", "lower", lambda x, r: float((x - r).mean())))
-    assert compare(x, r)["bias"] == pytest.approx(x.mean() - r.mean())
-    assert scores(["bias"], x, r, r + 2)["bias"] == pytest.approx(x.mean() - r.mean() - 1)

@@ -7,7 +7,7 @@ from full_stack import full_stack
 import ngpt
 from ngpt.cli import main
 from ngpt.errors import NgptError
-from ngpt.network.run_onnx import Network, session
+from ngpt.network.run_onnx import Network
 
 onnx = pytest.importorskip("onnx")
 from onnx import TensorProto, helper  # noqa: E402
@@ -79,15 +79,6 @@ def test_a_network_of_frames_without_its_metadata_is_refused_by_name(tmp_path):
     path = network(tmp_path / "a.onnx", **{FRAMES: ", ".join(INPUTS), "ngpt.alignment": "much"})
     with pytest.raises(NgptError, match=r"a.onnx: its metadata .* no whole number"):
         OfFrames(path)
-
-
-def test_pipes_are_no_networks(tmp_path, capsys):
-    import os
-
-    os.mkfifo(tmp_path / "a.onnx")
-    with pytest.raises(NgptError, match="no such file"):
-        session(tmp_path / "a.onnx", "cpu", 0)
-    assert main(["info", str(tmp_path / "a.onnx")]) == 1
 
 
 EVIL = "x\x1b]0;title\x07\x1b[2J\rgood\u202eneddih"

@@ -4,19 +4,12 @@ import pytest
 import torch
 from torch.nn.functional import avg_pool2d
 
-from ngpt.errors import NgptError
-from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual, head_of
+from ngpt.network.heads import Direct, Kernels, Mixture, Pyramid, Residual
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.run_torch import reconstruct
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.weights import load_weights, save_weights
-from ngpt.training.settings import from_dict
 
 HEADS = [Direct(), Residual(("base",)), Mixture(("primal", "base")), Kernels(("primal", "base"), 3)]
-
-
-def by_kernels(size=3, start=("primal",), channels=(6,)):
-    return ModelConfig("plain", channels, (), ("primal", "albedo"), start=start, kernel=size)
 
 
 def images(head, height=9, width=11):
@@ -31,13 +24,6 @@ def images(head, height=9, width=11):
 
 def of_kernels(prediction, given, head):
     return signed_exp(head.forward(prediction, given))
-
-
-def test_which_head_a_configuration_has():
-    assert head_of((), 0) == Direct() and head_of(("base",), 0) == Residual(("base",))
-    assert head_of(("primal", "base"), 0) == Mixture(("primal", "base"))
-    assert head_of(("base",), 5) == Kernels(("base",), 5)
-    assert [head.outputs for head in HEADS] == [3, 3, 5, 18] and [head.radius for head in HEADS] == [0, 0, 0, 1]
 
 
 @pytest.mark.parametrize("head", HEADS[1:], ids=lambda head: type(head).__name__)
@@ -64,55 +50,6 @@ def test_kernels_stay_between_the_least_and_the_largest_pixel():
     result = of_kernels(20 * torch.randn(1, head.outputs, 9, 11), given, head)
     assert result.min() >= min(image.min() for image in given) - 1e-6
     assert result.max() <= max(image.max() for image in given) + 1e-5
-
-
-@pytest.mark.parametrize("size", [3, 17])
-def test_tiles_of_kernels_do_not_show(size):
-    """17 pixels reach further than this network sees."""
-    torch.manual_seed(0)
-    model = Reconstructor(by_kernels(size, channels=(4,))).eval()
-    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.5)
-    assert model.network.radius < 8 and model.radius == max(model.network.radius, size // 2)
-    layers = {name: torch.rand(1, 3, 40, 70) for name in model.config.inputs}
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, layers, tile=32), model(layers), rtol=1e-5, atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 16)])
-def test_any_size_and_any_exposure(size):
-    torch.manual_seed(0)
-    model = Reconstructor(by_kernels(17))
-    layers = {name: torch.rand(1, 3, *size) for name in model.config.inputs}
-    with torch.no_grad():
-        image = model(layers)
-        assert image.shape == (1, 3, *size) and torch.isfinite(image).all()
-        brighter = model(layers | {"primal": 1024 * layers["primal"]})
-    assert torch.allclose(brighter, 1024 * image, rtol=1e-4)
-
-
-def test_kernels_learn_to_average_within_edges(tmp_path):
-    """Noise on two walls: in a few steps the error is far below that of the input and of plain averages."""
-    torch.manual_seed(0)
-    model = Reconstructor(by_kernels(5))
-    clean = torch.ones(1, 3, 32, 32)
-    clean[..., 13:] = 8
-    layers = {"primal": clean * (1 + 0.4 * torch.randn(clean.shape)).clamp(min=0.1), "albedo": clean / 8}
-
-    def loss():
-        return (signed_log(model(layers)) - signed_log(clean)).square().mean()
-
-    first = loss().item()
-    noise = (signed_log(layers["primal"]) - signed_log(clean)).square().mean().item()
-    optimizer = torch.optim.Adam(model.parameters(), 2e-2)
-    for _ in range(60):
-        optimizer.zero_grad()
-        loss().backward()
-        optimizer.step()
-    assert loss().item() < 0.35 * min(first, noise)
-    save_weights(tmp_path / "w.safetensors", model, {})
-    again, _ = load_weights(tmp_path / "w.safetensors")
-    with torch.no_grad():
-        assert again.config == model.config and torch.equal(again(layers), model(layers))
 
 
 def pyramid(demodulate=False, size=3, scales=3):
@@ -175,16 +112,6 @@ def test_texture_of_the_albedo_is_not_averaged():
     assert torch.allclose(kept, image, rtol=1e-4) and (lost - image).abs().mean() > 0.3
 
 
-@pytest.mark.parametrize("demodulate", [False, True])
-def test_tiles_of_a_pyramid_do_not_show(demodulate):
-    torch.manual_seed(0)
-    model = Reconstructor(of_a_pyramid(demodulate)).eval()
-    torch.nn.init.normal_(model.network.head.convolution.weight, std=0.5)
-    layers = {name: torch.rand(1, 3, 60, 150) for name in model.config.inputs}
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, layers, tile=96), model(layers), rtol=1e-5, atol=1e-6)
-
-
 def of_a_pyramid(demodulate=True, **changes):
     config = {"inputs": ("primal", "albedo"), "start": ("primal",), "kernel": 3, "scales": 3, **changes}
     return ModelConfig("plain", (6, 6, 6), (), demodulate=demodulate, **config)
@@ -212,35 +139,3 @@ def test_a_pyramid_learns(tmp_path):
     again, _ = load_weights(tmp_path / "w.safetensors")
     with torch.no_grad():
         assert again.config == model.config and torch.equal(again(layers), model(layers))
-
-
-@pytest.mark.parametrize(
-    "changes, message",
-    [
-        ({"scales": 0}, "must be from 1 to the 3 levels of the network"),
-        ({"scales": 4}, "must be from 1 to the 3 levels of the network"),
-        ({"kernel": 1}, "needs kernels of 3 pixels or more"),
-        ({"start": ()}, "there is no image to average"),
-        ({"scales": 1}, "demodulate = True: true or false; needs scales and the input albedo"),
-        ({"inputs": ("primal",)}, "demodulate = True: true or false; needs scales and the input albedo"),
-    ],
-)
-def test_pyramids_that_cannot_be(changes, message):
-    with pytest.raises(NgptError, match=message):
-        of_a_pyramid(**changes)
-
-
-def test_settings_name_the_size_of_kernels():
-    table = {"network": "plain", "channels": [4], "units": [], "inputs": ["primal"], "start": ["primal"], "kernel": 5}
-    assert from_dict({"model": table}, "a.toml").model.head == Kernels(("primal",), 5)
-
-
-@pytest.mark.parametrize("size", [2, -1, 19, True, "3", 3.0])
-def test_sizes_that_no_kernel_has(size):
-    with pytest.raises(NgptError, match="must be an odd number of pixels up to 17, or 0"):
-        by_kernels(size)
-
-
-def test_kernels_need_an_image():
-    with pytest.raises(NgptError, match="kernel = 3: there is no image to average"):
-        by_kernels(3, start=())

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-import torch
 from full_stack import full_stack
 
 from ngpt.classical.bases import BASES
@@ -10,8 +9,6 @@ from ngpt.classical.energy import keep_energy
 from ngpt.errors import NgptError
 from ngpt.methods import METHODS, reconstruct
 from ngpt.network import inputs
-from ngpt.network.model import ModelConfig
-from ngpt.network.run_torch import layers_of
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 
@@ -34,12 +31,6 @@ def test_a_base_is_what_the_method_of_that_name_makes(base):
     assert BASES[base].needs == METHODS[base].needs == inputs.needs(("primal", "base"), base)
 
 
-def test_what_a_stack_must_hold_is_listed_in_order():
-    assert inputs.needs(("dy_se", "depth"), "") == ("primal", "depth", "dy_var")
-    assert inputs.needs(("denoised",), "") == ("primal", "albedo", "normal")
-    assert inputs.needs(("base",), "wcv") == ("primal", "dx", "dy", "primal_var", "dx_var", "dy_var")
-
-
 def test_standard_errors_are_roots_and_0_where_nothing_is_known():
     stack = full_stack(9, 8)
     variance = stack["primal_var"].copy()
@@ -56,16 +47,6 @@ def test_only_what_is_asked_for_is_given_in_that_order():
         "base",
         "primal",
     ]
-
-
-def test_tensors_are_the_same_arrays():
-    config = ModelConfig("plain", (4,), (), ("primal", "base", "dx_se", "normal"), "wcv")
-    data = repair(full_stack(11, 7))
-    arrays = inputs.gather(data, config.layers, config.base)
-    tensors = layers_of(data, config)
-    assert list(tensors) == list(arrays) == list(config.layers)
-    for name, tensor in tensors.items():
-        assert tensor.dtype == torch.float32 and np.array_equal(tensor.permute(1, 2, 0).numpy(), arrays[name])
 
 
 @pytest.mark.parametrize(

@@ -7,13 +7,10 @@ from full_stack import full_stack
 from torch.nn.functional import avg_pool2d
 
 from ngpt.errors import NgptError
-from ngpt.network import inputs
 from ngpt.network.kpcn import EPSILON, SplitKernels
 from ngpt.network.model import ModelConfig, Reconstructor
-from ngpt.network.run_torch import reconstruct
 from ngpt.network.transfer import signed_exp, signed_log
 from ngpt.network.weights import load_weights, save_weights
-from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.training.settings import from_dict, read_settings
 
@@ -60,18 +57,6 @@ def test_a_kernel_picks_the_pixel_it_points_to():
         assert torch.allclose(signed_exp(head.forward(prediction, [diffuse, specular, albedo])), expected, rtol=1e-4)
 
 
-def test_texture_of_the_albedo_stays():
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small()))
-    layers = random_layers()
-    albedo = 0.05 + 0.9 * torch.rand(1, 3, 24, 30)
-    light = 3 * (albedo + EPSILON)
-    nothing = torch.zeros_like(light)
-    with torch.no_grad():
-        result = model(layers | {"primal": light, "diffuse": light, "specular": nothing, "albedo": albedo})
-    assert torch.allclose(result, light, rtol=1e-4)
-
-
 @pytest.mark.parametrize(("part", "other"), [("diffuse", "specular"), ("specular", "diffuse")])
 def test_a_network_reads_its_own_part_alone(part, other):
     torch.manual_seed(0)
@@ -86,31 +71,6 @@ def test_a_network_reads_its_own_part_alone(part, other):
         halves = model.network(channels).chunk(2, 1)
     own = halves[("diffuse", "specular").index(part)]
     assert torch.equal(own[0], own[1]) and halves[0].shape[1] == halves[1].shape[1] == 25
-
-
-@pytest.mark.parametrize("kernel", [3, 21])
-def test_tiles_do_not_show(kernel):
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small(kernel=kernel)).eval())
-    assert model.radius == max(4, kernel // 2) and model.alignment == 1
-    layers = random_layers(40, 70)
-    with torch.no_grad():
-        assert torch.allclose(reconstruct(model, layers, tile=32), model(layers), rtol=1e-4, atol=1e-6)
-
-
-@pytest.mark.parametrize("size", [(1, 1), (2, 3), (17, 16)])
-def test_any_size_and_any_exposure(size):
-    torch.manual_seed(0)
-    model = random_kernels(Reconstructor(small(kernel=21)))
-    layers = random_layers(*size)
-    light = ("primal", "diffuse", "specular", "diffuse_se", "specular_se")
-    with torch.no_grad():
-        image = model(layers)
-        assert image.shape == (1, 3, *size) and torch.isfinite(image).all()
-        brighter = model(layers | {name: 1024 * layers[name] for name in light})
-        assert torch.allclose(brighter, 1024 * image, rtol=1e-3)
-        layers["diffuse"][..., 0, 0] = layers["primal"][..., 0, 0] = 1e12
-        assert torch.isfinite(model(layers)).all()
 
 
 def test_it_learns(tmp_path):
@@ -175,32 +135,6 @@ def test_a_stack_is_reconstructed_by_its_weights(tmp_path):
     assert np.isfinite(repaired).all() and np.abs(repaired - image).max() < 1
     with pytest.raises(NgptError, match="need layers diffuse, specular, diffuse_var, specular_var, which"):
         ngpt.denoise(full_stack(20, 26), "ngpt", weights=str(tmp_path / "w.safetensors"))
-
-
-def test_what_it_reads_of_a_stack():
-    stack = split_stack()
-    config = small()
-    given = inputs.gather(repair(stack), config.layers, "")
-    assert config.needs == ("primal", "albedo", "normal", "diffuse", "specular", "diffuse_var", "specular_var")
-    assert np.array_equal(given["diffuse"], stack["diffuse"])
-    assert np.allclose(given["specular_se"], np.sqrt(stack["specular_var"]))
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"inputs": ("primal", "diffuse", "albedo")}, "network 'kpcn' needs the inputs .*; lacks specular"),
-        ({"kernel": 0}, "must be an odd number from 3 to 21"),
-        ({"kernel": 23}, "must be an odd number from 3 to 21"),
-        ({"channels": (4, 4), "units": (1, 1)}, "'kpcn' has one level"),
-        ({"units": ()}, "give a positive number, up to 32, for each of 1 levels"),
-        ({"start": ("primal",)}, "network 'kpcn' goes without start"),
-        ({"sweeps": 2, "quiet": 1.0}, "network 'kpcn' goes without quiet, sweeps"),
-    ],
-)
-def test_configurations_that_cannot_be(changes, message):
-    with pytest.raises(NgptError, match=message):
-        small(**changes)
 
 
 @pytest.mark.parametrize("made", ["quieter", "rarer"])

@@ -146,12 +146,6 @@ def test_the_stock_tool_takes_the_file(files, tmp_path):
     agree(np.minimum(image.reshape(75, 101, 3)[::-1], layers["primal"].max()), expected)
 
 
-def test_info_says_what_the_file_is(files, capsys):
-    assert main(["info", str(files / "small.tza")]) == 0
-    text = capsys.readouterr().out
-    assert "wcv" in text and "OIDN" in text and "dx_var" in text
-
-
 def test_wrong_files_end_in_one_line(files, tmp_path):
     stack, good = full_stack(20, 20), (files / "small.tza").read_bytes()
     foreign = tza.packed({"enc_conv0.bias": np.zeros(3)}, "primal").replace(b"ngpt.colour", b"some.colour")
@@ -173,37 +167,6 @@ def test_wrong_files_end_in_one_line(files, tmp_path):
         ngpt.denoise(ngpt.GradientStack.from_arrays(primal=stack["primal"]), "ngpt", weights=path)
     with hidden_oidn(), pytest.raises(NgptError, match="OIDN is not installed"):
         ngpt.denoise(stack, "ngpt", weights=path)
-
-
-def test_files_of_another_kind_are_not_made(files, tmp_path, capsys):
-    save_weights(tmp_path / "dense.safetensors", Reconstructor(ModelConfig("dense", (4,), (1,), ("primal",))), {})
-    large = Reconstructor(config())
-    large.network.enc_conv0.weight.data[0, 0, 0, 0] = 1e6
-    save_weights(tmp_path / "large.safetensors", large, {})
-    for weights, made, message in (
-        (tmp_path / "dense.safetensors", "a.tza", "has not OIDN's shape"),
-        (files / "small.safetensors", "a.onnx", "export it to a .tza file"),
-        (tmp_path / "large.safetensors", "a.tza", "beyond 65504"),
-    ):
-        assert main(["export", "--weights", str(weights), "-o", str(tmp_path / made)]) == 1
-        assert message in capsys.readouterr().err and not (tmp_path / made).exists()
-    assert main(["export", "-o", str(tmp_path / "l2.tza")]) == 2
-
-
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"channels": (32, 32)}, "they must be"),
-        ({"units": (1,)}, "has none"),
-        ({"inputs": ("primal", "albedo", "normal")}, "must be base, albedo, normal"),
-        ({"base": "oidn"}, "choose one of"),
-        ({"quiet": 0.03, "kernel": 3}, "goes without quiet, kernel"),
-    ],
-)
-def test_configurations_that_make_no_sense(wrong, message):
-    right = {"network": "oidn", "channels": SMALL, "units": (), "inputs": INPUTS, "base": "wcv"}
-    with pytest.raises(NgptError, match=message):
-        ModelConfig(**(right | wrong))
 
 
 def test_it_runs_without_pytorch():

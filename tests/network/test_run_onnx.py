@@ -1,6 +1,5 @@
 """Networks in ONNX Runtime: tiles, memory, devices, and what is wrong with files."""
 
-import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -66,12 +65,6 @@ def test_plans_cover_every_pixel_once_with_all_it_needs(network, size, memory):
             assert begin == 0 or inner.start - begin >= network.overlap
             assert begin + extent == length or begin + extent - inner.stop >= network.overlap
     assert (count == 1).all()
-
-
-def test_a_file_that_is_on_disk_twice_is_loaded_twice_and_once_otherwise(tmp_path):
-    assert Network(FAST).session is Network(FAST).session
-    shutil.copy(FAST, tmp_path / "n.onnx")
-    assert Network(tmp_path / "n.onnx").session is not Network(FAST).session
 
 
 def test_progress_and_stop(network, image):
@@ -166,13 +159,6 @@ def test_bad_files(tmp_path):
         Network(damaged)
     with pytest.raises(NgptError, match=r"statistics\.onnx: lacks the metadata"):
         Network(WEIGHTS / "ngpt-fast.statistics.onnx")
-
-
-def test_missing_layers_are_named(network):
-    layers = full_layers(9, 9)
-    del layers["albedo"], layers["dx_var"]
-    with pytest.raises(NgptError, match="needs layers albedo, dx_var, base"):
-        network.reconstruct(layers)
 
 
 def test_the_method_takes_files_of_both_kinds():

@@ -32,11 +32,6 @@ def test_slopes_are_finite_and_those_of_the_function(transfer):
     assert torch.isfinite(x.grad).all() and torch.allclose(x.grad, numeric, rtol=1e-4)
 
 
-def test_the_srgb_curve_is_that_of_the_standard():
-    x = torch.tensor([0.002, 0.0031308, 0.18, 0.5, 1.0])
-    assert srgb(x).tolist() == pytest.approx([0.02584, 0.04045, 0.46136, 0.73536, 1.0], abs=2e-5)
-
-
 def test_the_inverse_of_the_signed_log():
     x = both_signs(RANGES[signed_log])
     # One rounding of y = 27.6 is two millionths of 1e12.

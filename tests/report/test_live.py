@@ -9,7 +9,6 @@ from contextlib import suppress
 
 import numpy as np
 import pytest
-from browser import Session
 
 from ngpt.report import live
 from ngpt.report.live import LivePage
@@ -79,14 +78,6 @@ def test_only_the_page_itself_ends_the_render(page):
     assert page.enough
 
 
-def test_a_port_in_use_is_no_obstacle(page):
-    other = LivePage("t", "c", page.server.server_port)
-    assert other.server.server_port != page.server.server_port
-    other.close("ended")
-    with pytest.raises(ConnectionRefusedError):
-        socket.create_connection(("127.0.0.1", other.server.server_port), 5)
-
-
 def test_many_and_slow_connections_take_little_and_keep_nobody_out(page, monkeypatch):
     """200 clients that send a bit of a request and then nothing more, as long as they like."""
     address, before = page.server.server_address, threading.active_count()
@@ -111,71 +102,54 @@ def test_many_and_slow_connections_take_little_and_keep_nobody_out(page, monkeyp
             connection.close()
 
 
-def test_names_turn_no_text_around_and_hide_nothing(page):
-    evil = "gnp.\u202egpj\u2066 \u200f\u061c\u3164"
-    image = np.ones((8, 8, 3), np.float32)
-    page.title = page.command = evil
-    page.show(Preview({evil: image}), evil)
-    text = asked(page, "GET", "/")[2]
-    assert "\\u202egpj\\u2066 \\u200f\\u061c\\u3164" in text and not set(evil[4:]) & set(text) - set("gpj ")
-    page.tell(f"ended: {evil} is written")
-    assert json.loads(asked(page, "GET", "/status")[2])["text"] == f"ended: {printable(evil)} is written"
-
-
-def test_a_browser_sees_newer_images_and_ends_the_render(page, tmp_path):
+def test_a_browser_sees_newer_images_and_ends_the_render(page, browser):
     first = stack(0.25)
     del first.layers["samples"]
     page.show(preview(first), "the first")
-    session = Session(tmp_path / "profile", page.url)
-    try:
-        names = session.ask("page.scenes[0].pictures.join()").split(",")
-        assert names[0] == "noisy" and len(names) == 2
-        value = "+document.querySelectorAll('#value-a td')[1].textContent"
-        assert session.ask(value) == pytest.approx(0.25, rel=1)
-        maps = "[...$('maps').children].filter(b => !b.disabled).map(b => b.value).join()"
-        assert session.ask(maps) == "stops,std. error"
-        session.ask("document.querySelector('#maps button[value=\"std. error\"]').click()")
-        session.settle()
-        assert "relative to the light" in session.ask("$('meaning').textContent")
-        session.ask("change({map: '', exposure: 1, split: 30})")
-        session.settle()
-        page.tell("32 of 64")
-        page.show(preview(stack(8.0, 1)), "the second")
-        end = time.monotonic() + 20
-        while session.ask("page.live") < 2 and time.monotonic() < end:
-            time.sleep(0.05)
-        session.settle()
-        assert session.ask("document.querySelector('.caption').textContent") == "the second"
-        assert session.ask(maps) == "stops,std. error,samples"
-        assert session.ask(value) == pytest.approx(8, rel=1) and session.ask("told.textContent") == "32 of 64"
-        # What was chosen stays.
-        assert session.view().items() >= {"exposure": "1", "split": "30", "a": "noisy", "map": ""}.items()
-        session.resize(420, 860)
-        assert session.ask("document.documentElement.scrollWidth") == 420
-        session.ask("enough.click()")
-        while not page.enough and time.monotonic() < end:
-            time.sleep(0.05)
-        assert page.enough
-        page.close("ended: it is written")
-        assert session.ask("told.textContent") == "ended: it is written" and session.ask("enough.hidden") is True
-        assert session.complaints == []
-    finally:
-        session.close()
+    session = browser(page.url)
+    names = session.ask("page.scenes[0].pictures.join()").split(",")
+    assert names[0] == "noisy" and len(names) == 2
+    value = "+document.querySelectorAll('#value-a td')[1].textContent"
+    assert session.ask(value) == pytest.approx(0.25, rel=1)
+    maps = "[...$('maps').children].filter(b => !b.disabled).map(b => b.value).join()"
+    assert session.ask(maps) == "stops,std. error"
+    session.ask("document.querySelector('#maps button[value=\"std. error\"]').click()")
+    session.settle()
+    assert "relative to the light" in session.ask("$('meaning').textContent")
+    session.ask("change({map: '', exposure: 1, split: 30})")
+    session.settle()
+    page.tell("32 of 64")
+    page.show(preview(stack(8.0, 1)), "the second")
+    end = time.monotonic() + 20
+    while session.ask("page.live") < 2 and time.monotonic() < end:
+        time.sleep(0.05)
+    session.settle()
+    assert session.ask("document.querySelector('.caption').textContent") == "the second"
+    assert session.ask(maps) == "stops,std. error,samples"
+    assert session.ask(value) == pytest.approx(8, rel=1) and session.ask("told.textContent") == "32 of 64"
+    # What was chosen stays.
+    assert session.view().items() >= {"exposure": "1", "split": "30", "a": "noisy", "map": ""}.items()
+    session.resize(420, 860)
+    assert session.ask("document.documentElement.scrollWidth") == 420
+    session.ask("enough.click()")
+    while not page.enough and time.monotonic() < end:
+        time.sleep(0.05)
+    assert page.enough
+    page.close("ended: it is written")
+    assert session.ask("told.textContent") == "ended: it is written" and session.ask("enough.hidden") is True
 
 
-def test_a_browser_says_when_the_render_was_killed(page, tmp_path):
+def test_a_browser_says_when_the_render_was_killed(page, browser):
     page.show(preview(stack(0.25)), "the first")
-    session = Session(tmp_path / "profile", page.url)
-    try:
-        page.server.shutdown()
-        page.server.server_close()
-        end = time.monotonic() + 20
-        while session.ask("told.textContent") != "the render is gone" and time.monotonic() < end:
-            time.sleep(0.05)
-        assert session.ask("told.textContent") == "the render is gone"
-        assert session.ask("document.documentElement.dataset.error ?? null") is None
-    finally:
-        session.close()
+    session = browser(page.url)
+    page.server.shutdown()
+    page.server.server_close()
+    end = time.monotonic() + 20
+    while session.ask("told.textContent") != "the render is gone" and time.monotonic() < end:
+        time.sleep(0.05)
+    assert session.ask("told.textContent") == "the render is gone"
+    assert session.ask("document.documentElement.dataset.error ?? null") is None
+    session.complaints.clear()  # of addresses that do not answer
 
 
 def test_what_is_shown_of_a_stack_follows_its_layers():
@@ -186,3 +160,14 @@ def test_what_is_shown_of_a_stack_follows_its_layers():
     assert full.most == 16 and all(set(maps) == {"std. error", "samples"} for maps in full.maps.values())
     # A standard error of 22 % is two thirds of the way from 1 % to 100 %.
     assert np.median(full.maps["noisy"]["std. error"]) == pytest.approx(np.log10(22.4) / 2, abs=0.1)
+
+
+def test_names_turn_no_text_around_and_hide_nothing(page):
+    evil = "gnp.\u202egpj\u2066 \u200f\u061c\u3164"
+    image = np.ones((8, 8, 3), np.float32)
+    page.title = page.command = evil
+    page.show(Preview({evil: image}), evil)
+    text = asked(page, "GET", "/")[2]
+    assert "\\u202egpj\\u2066 \\u200f\\u061c\\u3164" in text and not set(evil[4:]) & set(text) - set("gpj ")
+    page.tell(f"ended: {evil} is written")
+    assert json.loads(asked(page, "GET", "/status")[2])["text"] == f"ended: {printable(evil)} is written"

@@ -13,7 +13,7 @@ from ngpt.errors import NgptError
 from ngpt.io.exr import write
 from ngpt.io.primaries import ACES_AP1, converted, to_rec709
 from ngpt.report import display
-from ngpt.report.pictures import write_picture, write_shot
+from ngpt.report.pictures import write_shot
 from ngpt.report.transforms import TRANSFORMS, shown
 from ngpt.stack import GradientStack
 
@@ -162,15 +162,7 @@ def test_an_mp4_of_a_shot(tmp_path):
     assert np.abs(found - levels).max() < 4
 
 
-@pytest.mark.parametrize(("kind", "most"), [("webp", 16383), ("jpg", 65500)])
-def test_a_picture_is_as_long_as_its_format_allows(tmp_path, kind, most):
-    pytest.importorskip("PIL")
-    write_picture(tmp_path / f"a.{kind}", np.zeros((1, most, 3), np.uint8))
-    with pytest.raises(NgptError, match=f"b.{kind}: {most + 1}x1 pixels are too many for .{kind}, which has {most} a"):
-        write_picture(tmp_path / f"b.{kind}", np.zeros((1, most + 1, 3), np.uint8))
-
-
-def test_what_cannot_be_made_is_refused_in_one_line(tmp_path, frames, image, capfd, monkeypatch):
+def test_what_is_not_installed_is_named_in_one_line(tmp_path, frames, image, capfd, monkeypatch):
     write(tmp_path / "a.exr", image)
 
     def refused(*words):
@@ -182,12 +174,6 @@ def test_what_cannot_be_made_is_refused_in_one_line(tmp_path, frames, image, cap
         assert message.count("\n") == 1, message
         return message
 
-    assert "one of .png .jpg" in refused(tmp_path / "a.exr", "-o", tmp_path / "a.gif")
-    assert "one of .webp .mp4" in refused(frames, "-o", tmp_path / "a.png")
-    assert "nor auto" in refused(tmp_path / "a.exr", "-o", tmp_path / "a.png", "--exposure", "bright")
-    assert "frames a second" in refused(frames, "-o", tmp_path / "a.webp", "--fps", "0")
-    (tmp_path / "empty").mkdir()
-    assert "no .exr files" in refused(tmp_path / "empty", "-o", tmp_path / "a.webp")
     for module in ("report.pictures", "report.transforms"):
         monkeypatch.setattr(f"ngpt.{module}.find_spec", lambda name: None)
     monkeypatch.setattr("ngpt.report.pictures.shutil.which", lambda name: None)

@@ -48,13 +48,3 @@ def test_no_pixel_is_off_by_more_than_is_stated(steps):
     error = np.abs(found - image) / (np.abs(image) + pixelcodec.TOE)
     worst = pixelcodec.worst_error(steps)
     assert 0.8 * worst < error.max() <= worst * (1 + 1e-9)
-
-
-def test_noise_gives_way_before_what_is_smooth():
-    rng = np.random.default_rng(0)
-    images = [np.ones((64, 64, 3)), rng.gamma(1.0, 1.0, (64, 64, 3))]
-    full = sum(len(pixelcodec.encode(image, pixelcodec.LADDER[0])) for image in images)
-    assert pixelcodec.fitting_steps(images, full) == [256, 256]
-    smooth, noisy = pixelcodec.fitting_steps(images, 0.6 * full)
-    assert smooth == 256 and noisy < 64
-    assert pixelcodec.fitting_steps(images, 0.0) == [pixelcodec.LADDER[-1]] * 2

@@ -59,13 +59,6 @@ def test_the_page_shows_every_number_and_says_what_is_absent(tmp_path):
     assert "<dt>relMSE</dt><dd>mean (lower is better)</dd>" in text and "data:image/svg+xml" in text
 
 
-def test_high_sample_counts_are_left_out_when_there_is_no_room(tmp_path, monkeypatch):
-    results_folder(tmp_path)
-    monkeypatch.setattr("ngpt.report.evaluation.ROOM", 8 * 6 * 5)  # two methods and a reference take three pictures
-    text = write_evaluation_report(tmp_path, tmp_path / "report.html").read_text()
-    assert re.findall(r"<h2>([^<]*)", text) == ["room, 4 spp"] and "first seed; 4 spp of 4, 16" in text
-
-
 def test_what_is_not_a_result_is_refused(tmp_path):
     with pytest.raises(NgptError, match=r"results.json: cannot be read"):
         write_evaluation_report(tmp_path, tmp_path / "report.html")

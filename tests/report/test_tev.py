@@ -32,13 +32,3 @@ def test_without_a_viewer_there_is_one_line():
     for wrong in (":14158", "host:", "host:70000", "host:port"):
         with pytest.raises(WrongUse, match=f"is no HOST:PORT; tev listens on 127.0.0.1:{PORT}"):
             Tev(wrong, "s")
-
-
-def test_a_viewer_that_goes_away_is_told_of():
-    with socket.create_server(("127.0.0.1", 0)) as listening:
-        tev = Tev(f"127.0.0.1:{listening.getsockname()[1]}", "s")
-        connection, _ = listening.accept()
-        connection.close()
-        with pytest.raises(NgptError, match="the viewer went away"):
-            for _ in range(20):
-                tev.show({"noisy": np.zeros((64, 64, 3), np.float32)})

@@ -1,76 +1,27 @@
 """Ctrl-C, SIGTERM, and output that nobody takes: one line or none, a status that says so, and no traceback."""
 
-import fcntl
 import os
 import signal
 import subprocess
 import sys
-import time
 
-import numpy as np
 import pytest
 from processes import (
-    COMMANDS,
     ROOT,
+    SIGNALS,
     complete,
-    ended,
     half_written,
     make_work,
     one_error,
+    shell,
     start,
-    temporary_files,
     timeless,
 )
-from reliability import record
 
 import ngpt
 from ngpt.system.console import run_command
 
-SIGNALS = {"Ctrl-C": signal.SIGINT, "SIGTERM": signal.SIGTERM}
-EARLY = "while Python starts and imports its own modules: as Python does"
-DONE = "done before"
 NGPT = (sys.executable, "-m", "ngpt")
-
-
-def interrupt_campaign(kind, folder, interrupts, name):
-    """Ctrl-C or SIGTERM at moments spread over a whole run."""
-    number = SIGNALS[name]
-    interrupted = f"interrupted, status {128 + number}, one line"
-    job, rng, clock = make_work(kind, folder), np.random.default_rng(2), time.monotonic()
-    out = folder / "out"
-    assert complete(job.arguments(out)).returncode == 0
-    duration, outcomes = time.monotonic() - clock, {interrupted: 0, EARLY: 0, DONE: 0}
-    for i in range(interrupts):
-        out = folder / f"out{i}"
-        arguments = job.arguments(out)
-        with start(arguments) as process:
-            status = ended(process, rng.uniform(0, duration), number)
-            errors = process.stderr.read()
-        assert half_written(out) == [] and temporary_files(out) == []
-        if status == 128 + number:
-            # train.py says on standard output that it stops, and keeps what it has learnt.
-            assert one_error(errors) or (kind == "train" and ": error: " not in errors), errors
-            outcomes[interrupted] += 1
-        else:
-            early = status == -number or "Fatal Python error: init" in errors
-            assert (early or status == 0) and "in run_command" not in errors, (status, errors)
-            assert ": error: " not in errors, (status, errors)
-            outcomes[EARLY if status else DONE] += 1
-    assert outcomes[interrupted]
-    record(f"{name} at random moments of {job.name}", interrupts, outcomes, seconds=round(time.monotonic() - clock))
-
-
-@pytest.mark.parametrize(("kind", "name"), [("denoise", "Ctrl-C"), ("denoise", "SIGTERM"), ("export", "Ctrl-C")])
-def test_a_few_interrupts(tmp_path, kind, name):
-    interrupt_campaign(kind, tmp_path, 4, name)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("name", SIGNALS)
-@pytest.mark.parametrize("kind", COMMANDS)
-def test_many_interrupts(tmp_path, kind, name):
-    interrupt_campaign(kind, tmp_path, 20, name)
 
 
 def test_sigterm_leaves_the_samples_done_so_far(tmp_path):
@@ -114,21 +65,6 @@ def test_a_second_sigterm_discards_them():
     assert [signal.getsignal(number) for number in SIGNALS.values()] == before
 
 
-def test_handlers_of_others_stay(capfd):
-    """A host that has one of its own for SIGTERM, and runs a command within itself."""
-    got = []
-    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
-    try:
-        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
-    finally:
-        signal.signal(signal.SIGTERM, before)
-
-
-def shell(line, *arguments):
-    """Runs a line of shell in which "$@" is a command."""
-    return complete(["bash", "-c", f"set -o pipefail; {line}", "bash", *arguments])
-
-
 @pytest.fixture(scope="module")
 def stack(tmp_path_factory):
     """A small stack's file."""
@@ -145,44 +81,6 @@ def test_a_reader_that_has_enough(arguments, stack):
     assert run.stderr == "" and run.returncode in (0, 1, 141)
 
 
-def closed_streams(job, folder):
-    """Each way in which nobody takes what a command prints; yields (what it is, the run, where it wrote)."""
-    lines = {
-        "standard output read for one line": '"$@" | head -1',
-        "both read for one line": '"$@" 2>&1 | head -1',
-        "standard output closed": '"$@" >&-',
-        "errors closed": '"$@" 2>&-',
-        "all closed": '"$@" <&- >&- 2>&-',
-        "standard output on a full disk": '"$@" > /dev/full',
-        "both on a full disk": '"$@" > /dev/full 2>&1',
-    }
-    for i, (what, line) in enumerate(lines.items()):
-        out = folder / f"out{i}"
-        yield what, shell(line, *job.arguments(out)), out
-
-
-def stream_campaign(kinds, folder):
-    outcomes = {"work done": 0, "quiet or one line, nothing half-written": 0}
-    for kind in kinds:
-        (folder / kind).mkdir()
-        for what, run, out in closed_streams(make_work(kind, folder / kind), folder / kind):
-            assert "Traceback" not in run.stdout + run.stderr and "Exception ignored" not in run.stderr, (kind, what)
-            assert run.returncode in (0, 1, 2, 141), (kind, what, run.stderr)
-            assert half_written(out) == [] and temporary_files(out) == [], (kind, what)
-            outcomes["work done" if run.returncode == 0 else "quiet or one line, nothing half-written"] += 1
-    record("Output that nobody takes, seven ways for each command", sum(outcomes.values()), outcomes)
-
-
-def test_output_that_nobody_takes(tmp_path):
-    stream_campaign(["merge"], tmp_path)
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_output_of_all_commands_that_nobody_takes(tmp_path):
-    stream_campaign(COMMANDS, tmp_path)
-
-
 def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
     """Else what is printed would go into the next file opened."""
     out = tmp_path / "o.exr"
@@ -195,20 +93,6 @@ def test_files_do_not_take_the_place_of_a_closed_stream(tmp_path, stack):
 def test_results_that_cannot_be_printed_are_an_error(stack):
     run = shell('"$@" > /dev/full', *NGPT, "info", stack, "--json")
     assert run.returncode == 1 and one_error(run.stderr) and "No space left" in run.stderr
-
-
-def test_a_reader_that_takes_its_time_gets_everything(stack):
-    """More than a pipe holds, to a reader that sleeps first."""
-    whole = complete([*NGPT, "info", "--aliases"]).stdout
-    reader, writer = os.pipe()
-    fcntl.fcntl(writer, fcntl.F_SETPIPE_SZ, 4096)
-    assert len(whole) > 0
-    with start([*NGPT, "info", "--aliases"], stdout=writer) as process:
-        os.close(writer)
-        time.sleep(1)
-        with os.fdopen(reader) as file:
-            assert file.read() == whole
-        assert process.wait(60) == 0
 
 
 def test_an_interrupt_during_import_is_one_line():
@@ -242,3 +126,13 @@ def test_a_handler_prints_amid_a_line(tmp_path):
     with open(tmp_path / "log", "wb") as file:
         print_line("interrupted", Entered(file))
     assert (tmp_path / "log").read_text() == "interrupted\n"
+
+
+def test_handlers_of_others_stay(capfd):
+    """A host that has one of its own for SIGTERM, and runs a command within itself."""
+    got = []
+    before = signal.signal(signal.SIGTERM, lambda *_: got.append(1))
+    try:
+        assert run_command(lambda: os.kill(os.getpid(), signal.SIGTERM) or 0) == 0 and got == [1]
+    finally:
+        signal.signal(signal.SIGTERM, before)

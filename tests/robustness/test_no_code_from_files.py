@@ -64,23 +64,6 @@ def test_nothing_in_the_project_unpickles_or_evaluates():
     assert {name: list(offences(text, name)) for name, text in found.items() if list(offences(text, name))} == {}
 
 
-TELLTALE = """import pickle
-from pickle import loads
-import joblib as j
-from torch import load
-torch.load(p)
-torch.load(p, weights_only=False)
-np.load(p)
-f(p, allow_pickle=True)
-import yaml.loader
-eval(x)"""
-
-
-@pytest.mark.parametrize("line", TELLTALE.splitlines())
-def test_the_search_finds_what_it_is_for(line):
-    assert list(offences(line, "ngpt/measure/distances/backbones.py" if "False" in line else "x.py"))
-
-
 class Payload:
     def __reduce__(self):
         return (os.mkdir, (os.environ["NGPT_PAYLOAD"],))

@@ -99,23 +99,6 @@ def test_a_long_program_asks_for_no_address(tmp_path):
     assert spoken_to(lines) == set()
 
 
-def test_what_is_written_and_spoken_to_is_read_from_a_trace():
-    """Else the tests above could not fail."""
-    lines = [
-        '7 openat(AT_FDCWD, "read.txt", O_RDONLY|O_CLOEXEC) = 3',
-        '7 openat(AT_FDCWD, "/home/me/id", O_RDWR|O_CREAT|O_EXCL, 0600) = 4',
-        '7 openat(AT_FDCWD, "refused", O_WRONLY|O_CREAT, 0600) = -1 EACCES (Permission denied)',
-        '7 openat(AT_FDCWD, "late", O_WRONLY|O_CREAT, 0600 <unfinished ...>',
-        '7 rename("a", "../b") = 0',
-        '7 connect(5, {sa_family=AF_INET, sin_port=htons(53), sin_addr=inet_addr("192.0.2.7")}, 16) = 0',
-        '7 connect(5, {sa_family=AF_INET6, sin6_port=htons(1), inet_pton(AF_INET6, "2001:db8::1", &a)}, 28) = 0',
-        '7 connect(5, {sa_family=AF_INET, sin_port=htons(53), sin_addr=inet_addr("127.0.0.53")}, 16) = 0',
-        '7 connect(5, {sa_family=AF_UNIX, sun_path="/var/run/nscd/socket"}, 110) = -1 ENOENT',
-    ]
-    assert written(lines, Path("/desk")) == {"/home/me/id", "/desk/late", "/b"}
-    assert spoken_to(lines) == {"192.0.2.7", "2001:db8::1"}
-
-
 def test_the_runtime_is_loaded_in_one_place_and_examples_turn_it_off():
     loads = re.compile(r"^\s*(?:import|from) onnxruntime\b", re.M)
     files = [

@@ -85,11 +85,6 @@ def test_modules_of_posix_are_imported_where_they_may_be_missing():
     assert not unguarded("try:\n    import fcntl\nexcept ImportError:\n    fcntl = None")
 
 
-def test_the_lesser_system_lacks_what_it_should(python):
-    code = "import ngpt, os, sys; print(sys.modules['fcntl'], hasattr(os, 'fork'), os.path.exists('/dev/fd'))"
-    assert run(python, "-c", code).stdout.split() == ["None", "False", "False"]
-
-
 @pytest.mark.parametrize("options", [["-m", "ngpt-fast"], ["-m", "wcv", "--untrusted"]])
 def test_the_same_image(tmp_path, python, options):
     source, out = tmp_path / "noisy.exr", tmp_path / "clean.exr"
@@ -110,12 +105,6 @@ def test_letters_that_the_terminal_lacks(tmp_path, python):
     ngpt.write(source, stack)
     done = run(python, "-m", "ngpt", "info", source)
     assert done.returncode == 0 and "\\u03a9mega" in done.stdout, done.stderr
-
-
-@pytest.mark.parametrize("name", [".", "missing.exr"])
-def test_one_line_says_what_is_no_file(tmp_path, python, name):
-    done = run(python, "-m", "ngpt", "info", tmp_path / name)
-    assert done.returncode in (1, 2) and one_error(done.stderr), done.stderr
 
 
 def test_a_folder_belongs_to_one_process_until_it_is_killed(tmp_path, python):
@@ -156,14 +145,3 @@ def test_memory_where_only_windows_tells(monkeypatch):
     kernel = SimpleNamespace(GetPhysicallyInstalledSystemMemory=installed)
     monkeypatch.setattr(ctypes, "windll", SimpleNamespace(kernel32=kernel), raising=False)
     assert limits.memory() == 3 * 2**30
-
-
-def test_limits_of_memory_where_there_are_none(monkeypatch):
-    monkeypatch.setattr(limits, "resource", None)
-    limits.limit_address_space(2**20)
-    assert limits.address_space() is None and limits.free_address_space() == limits.UNLIMITED
-
-
-def test_processors_where_affinity_is_not_told(monkeypatch):
-    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
-    assert limits.processors() == (os.cpu_count() or 1)

@@ -125,29 +125,6 @@ def test_noisy_differences_in_time_count_little(rng):
     assert error(wcv_frames(bad), truth) < 1.3 * error(wcv_frames(spread), truth)
 
 
-def test_it_follows_the_exposure_and_keeps_values_far_apart(rng):
-    truth = [rng.random(SIZE) for _ in range(3)]
-    still = np.zeros((*SIZE[:2], 2))
-
-    def results(k):
-        found = []
-        own = np.random.default_rng(3)
-        for t, image in enumerate(truth):
-            known = link(k * image, k * truth[t - 1], still, 1e-4 * k**2) if t else None
-            one = frame(image, 0.2, own, None, spread=0.01)
-            variances = tuple(v * k**2 for v in one.variances)
-            found.append(Frame(k * one.image, one.apart, k * one.dx, k * one.dy, variances, None, k * one.image, known))
-        return wcv_frames(found)
-
-    plain = results(1.0)
-    for k in (2.0**-10, 2.0**10):
-        assert all(np.allclose(a, k * b, rtol=1e-4) for a, b in zip(results(k), plain, strict=True))
-    image = np.ones(SIZE)
-    image[0, 0] = 1e12
-    lamp = [frame(image, 0.0, rng, link(image, image, still) if t else None) for t in range(3)]
-    assert all(np.allclose(result, image, rtol=1e-6, atol=1e-3) for result in wcv_frames(lamp))
-
-
 def test_taps_are_those_of_the_bilinear_image(rng):
     image, motion = rng.random(SIZE), rng.uniform(-4, 4, (*SIZE[:2], 2))
     motion[2, 3] = np.nan

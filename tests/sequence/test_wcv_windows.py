@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 from shots import part_of, wall, without
 
-import ngpt
 from ngpt.methods import METHODS
-from ngpt.sequence.flicker import flicker
 from ngpt.sequence.wcv_windows import HOP, LENGTH, reconstruct_shot
 from ngpt.stack import GradientStack
 
@@ -31,19 +29,6 @@ def test_windows_pass_over_into_each_other(stacks):
         near, far = LENGTH - i, min(i - HOP + 1, COUNT - i)
         assert np.allclose(both[i], (near * first[i] + far * second[i - HOP]) / (near + far), atol=1e-5)
     assert np.array_equal(both[0], first[0]) and np.allclose(both[COUNT - 1], second[COUNT - HOP - 1], atol=1e-6)
-
-
-def squares(images):
-    return np.mean([np.square(image - 1 - 0.1 * i).mean() for i, image in images.items()])
-
-
-def test_frames_are_better_together(stacks):
-    alone = {i: ngpt.denoise(stack, "wcv") for i, stack in enumerate(stacks)}
-    together = results(stacks)
-    assert list(together) == list(range(COUNT)) and squares(together) < 0.4 * squares(alone)
-    truth = [np.full(SIZE, 1 + 0.1 * i) for i in together]
-    still = [stack["motion"] for stack in stacks]
-    assert flicker(list(together.values()), truth, still) < 0.1 * flicker(list(alone.values()), truth, still)
 
 
 def test_direct_light_and_caustics_are_added_back(stacks):

@@ -8,7 +8,6 @@ import sys
 import pytest
 
 import ngpt
-from ngpt.cli import main
 from ngpt.cli.info import show
 from ngpt.system import console
 from ngpt.system.console import Console, logged
@@ -47,11 +46,6 @@ def test_it_fits_and_says_how_far_it_is_and_how_long_it_takes(shown, columns, ra
     assert ("…" in last) == ("render scenes" not in last)
 
 
-def test_a_wide_terminal_has_all_of_it(shown):
-    (last,) = shown(160, rate=True)[-1:]
-    assert "render scenes/a-long-name" in last and "spp/s" in last and "━" in last and "about 1 s left" in last
-
-
 def test_info_breaks_lines_between_words_on_a_terminal_alone(monkeypatch):
     told = {"layers": {"primal": {"channels": "R G B", "part": 0, "type": "float32"}}, "missing": ["dx", "dy_var"] * 9}
     screens = Terminal(), io.StringIO()
@@ -62,17 +56,6 @@ def test_info_breaks_lines_between_words_on_a_terminal_alone(monkeypatch):
     narrow, plain = (screen.getvalue().splitlines() for screen in screens)
     assert max(map(len, narrow)) <= 40 and max(map(len, plain)) > 100
     assert " ".join(narrow).split() == " ".join(plain).split()
-
-
-def test_verbose_shows_what_the_logger_is_told(noisy_stack, tmp_path, capfd):
-    ngpt.write(tmp_path / "noisy.exr", noisy_stack[0])
-    command = ["denoise", str(tmp_path / "noisy.exr"), "-m", "l1", "--force"]
-    assert main(command) == 0
-    assert "ms  ngpt." not in capfd.readouterr().err
-    assert main([*command, "--verbose"]) == 0
-    output, errors = capfd.readouterr()
-    assert "ngpt.io.exr: " in errors and "dx (dx.R dx.G dx.B)" in errors and "method l1" in errors and output == ""
-    assert logging.getLogger("ngpt").level == logging.NOTSET
 
 
 def test_a_program_hears_it_only_if_it_asks(noisy_stack, caplog):

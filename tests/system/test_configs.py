@@ -1,17 +1,9 @@
 """Configurations by name or path."""
 
-from itertools import chain
-
 import pytest
 
 from ngpt.errors import NgptError
-from ngpt.system.configs import DATASET, EVALUATION, FOLDER, TRAINING, find_config, names
-
-
-def test_every_configuration_has_a_kind():
-    kinds = [names(kind) for kind in (DATASET, EVALUATION, TRAINING)]
-    assert sorted(chain(*kinds)) == sorted(path.stem for path in FOLDER.glob("*.toml"))
-    assert "data-tiny" in kinds[0] and "eval-tiny" in kinds[1] and "tiny" in kinds[2]
+from ngpt.system.configs import DATASET, FOLDER, TRAINING, find_config
 
 
 def test_a_name_is_found_from_anywhere_and_a_file_comes_first(tmp_path, monkeypatch):

@@ -1,13 +1,11 @@
 """What is told to be typed installs: messages and pages say the same, and no more than is true today."""
 
-import re
 import sys
 from pathlib import Path
 
 from ngpt.system import install
 
 ROOT = Path(__file__).parents[2]
-PAGES = [ROOT / "README.md", *ROOT.glob("docs/[!l]*/*.md"), *ROOT.glob("docs/*/*.ipynb")]
 EXTRAS = ("render", "export", "train", "cluster", "peers")
 
 
@@ -33,16 +31,3 @@ def test_pip_is_that_of_this_python(monkeypatch):
     assert install.package_command("onnx") == f"{sys.executable} -m pip install onnx"
     monkeypatch.setattr(install.shutil, "which", lambda name: str(Path(sys.executable).parent / "pip"))
     assert install.package_command("onnx") == "pip install onnx"
-
-
-def test_pages_name_the_index_only_once_the_package_is_there():
-    for page in PAGES:
-        named = re.findall(r"pip install '?ngpt-recon", page.read_text())
-        assert bool(named) <= install.PUBLISHED, page
-    front = (ROOT / "README.md").read_text()
-    assert install.PUBLISHED or ("pip install '.[render]'" in front and "make wheel" in front)
-
-
-def test_messages_take_the_command_from_one_place():
-    files = [file for room in ("ngpt", "data_gen") for file in (ROOT / room).rglob("*.py")]
-    assert not [file for file in files if re.search(r"ngpt-recon\[|pip install", file.read_text())]

@@ -4,21 +4,7 @@ import json
 
 import pytest
 
-from ngpt.system.machine import metadata
 from ngpt.system.writing import write_json, write_text
-from ngpt.version import __version__
-
-
-def test_metadata_names_versions_and_machine():
-    facts = metadata("numpy", "a-package-that-is-not-there")
-    assert facts["versions"]["ngpt-recon"] == __version__ and facts["versions"]["numpy"]
-    assert facts["versions"]["a-package-that-is-not-there"] is None and facts["threads"] >= 1
-    json.dumps(facts)
-
-
-def test_without_git_there_is_no_commit(monkeypatch, tmp_path):
-    monkeypatch.setenv("PATH", str(tmp_path))
-    assert metadata()["commit"] is None
 
 
 def test_files_are_replaced_whole_or_not_at_all(tmp_path):

@@ -2,14 +2,12 @@
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from ngpt.errors import NgptError  # noqa: E402
-from ngpt.network import padding  # noqa: E402
-from ngpt.stack import GradientStack  # noqa: E402
-from ngpt.training import augment  # noqa: E402
-from ngpt.training.augment import Augmentation, quieter, rarer  # noqa: E402
+from ngpt.network import padding
+from ngpt.stack import GradientStack
+from ngpt.training import augment
+from ngpt.training.augment import Augmentation, quieter, rarer
 
 
 def differences(image):
@@ -55,16 +53,6 @@ def test_geometry_is_an_involution_that_keeps_the_laws(name):
     assert all(torch.allclose(twice[name], before[name]) for name in before)
 
 
-def test_colors_and_brightness_change_light_and_surfaces_alike():
-    before = example()
-    after = augment.scale(augment.color(before, np.array([2, 0, 1]), np.array([0.5, 1.0, 1.5])), 3)
-    dx, dy = differences(after["primal"])
-    assert torch.allclose(after["dx"], dx, atol=1e-6) and torch.allclose(after["dy"], dy, atol=1e-6)
-    assert torch.allclose(after["primal"][0], 1.5 * before["primal"][2])
-    assert torch.allclose(after["albedo"][2], 1.5 * before["albedo"][1])
-    assert torch.equal(after["normal"], before["normal"])
-
-
 def test_all_transforms_together_keep_the_differences():
     rng = np.random.default_rng(1)
     for _ in range(20):
@@ -80,13 +68,6 @@ def test_factors_have_mean_one():
     draws = torch.stack([Augmentation()(layers, rng)["primal"].flatten() for _ in range(4000)])
     # Per-channel variance: E[c²] E[b²] - 1 = 1.5 e - 1 = 3.08 for c = 3 Dirichlet(1, 1, 1), b log-normal of sigma 1.
     assert (draws.mean(0) - 1).abs().max() < 4 * (3.08 / 4000) ** 0.5
-
-
-def test_nothing_happens_when_everything_is_off():
-    off = Augmentation(geometry=False, colors=False, brightness=0, depth=(1, 1))
-    before = example()
-    after = off(before, np.random.default_rng(0))
-    assert all(torch.equal(after[name], before[name]) for name in before)
 
 
 def test_a_quieter_stack_has_a_part_of_the_noise():
@@ -143,18 +124,6 @@ def test_rarer_light_keeps_its_mean_and_says_its_variance(share):
     assert rarer(bare, k, share, rng).names == ("primal",)
 
 
-@pytest.mark.parametrize("numbers", [(4,), (0.5, 4), (8, 4)])
-def test_numbers_of_rarer_light_are_checked(numbers):
-    with pytest.raises(NgptError, match="two numbers"):
-        Augmentation(rarer=numbers)
-
-
-@pytest.mark.parametrize("factors", [(0.1,), (0, 0.5), (0.5, 0.1), (0.5, 2), (0.1, 0.2, 0.3)])
-def test_factors_of_noise_are_checked(factors):
-    with pytest.raises(NgptError, match="two factors"):
-        Augmentation(quieter=factors)
-
-
 @pytest.mark.parametrize("size", [(1, 1), (1, 7), (2, 3), (5, 4), (16, 24)])
 def test_padding_reflects_and_keeps_the_differences(size):
     layers = {name: layer[None] for name, layer in example(*size).items()}
@@ -170,7 +139,11 @@ def test_padding_reflects_and_keeps_the_differences(size):
     assert torch.equal(padding.crop(padded["depth"], pads), layers["depth"])
 
 
-def test_padding_agrees_with_reflection_of_torch():
-    image = torch.rand(1, 3, 20, 30)
-    ours = padding.pad({"primal": image}, (3, 5, 7, 2))["primal"]
-    assert torch.equal(ours, torch.nn.functional.pad(image, (7, 2, 3, 5), mode="reflect"))
+def test_colors_and_brightness_change_light_and_surfaces_alike():
+    before = example()
+    after = augment.scale(augment.color(before, np.array([2, 0, 1]), np.array([0.5, 1.0, 1.5])), 3)
+    dx, dy = differences(after["primal"])
+    assert torch.allclose(after["dx"], dx, atol=1e-6) and torch.allclose(after["dy"], dy, atol=1e-6)
+    assert torch.allclose(after["primal"][0], 1.5 * before["primal"][2])
+    assert torch.allclose(after["albedo"][2], 1.5 * before["albedo"][1])
+    assert torch.equal(after["normal"], before["normal"])

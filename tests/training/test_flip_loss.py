@@ -2,14 +2,11 @@
 
 import numpy as np
 import pytest
+import torch
+from scipy.ndimage import gaussian_filter
 
-torch = pytest.importorskip("torch")
-
-from scipy.ndimage import gaussian_filter  # noqa: E402
-
-from ngpt.measure.distances import flip  # noqa: E402
-from ngpt.network.transfer import srgb  # noqa: E402
-from ngpt.training.loss import make_loss  # noqa: E402
+from ngpt.measure.distances import flip
+from ngpt.network.transfer import srgb
 
 
 def picture(seed, blur, size=(48, 64)):
@@ -42,18 +39,3 @@ def test_gradients_are_finite_where_images_agree_and_at_extremes(value):
     image = torch.full((1, 3, 24, 24), value, requires_grad=True)
     flip.flip(image, image.detach().clone(), (0.25, 0.01)).backward()
     assert torch.isfinite(image.grad).all()
-
-
-def test_steps_down_its_slope_make_noise_invisible():
-    reference = picture(0, 2)
-    image = (reference + 0.2 * torch.randn(reference.shape, generator=torch.Generator().manual_seed(1))).clamp(min=0)
-    loss = make_loss({"kind": "l1", "gradient": 0.0, "flip": 1.0})
-    image.requires_grad_()
-    optimizer = torch.optim.Adam([image], 2e-2)
-    first = flip.flip(image, reference, (0.25,)).item()
-    for _ in range(40):
-        optimizer.zero_grad()
-        total, parts = loss(image, reference, torch.Generator())
-        total.backward()
-        optimizer.step()
-    assert "flip" in parts and flip.flip(image, reference, (0.25,)).item() < 0.4 * first

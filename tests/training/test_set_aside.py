@@ -43,19 +43,6 @@ def test_a_share_of_the_scenes_is_set_aside_whole(scenes, share):
     assert {crop.scene for crop in split(given[::-1], (), share).held_out} == apart
 
 
-def test_the_scene_of_the_smallest_set_is_the_one_that_pages_show():
-    assert {crop.scene for crop in split(crops(*made(2)), (), 0.1).held_out} == {"made-00001"}
-
-
-def test_crops_of_one_scene_are_split_and_it_is_said():
-    given = crops("mine", of_each=10)
-    training, held_out, told = split(given, (), 0.2)
-    assert len(held_out) == 2 and len(training) == 8 and not set(held_out) & set(training)
-    assert told == "validation: 2 of 10 crops set aside, of 'mine' as are the others: there is no second scene"
-    training, held_out, told = split(given[:1], (), 0.2)
-    assert (training, held_out) == (given[:1], []) and "only one crop has a reference ('mine')" in told
-
-
 def test_nothing_is_set_aside_where_nothing_can_measure_or_nobody_asks():
     given = crops("a", "b", paired=True)
     assert split(given, (), 0.1)[:2] == (given, []) and "pairs have no reference" in split(given, (), 0.1).told

@@ -2,20 +2,16 @@
 
 import re
 import runpy
-import tomllib
-from dataclasses import fields, replace
+from dataclasses import fields
 from pathlib import Path
 
 import numpy as np
 import pytest
-from full_stack import full_stack
 
 import ngpt
-from ngpt.network.model import Reconstructor, parameters
 from ngpt.system.templates import entries
-from ngpt.training.loss import make_loss
-from ngpt.training.parameters import TABLES, configuration_row, parameter_tables, purpose
-from ngpt.training.settings import from_dict, read_settings
+from ngpt.training.parameters import TABLES, configuration_row, purpose
+from ngpt.training.settings import read_settings
 
 CONFIGS = sorted(path for path in Path("configs").glob("*.toml") if not path.name.startswith(("data-", "eval-")))
 TRAINING = Path("docs/train/training.md")
@@ -40,11 +36,6 @@ def test_configurations_are_whole(path):
     assert configuration_row(path.stem) in TRAINING.read_text()
 
 
-def test_the_page_of_training_holds_all_configurations_and_no_other():
-    rows = re.findall(r"^\| `([\w-]+)` \|.*\| *[\d,]+ \| *\d+ \|$", TRAINING.read_text(), re.M)
-    assert sorted(rows) == sorted(path.stem for path in CONFIGS)
-
-
 @pytest.mark.parametrize("table", TABLES)
 def test_every_parameter_has_a_meaning_and_every_meaning_a_parameter(table):
     told = [name for names, meaning in entries(TABLES[table]) for name in names if meaning]
@@ -52,46 +43,10 @@ def test_every_parameter_has_a_meaning_and_every_meaning_a_parameter(table):
     assert sorted(told) == sorted(own)
 
 
-def test_defaults_of_the_page_are_what_an_empty_configuration_gives():
-    """Read as TOML, they are the settings of a run that sets nothing else."""
-    model = "model = {network = 'dense', channels = [4], units = [1], inputs = ['primal']}"
-    values = tomllib.loads(model)
-    for keys, defaults in re.findall(r"^\| ((?:`[\w.]+`(?:, )?)+) \|[^|]*\| (`.*?`) \|", parameter_tables(), re.M):
-        for key, default in zip(re.findall(r"`(.+?)`", keys), re.findall(r"`(.+?)`", defaults), strict=True):
-            *table, name = key.split(".")
-            holder = values.setdefault(table[0], {}) if table else values
-            holder[name] = tomllib.loads(f"value = {default}")["value"]
-    told, plain = from_dict(values, "the page"), from_dict(tomllib.loads(model), "empty")
-    assert make_loss(told.loss).settings == make_loss(plain.loss).settings
-    assert replace(told, loss={}) == replace(plain, loss={})
-
-
-def test_sizes():
-    sizes = {path.stem: parameters(Reconstructor(read_settings(path).model)) for path in CONFIGS}
-    assert sizes["paper"] == 4_358_534
-
-
 def test_a_dry_run_says_what_it_would_cost(train):
     status, output, _ = train("--config", "configs/paper.toml", "--dry-run")
     assert status == 0
     assert "4,358,534" in output and "765.3 G at 1280x720" in output
-
-
-@pytest.mark.parametrize(
-    ("arguments", "expected", "complaint"),
-    [
-        (["--config", "nowhere.toml", "--dry-run"], 1, "nowhere.toml: cannot be read"),
-        (["--config", "configs/fast.toml"], 2, "--out is missing"),
-        ([], 2, "--config is missing: a TOML file, or one of: ablations, "),
-        (["--config", "configs/fast.toml", "--out", "OUT", "--set", "data.folders=['nowhere']"], 1, "no such folder"),
-        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base=x"], 1, "choose one of"),
-        (["--config", "configs/fast.toml", "--dry-run", "--set", "model.base"], 2, "give it as table.key=value"),
-    ],
-)
-def test_mistakes_end_in_one_line(train, tmp_path, arguments, expected, complaint):
-    status, _, errors = train(*[str(tmp_path) if a == "OUT" else a for a in arguments])
-    assert status == expected
-    assert complaint in errors and errors.count("\n") == 1
 
 
 def test_views_of_ones_own_train_a_network(train, tmp_path):
@@ -240,19 +195,3 @@ def test_every_configuration_trains_on_a_set_of_our_own_generator(path, kind, tr
     status, output, errors = train("--config", path.stem, "--out", str(tmp_path / "run"), *arguments)
     assert status == 0, errors
     assert "validation: 1 of 2 scenes set aside" in output and "finished at step 2" in output and "relMSE" in output
-
-
-def test_the_smallest_set_trains_the_smallest_network_as_the_page_says(smallest_set, tmp_path, monkeypatch, capsys):
-    """The first commands of docs/train/training.md, in a folder of their own."""
-    from ngpt.cli import main
-
-    commands = FIRST_COMMANDS
-    assert [command.split()[0] for command in commands] == ["dataset", "train", "denoise"]
-    assert commands[1] == "train --config tiny --out run --set run.steps=2"
-    monkeypatch.chdir(smallest_set)
-    assert main(commands[1].split()) == 0, capsys.readouterr().err
-    output = capsys.readouterr().out
-    assert "validation: 1 of 2 scenes set aside, 2 crops: made-00001" in output
-    assert "finished at step 2" in output and "relMSE" in output
-    ngpt.write("stack.exr", full_stack(18, 26))
-    assert main(commands[2].split()) == 0, capsys.readouterr().err

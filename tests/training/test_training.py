@@ -2,65 +2,30 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
-import time
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from crops import SyntheticCrop
+from runs import CROPS, SETTINGS, loss, settings, trainer
 
-torch = pytest.importorskip("torch")
+import ngpt
+from ngpt.errors import NgptError
+from ngpt.network import weights
+from ngpt.stack import GradientStack
+from ngpt.training import examples, folders
+from ngpt.training.augment import Augmentation
+from ngpt.training.schedule import learning_rate
+from ngpt.training.settings import OptimizerSettings, from_dict, read_settings
+from ngpt.training.trainer import Trainer, published
+from ngpt.windows import Place, Window
 
-from crops import SyntheticCrop  # noqa: E402
-
-import ngpt  # noqa: E402
-from ngpt.errors import NgptError  # noqa: E402
-from ngpt.network import weights  # noqa: E402
-from ngpt.network.model import ModelConfig  # noqa: E402
-from ngpt.stack import GradientStack  # noqa: E402
-from ngpt.training import examples, folders  # noqa: E402
-from ngpt.training.augment import Augmentation  # noqa: E402
-from ngpt.training.schedule import learning_rate  # noqa: E402
-from ngpt.training.settings import OptimizerSettings, from_dict, read_settings  # noqa: E402
-from ngpt.training.trainer import Trainer, published  # noqa: E402
-from ngpt.windows import Place, Window  # noqa: E402
-
-CROPS = [SyntheticCrop(f"scene{i}", i) for i in range(6)]
-SETTINGS = {
-    "model": {
-        "network": "dense",
-        "channels": [4, 6],
-        "units": [1, 1],
-        "inputs": ["primal", "dx", "dy", "albedo", "normal", "depth"],
-    },
-    "data": {"crop": 32},
-    "augmentation": {"brightness": 0.0},
-    "optimizer": {"learning_rate": 1e-2, "schedule": "cosine", "warmup": 5, "ema": 0.9},
-    "run": {"steps": 12, "batch": 2, "log": 2, "save": 5, "validate": 6},
-}
-
-
-def loss(prediction, target, generator):
-    """Random, so that resuming must restore the generator too."""
-    weight = 1 + 0.1 * torch.rand(target.shape, generator=generator)
-    parts = {"l1": (weight * (prediction - target).abs()).mean()}
-    return parts["l1"], parts
-
-
-def settings(**changes):
-    values = json.loads(json.dumps(SETTINGS))
-    for name, value in changes.items():
-        table, _, key = name.partition("_")
-        values[table][key] = value
-    return from_dict(values, "test")
-
-
-def trainer(out, crops=CROPS, **changes):
-    out.mkdir(exist_ok=True)
-    return Trainer(settings(**changes), crops[:4], crops[4:], loss, out, say=lambda text: None)
+HERE = str(Path(__file__).parent)
 
 
 def test_it_learns_and_its_weights_can_be_used(tmp_path):
@@ -75,40 +40,6 @@ def test_it_learns_and_its_weights_can_be_used(tmp_path):
     image = ngpt.denoise(crop.stack(0), "ngpt", weights=str(tmp_path / "weights.safetensors"))
     error = np.mean((image - crop.reference) ** 2)
     assert error < 0.5 * np.mean((crop.stack(0)["primal"] - crop.reference) ** 2)
-
-
-def test_a_network_of_oidns_shape_learns(tmp_path):
-    shipped = read_settings("configs/oidn-small.toml").model.to_dict()
-    made = shipped | {"inputs": ("primal", "albedo", "normal"), "base": "", "start": ()}
-    values = settings(run_steps=120, run_batch=4, run_validate=120, optimizer_learning_rate=1e-3)
-    run = Trainer(
-        replace(values, model=ModelConfig(**made)), CROPS[:4], CROPS[4:], loss, tmp_path, say=lambda text: None
-    )
-    assert run.run()
-    scores = json.loads((tmp_path / "log.jsonl").read_text().splitlines()[-1])
-    assert scores["relMSE"] < 0.95 * scores["relMSE primal"]
-
-
-def test_one_batch_can_be_learnt_by_heart():
-    run_settings = settings()
-    drawn = examples.Examples(CROPS[:1], run_settings.model, run_settings.augmentation, 32, seed=0)
-    from ngpt.network.model import Reconstructor
-    from ngpt.network.transfer import signed_exp
-
-    torch.manual_seed(0)
-    model = Reconstructor(run_settings.model)
-    optimizer = torch.optim.Adam(model.parameters(), 5e-3)
-    batch = {name: torch.stack([drawn[0][name], drawn[1][name]]) for name in drawn[0]}
-    target = batch.pop("target")
-    first = None
-    for _ in range(300):
-        prediction = signed_exp(model.predict(batch)[..., 15:-15, 15:-15])
-        value = (prediction - target).abs().mean()
-        first = first or float(value.detach())
-        optimizer.zero_grad()
-        value.backward()
-        optimizer.step()
-    assert float(value.detach()) < 0.03 * first
 
 
 @pytest.mark.parametrize("stop", [1, 5, 7])
@@ -135,36 +66,6 @@ def test_a_stopped_run_continues_bit_for_bit(tmp_path, stop):
     logs = [(tmp_path / name / "log.jsonl").read_text().splitlines() for name in ("whole", "part")]
     steps = [[json.loads(line)["step"] for line in log] for log in logs]
     assert steps[0] == steps[1]
-
-
-def test_a_killed_run_continues_bit_for_bit(tmp_path):
-    """SIGKILL at a moment of its own choosing; what is on disk is whole, and leads to the same weights."""
-    program = (
-        "import sys; from pathlib import Path; sys.path[:0] = ['tests/training'];"
-        "import torch; torch.set_num_threads(1); import test_training as t;"
-        "r = t.trainer(Path(sys.argv[1]), run_steps=40, run_save=3);"
-        "r.resume() if r.checkpoint.exists() else None; r.run()"
-    )
-    whole = trainer(tmp_path / "whole", run_steps=40, run_save=3)
-    whole.run()
-    out = tmp_path / "killed"
-    environment = os.environ | {"PYTHONPATH": os.getcwd()}
-    process = subprocess.Popen([sys.executable, "-c", program, str(out)], env=environment)
-    deadline = time.monotonic() + 60
-    while not (out / "checkpoint.safetensors").exists() and time.monotonic() < deadline and process.poll() is None:
-        time.sleep(0.01)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    weights.load_weights(out / "weights.safetensors") if (out / "weights.safetensors").exists() else None
-    subprocess.run([sys.executable, "-c", program, str(out)], env=environment, check=True)
-    ours, _ = weights.read_tensors(tmp_path / "whole" / "weights.safetensors")
-    theirs, _ = weights.read_tensors(out / "weights.safetensors")
-    assert all(torch.equal(ours[name], theirs[name]) for name in ours)
-
-
-def test_a_wall_clock_budget_stops_it(tmp_path):
-    run = trainer(tmp_path, run_minutes=1e-9)
-    assert not run.run() and run.step == 1 and run.checkpoint.exists()
 
 
 def test_records_that_cannot_be_written_cost_no_step(tmp_path, monkeypatch):
@@ -276,30 +177,6 @@ def test_folders_with_a_layer_that_the_reference_or_a_stack_lacks(tmp_path):
     assert not folders.open_crops(tmp_path)[0].reference_caustic.any()
 
 
-def test_the_best_input_is_shown_once_more_with_less_noise():
-    s = settings()
-    crop = SyntheticCrop("noisy", 0)
-    crop.spp = (1, 4)
-    drawn = examples.Examples([crop], s.model, Augmentation(quieter=(0.01, 0.01)), 32, seed=0)
-    inner = np.s_[:, 15:-15, 15:-15]
-    errors = [
-        (example["primal"][inner] - example["target"]).abs().mean().item()
-        for example in map(drawn.__getitem__, range(30))
-    ]
-    quiet = sum(error < 0.05 * max(errors) for error in errors)
-    # A third of them; at 4 samples there is half the noise of one sample.
-    assert 3 <= quiet <= 18
-    assert min(errors) > 0
-
-
-def test_a_mixture_is_its_parts_one_after_the_other():
-    growing = CROPS[:1]
-    mixture = examples.Mixture(growing, CROPS[3:5])
-    assert [crop.scene for crop in mixture] == ["scene0", "scene3", "scene4"]
-    growing.append(CROPS[1])
-    assert len(mixture) == 4 and mixture[1].scene == "scene1" and mixture[3].scene == "scene4"
-
-
 def test_folders_of_stacks_are_crops(tmp_path):
     crop = CROPS[0]
     (tmp_path / "view").mkdir()
@@ -332,13 +209,6 @@ def test_the_papers_schedule():
     assert learning_rate(paper, 120_000, 600_000) == pytest.approx(2.5e-4)
     # The facts sheet of the released code: 2.2e-6 at the end.
     assert learning_rate(paper, 600_000, 600_000) == pytest.approx(2.2e-6, rel=0.03)
-
-
-def test_the_cosine_schedule():
-    s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
-    rates = [learning_rate(s, i, 110) for i in range(110)]
-    assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
-    assert all(a >= b for a, b in pairwise(rates[10:]))
 
 
 @pytest.mark.parametrize("schedule", ("paper", "cosine"))
@@ -416,13 +286,6 @@ def test_fine_tuning_starts_from_weights(tmp_path):
         Trainer(from_dict(values, "test"), CROPS[:4], [], loss, tmp_path / "b")
 
 
-def test_weights_do_not_tell_where_things_lie(tmp_path):
-    values = SETTINGS | {"initial": "/home/me/a.safetensors", "loss": {"kind": "l1", "backbone": "/home/me/b.pth"}}
-    values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
-    told = published(from_dict(values, "test"))
-    assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
-
-
 def test_damaged_weights_are_explained(tmp_path):
     run = trainer(tmp_path, run_steps=1)
     run.run()
@@ -469,15 +332,6 @@ def test_damaged_weights_are_explained(tmp_path):
         ngpt.denoise(CROPS[0].stack(0), "ngpt", weights=str(tmp_path / "nothing"))
 
 
-def test_a_stack_without_what_the_weights_read_is_explained(tmp_path):
-    trainer(tmp_path, run_steps=1).run()
-    path = str(tmp_path / "weights.safetensors")
-    stack = CROPS[0].stack(0)
-    poor = ngpt.GradientStack.from_arrays(primal=stack["primal"], dx=stack["dx"], dy=stack["dy"])
-    with pytest.raises(NgptError, match="need layers albedo, normal, depth, which the stack lacks"):
-        ngpt.denoise(poor, "ngpt", weights=path)
-
-
 def test_checkpoints_that_do_not_fit_are_explained(tmp_path):
     trainer(tmp_path, run_steps=1).run()
     path = tmp_path / "checkpoint.safetensors"
@@ -501,16 +355,30 @@ def test_checkpoints_that_do_not_fit_are_explained(tmp_path):
 def test_two_processes_do_what_one_does(tmp_path):
     """Gradients of two processes with half the batch each, averaged, are those of one; their examples are the same."""
     program = (
-        "import sys; from pathlib import Path; sys.path[:0] = ['tests/training']; import test_training as t;"
+        "import sys; from pathlib import Path; sys.path[:0] = [sys.argv[2]]; import runs as t;"
         "t.loss = lambda p, q, g: ((p - q).abs().mean(), {});"
         "r = t.trainer(Path(sys.argv[1]), run_steps=3); r.run(); r.processes.close()"
     )
     environment = os.environ | {"PYTHONPATH": os.getcwd(), "OMP_NUM_THREADS": "1"}
     (tmp_path / "run.py").write_text(program)
-    one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one")]
-    two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two")]
+    one = [sys.executable, str(tmp_path / "run.py"), str(tmp_path / "one"), HERE]
+    two = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", one[1], str(tmp_path / "two"), HERE]
     subprocess.run(one, env=environment, check=True)
     subprocess.run(two, env=environment, check=True)
     ours, _ = weights.read_tensors(tmp_path / "one" / "weights.safetensors")
     theirs, _ = weights.read_tensors(tmp_path / "two" / "weights.safetensors")
     assert all(torch.allclose(ours[name], theirs[name], rtol=1e-3, atol=1e-4) for name in ours)
+
+
+def test_weights_do_not_tell_where_things_lie(tmp_path):
+    values = SETTINGS | {"initial": "/home/me/a.safetensors", "loss": {"kind": "l1", "backbone": "/home/me/b.pth"}}
+    values["data"] = SETTINGS["data"] | {"folders": ["/home/me/views"]}
+    told = published(from_dict(values, "test"))
+    assert told["data"]["folders"] == ["views"] and told["initial"] == "a.safetensors" and "/" not in str(told["loss"])
+
+
+def test_the_cosine_schedule():
+    s = OptimizerSettings(learning_rate=1.0, schedule="cosine", warmup=10)
+    rates = [learning_rate(s, i, 110) for i in range(110)]
+    assert rates[0] == pytest.approx(0.1) and max(rates) == 1 and rates[-1] == pytest.approx(0.01)
+    assert all(a >= b for a, b in pairwise(rates[10:]))

@@ -26,7 +26,7 @@ A suffix is shared where all three vertices are connectable and the event at x_j
 pixel alone, in primal and differences alike: the pixels of a pair agree on that, since the rule names neither first.
 
 [Bauszat, Petitjean, Eisemann 2017, "Gradient-domain path reusing"; Bekaert, Sbert, Halton 2002, "Accelerating path
-tracing by re-using paths"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 6.1]
+tracing by reusing paths"; Hua et al. 2019, "A Survey on Gradient-Domain Rendering", section 6.1]
 """
 
 from __future__ import annotations

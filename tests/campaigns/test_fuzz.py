@@ -1,6 +1,6 @@
-"""Broken files by the hundred, and by the ten thousand in `make test-slow`: each is refused by name or handled.
+"""Broken files by the hundred, and by the ten thousand in `make campaigns`: each is refused by name or handled.
 
-A failure names inputs by number: `python tests/fuzz/campaign.py TARGET --replay NUMBER` does it again.
+A failure names inputs by number: `python tests/campaigns/fuzz/campaign.py TARGET --replay NUMBER` does it again.
 """
 
 import os
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from fuzz.campaign import run
-from reliability import record
+from reliability import at_length, record
 
 # Target: what it is to a reader, inputs here, inputs in the slow campaign, what it needs beyond the base.
 TARGETS = {
@@ -26,27 +26,21 @@ TARGETS = {
 }
 
 
-def campaign(target, first, count):
-    for package in TARGETS[target][3]:
+@pytest.mark.parametrize(
+    ("target", "first", "count"),
+    [
+        *((target, 0, few) for target, (_, few, _, _) in TARGETS.items()),
+        *(at_length(target, 1000, many) for target, (_, _, many, _) in TARGETS.items()),
+    ],
+)
+def test_broken_inputs_are_refused_or_handled(target, first, count):
+    text, _, _, needs = TARGETS[target]
+    for package in needs:
         pytest.importorskip(package)
     report = run(target, first, count)
     assert not report.failures, report.failures
     assert report.outcomes["named error"] > count / 10 and report.outcomes["accepted"] > count / 100, "does it work?"
     assert report.outcomes.total() == count
-    return report
-
-
-@pytest.mark.parametrize("target", TARGETS)
-def test_broken_inputs_are_refused_or_handled(target):
-    campaign(target, 0, TARGETS[target][1])
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-@pytest.mark.parametrize("target", TARGETS)
-def test_many_broken_inputs_are_refused_or_handled(target):
-    text, _, count, _ = TARGETS[target]
-    report = campaign(target, 1000, count)
     record(text, count, dict(report.outcomes), worst=report.worst, seconds=round(report.seconds, 1))
 
 
@@ -55,27 +49,11 @@ def test_many_broken_inputs_are_refused_or_handled(target):
 def test_bytes_that_reach_new_lines(target, tmp_path):
     """A minute of libFuzzer for each of the parsers in Python."""
     pytest.importorskip("atheris")
-    program = Path(__file__).with_name("coverage_guided.py")
-    path = os.pathsep.join(map(str, [program.parents[2], program.parents[1]]))
+    program = Path(__file__).parent / "fuzz" / "coverage_guided.py"
+    path = os.pathsep.join(map(str, [program.parents[3], program.parents[2]]))
     command = [sys.executable, str(program), target, "-max_total_time=60"]
     environment = os.environ | {"PYTHONPATH": path}
     done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr[-2000:]
     runs = int(re.search(r"Done (\d+) runs", done.stderr)[1])
     record(f"Coverage-guided bytes: {target}", runs, {"named error or accepted": runs}, seconds=60)
-
-
-@pytest.mark.slow
-def test_campaigns_notice_what_they_are_for():
-    """Crash, hang, memory taken and refused, tracebacks, errors without the file; and they go on behind each."""
-    report = run("probe", 0, 10, patience=20)
-    assert report.outcomes == {"accepted": 3, "failed": 6, "named error": 1}, report.failures
-    for number, what in {
-        1: "the process died (-11)",
-        3: "hangs: no end after 0 s of work",
-        4: "took 6",
-        5: "MemoryError",
-        6: "KeyError",
-        7: "names no file",
-    }.items():
-        assert what in report.failures[number]

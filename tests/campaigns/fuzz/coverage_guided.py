@@ -1,7 +1,7 @@
 """Coverage-guided fuzzing of what is parsed in Python: bytes that reach new lines of ngpt breed others (libFuzzer).
 
-    python tests/fuzz/coverage_guided.py header -runs=100000      target, then libFuzzer's own arguments
-    python tests/fuzz/coverage_guided.py json crash-...           one input again
+    python tests/campaigns/fuzz/coverage_guided.py header -runs=100000      target, then libFuzzer's own arguments
+    python tests/campaigns/fuzz/coverage_guided.py json crash-...           one input again
 
 Targets: header (OpenEXR), json (manifests), toml (settings). Needs atheris, of PyPI, for Python up to 3.13.
 """

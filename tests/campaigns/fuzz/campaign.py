@@ -1,7 +1,7 @@
 """Campaigns: many broken inputs, in processes of their own, so that a crash or a hang is an outcome like others.
 
-python tests/fuzz/campaign.py exr 10000          inputs 0 .. 9999 of that target
-python tests/fuzz/campaign.py exr --replay 1234  one of them, in this process, with all it says
+python tests/campaigns/fuzz/campaign.py exr 10000          inputs 0 .. 9999 of that target
+python tests/campaigns/fuzz/campaign.py exr --replay 1234  one of them, in this process, with all it says
 """
 
 import argparse
@@ -50,7 +50,7 @@ def run(target: str, first: int, count: int, patience: float = PATIENCE) -> Repo
 def _batch(report: Report, target: str, first: int, last: int, patience: float) -> int:
     """Lets a process work until it is done, dead or too slow; returns the input to go on with."""
     command = [sys.executable, str(HERE / "child.py"), target, str(first), str(last), str(MEBIBYTES)]
-    path = os.pathsep.join([str(HERE.parent.parent), str(HERE.parent), os.environ.get("PYTHONPATH", "")])
+    path = os.pathsep.join([str(HERE.parents[2]), str(HERE.parents[1]), os.environ.get("PYTHONPATH", "")])
     environment = os.environ | {"PYTHONPATH": path, "OMP_NUM_THREADS": "1", "PYTHONFAULTHANDLER": "1"}
     with (
         tempfile.TemporaryFile("w+") as stderr,
@@ -110,7 +110,7 @@ def main() -> None:
     parser.add_argument("--replay", type=int)
     args = parser.parse_args()
     if args.replay is not None:
-        sys.path[:0] = [str(HERE.parent.parent), str(HERE.parent)]
+        sys.path[:0] = [str(HERE.parents[2]), str(HERE.parents[1])]
         from targets import TARGETS
 
         with tempfile.TemporaryDirectory() as folder:

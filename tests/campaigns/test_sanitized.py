@@ -15,7 +15,7 @@ from reliability import record
 pytest.importorskip("onnx")
 pytestmark = pytest.mark.slow
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1] / "export"
 ADDRESS = "-fsanitize=address,undefined -fno-sanitize-recover=all -g"
 THREAD = "-fsanitize=thread -g"
 CALLS = 100_000
@@ -34,11 +34,11 @@ def has(compiler, flags, folder) -> bool:
 class Sanitized:
     """The library, built with a compiler's flags, and programs that use it."""
 
-    def __init__(self, flags, folder, runtime, *options):
+    def __init__(self, flags, folder, toolchain, *options):
         if not has(tool("gcc", "clang"), flags, folder):
             pytest.skip(f"the compiler has no {flags.split()[0]}")
         self.flags, self.folder = flags.split(), folder
-        self.prefix = install(runtime, folder, f"-DCMAKE_CXX_FLAGS={flags}", "-DCMAKE_BUILD_TYPE=Debug", *options)
+        self.prefix = install(toolchain, folder, f"-DCMAKE_CXX_FLAGS={flags}", "-DCMAKE_BUILD_TYPE=Debug", *options)
 
     def run(self, program, *arguments) -> str:
         built = self.folder / program
@@ -61,8 +61,8 @@ def done(arguments, **environment) -> str:
 
 
 @pytest.fixture(scope="module")
-def sanitized(runtime, tmp_path_factory):
-    return Sanitized(ADDRESS, tmp_path_factory.mktemp("address"), runtime)
+def sanitized(toolchain, tmp_path_factory):
+    return Sanitized(ADDRESS, tmp_path_factory.mktemp("address"), toolchain)
 
 
 @pytest.fixture(scope="module")
@@ -104,12 +104,12 @@ def test_arguments_at_random(sanitized, networks):
     )
 
 
-def test_arguments_that_cover_more(runtime, networks, tmp_path):
+def test_arguments_that_cover_more(toolchain, networks, tmp_path):
     """libFuzzer looks for bytes that lead to code which no bytes have led to."""
     flags = ADDRESS.replace("address", "fuzzer-no-link,address")
     if not has(tool("clang"), ADDRESS.replace("address", "fuzzer,address"), tmp_path):
         pytest.skip("clang has no libFuzzer")
-    made = Sanitized(flags, tmp_path, runtime, f"-DCMAKE_CXX_COMPILER={tool('clang++')}")
+    made = Sanitized(flags, tmp_path, toolchain, f"-DCMAKE_CXX_COMPILER={tool('clang++')}")
     program, prefix = tmp_path / "fuzzer", made.prefix
     options = [
         "-DLIBFUZZER",
@@ -139,8 +139,8 @@ def test_threads(sanitized, networks):
     assert sanitized.run("threads", networks[1], 8, 40) == ""
 
 
-def test_threads_race_for_nothing(runtime, networks, tmp_path):
-    assert Sanitized(THREAD, tmp_path, runtime).run("threads", networks[1], 4, 20) == ""
+def test_threads_race_for_nothing(toolchain, networks, tmp_path):
+    assert Sanitized(THREAD, tmp_path, toolchain).run("threads", networks[1], 4, 20) == ""
 
 
 def test_allocations_that_fail(sanitized, networks, tmp_path):

@@ -26,7 +26,7 @@ from ngpt.io.exr import read, write
 from ngpt.methods import reconstruct
 from ngpt.network.run import WEIGHTS
 
-CONFIGS = Path(__file__).resolve().parents[2] / "configs"
+CONFIGS = Path(__file__).resolve().parents[3] / "configs"
 
 
 def exr(number: int, folder: Path) -> None:

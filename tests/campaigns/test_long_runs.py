@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from full_stack import full_stack
 from processes import ENVIRONMENT, ROOT, make_work
-from reliability import record
+from reliability import at_length, record
 
 import ngpt
 
@@ -95,7 +95,7 @@ def judge(campaign, notes, each=1, slower=SLOWER):
     assert slope < MIB and ratio < slower, worst
 
 
-@pytest.mark.parametrize("count", [40, pytest.param(1000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("count", [40, at_length(1000)])
 def test_many_stacks_in_one_call(tmp_path, count):
     (tmp_path / "in").mkdir()
     for i in range(6):
@@ -119,7 +119,7 @@ def test_many_small_crops(tmp_path):
     judge("Small crops in one process of data_gen", notes)
 
 
-@pytest.mark.parametrize("steps", [150, pytest.param(5000, marks=[pytest.mark.slow, pytest.mark.timeout(3600)])])
+@pytest.mark.parametrize("steps", [150, at_length(5000)])
 def test_many_training_steps(tmp_path, steps):
     job = make_work("train", tmp_path)
     changes = {"run.steps": steps, "run.save": steps // 4, "run.validate": steps // 4, "run.log": 50}

@@ -1,6 +1,8 @@
 """Runs inputs of a target one after the other and tells its parent, ``campaign``, what became of each.
 
-python tests/fuzz/child.py TARGET FIRST LAST [MIB]      inputs FIRST .. LAST - 1, at most MIB more memory than at start
+python tests/campaigns/fuzz/child.py TARGET FIRST LAST [MIB]
+
+Inputs are FIRST .. LAST - 1; each may take at most MIB more memory than there was at the start.
 """
 
 import os
