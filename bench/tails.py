@@ -3,7 +3,7 @@
     python -m bench.tails kitchen/scene.xml bedroom/scene.xml --references FOLDER --groups rooms=kitchen,bedroom
 
 Samplers are `primal` (as it is, "raw", `oidn` and `ngpt-primal`) and `gpt` (`wcv`, `ngpt-fast`, `ngpt-combine` and
-`oidn`). Each cell has:
+`oidn`), and `mitsuba`: `primal` with Mitsuba's own points and lamps and whole paths, denoised by `oidn`. Each cell has:
 
     seconds    of processors, of the render and of the reconstruction, both warmed up; whole: both together
     error      relMSE by two halves of a reference, without the worst 0.1 % of the pixels; FLIP is over their mean
@@ -43,7 +43,13 @@ from ngpt.measure.metrics import EPSILON, relmse_trimmed, scores, squared_error,
 
 RAW = "raw"
 SECONDS = (5, 10, 20, 40)
-METHODS = {"primal": [RAW, "oidn", "ngpt-primal"], "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"]}
+METHODS = {
+    "primal": [RAW, "oidn", "ngpt-primal"],
+    "gpt": ["wcv", "ngpt-fast", "ngpt-combine", "oidn"],
+    "mitsuba": ["oidn"],
+}
+# Mitsuba as it is
+RIVAL = {"points": "independent", "lamps": "uniform"}
 TAILS = ("paths", "shared")
 VALUES = ("error", "steady", "FLIP", "blocks", "energy")
 ERRORS = VALUES[:-1]
@@ -103,19 +109,20 @@ def measured(scene: str, args: argparse.Namespace, known: set[tuple]):
     clean = np.mean([ngpt.reconstruct(half, "oidn").image for half in reference.stacks], axis=0, dtype=np.float64)
     for sampler in args.samplers:
         warm: set[str] = set()
+        name, options = ("primal", RIVAL) if sampler == "mitsuba" else (sampler, {})
         for spp in args.spp:
             for seed in args.seeds:
-                for tails in args.tails:
+                for tails in args.tails if sampler != "mitsuba" else ["paths"]:
                     values = (scene_name(scene), args.size, sampler, tails, spp, seed)
                     if values in known:
                         continue
                     if tails not in warm:
-                        stack = render_stack(loaded, WARM_SPP, 0, sampler, tails=tails)
+                        stack = render_stack(loaded, WARM_SPP, 0, name, tails=tails, **options)
                         for method in METHODS[sampler]:
                             image_of(stack, method)
                         warm.add(tails)
                     load, start = os.getloadavg()[0], processor_seconds()
-                    stack = render_stack(loaded, spp, seed, sampler, tails=tails)
+                    stack = render_stack(loaded, spp, seed, name, tails=tails, **options)
                     cell = dict(zip(CELL, values, strict=True)) | {"seconds": processor_seconds() - start}
                     cell |= {"load average": load, "options": stack.attributes.get("ngpt:samplerOptions", "")}
                     yield cell | {"methods": {name: judged(stack, name, reference, clean) for name in METHODS[sampler]}}
@@ -233,7 +240,7 @@ def show(cells: list[dict], groups: dict[str, list[str]]) -> None:
             table(head, lines)
     for tails in sorted({cell["tails"] for cell in cells}):
         print(f"\npipelines after equal whole time, tails={tails}: error and FLIP over those of `primal` and `oidn`")
-        table(["scenes", "processor s", *pipelines()], against_oidn(cells, tails, groups))
+        table(["scenes", "processor s", *pipelines(), "mitsuba+oidn"], against_oidn(cells, tails, groups))
     loads = [cell["load average"] for cell in cells]
     print(f"\nload average {min(loads):.1f} to {max(loads):.1f}")
 
@@ -244,16 +251,18 @@ def pipelines() -> dict[str, dict[str, str]]:
     return {
         f"{sampler}+{method}": {"sampler": sampler, "stack": "gradients" if sampler == "gpt" else "primal"}
         for sampler, method in pairs
-        if (sampler, method) != ("gpt", "oidn") and method != RAW
+        if (sampler, method) != ("gpt", "oidn") and method != RAW and sampler != "mitsuba"
     }
 
 
 def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) -> list[list[str]]:
-    """A row for each scene and group, and each of ``SECONDS``: of all ``pipelines``, error and FLIP."""
+    """A row for each scene and group, and each of ``SECONDS``: error and FLIP of all ``pipelines`` and of Mitsuba."""
+    names = [*pipelines(), "mitsuba+oidn"]
     curves: dict[str, dict[str, dict[str, list]]] = {}
     for (scene, _, sampler, method), by_spp in rows_of(cells).items():
-        if (name := f"{sampler}+{method}") in pipelines():
-            lines = [by[tails] for by in by_spp.values() if tails in by]
+        if (name := f"{sampler}+{method}") in names:
+            each = "paths" if sampler == "mitsuba" else tails
+            lines = [by[each] for by in by_spp.values() if each in by]
             points = {value: [(line["whole"], line[value]) for line in lines] for value in ("error", "FLIP")}
             curves.setdefault(scene, {})[name] = points
 
@@ -267,7 +276,7 @@ def against_oidn(cells: list[dict], tails: str, groups: dict[str, list[str]]) ->
         for seconds in SECONDS if here else ():
             values = {
                 name: [over([ratio(scene, name, value, seconds) for scene in here]) for value in ("error", "FLIP")]
-                for name in pipelines()
+                for name in names
             }
             rows.append([label, str(seconds), *map(", ".join, values.values())])
     return rows
