@@ -17,8 +17,6 @@ Control Variates for Rendering"]
 
 import numpy as np
 
-from ngpt.classical.arrays import Array
-from ngpt.classical.gradients import differences
 from ngpt.classical.jacobi import jacobi
 from ngpt.classical.leastsquares import Equations
 from ngpt.classical.variances import smooth_variances, without_missing
@@ -26,7 +24,13 @@ from ngpt.classical.variances import smooth_variances, without_missing
 SWEEPS = 50
 
 
-def cv(primal: Array, dx: Array, dy: Array, trusted: tuple[Array, Array] | None = None, sweeps: int = SWEEPS) -> Array:
+def cv(
+    primal: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    trusted: tuple[np.ndarray, np.ndarray] | None = None,
+    sweeps: int = SWEEPS,
+) -> np.ndarray:
     """Uniform control variates, (H, W, C) in the units of ``primal``; arguments as of ``ngpt.classical.poisson.l2``.
 
     Linear in (primal, dx, dy). ``sweeps`` of the Jacobi iteration: more take more from further pixels, down to a
@@ -34,21 +38,21 @@ def cv(primal: Array, dx: Array, dy: Array, trusted: tuple[Array, Array] | None 
     """
     equations = Equations(primal, dx, dy, trusted)
     # Equal weights are those of exact differences.
-    one = equations.xp.ones_like(equations.primal[:1])
-    exact = without_missing(equations.xp.zeros_like(equations.xp.stack([one[0], one[0]])), trusted)
+    one = np.ones_like(equations.primal[:1])
+    exact = without_missing(np.zeros_like(np.stack([one[0], one[0]])), trusted)
     return _sweep(equations, one, exact, [1.0] * sweeps)
 
 
 def wcv(
-    primal: Array,
-    dx: Array,
-    dy: Array,
-    primal_var: Array,
-    dx_var: Array,
-    dy_var: Array,
-    trusted: tuple[Array, Array] | None = None,
+    primal: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    primal_var: np.ndarray,
+    dx_var: np.ndarray,
+    dy_var: np.ndarray,
+    trusted: tuple[np.ndarray, np.ndarray] | None = None,
     sweeps: int = SWEEPS,
-) -> Array:
+) -> np.ndarray:
     """Variance-weighted control variates, (H, W, C) in the units of ``primal``.
 
     ``*_var`` (H, W, C) are variances of the pixel means; missing values may be NaN (``ngpt.classical.variances``).
@@ -68,32 +72,13 @@ def decay(sweeps: int) -> list[float]:
     return factors
 
 
-def _sweep(equations: Equations, primal_var: Array, difference_var: Array, factors: list[float]) -> Array:
+def _sweep(
+    equations: Equations, primal_var: np.ndarray, difference_var: np.ndarray, factors: list[float]
+) -> np.ndarray:
     """Jacobi sweeps on the correction u = I - P, one for each factor of the primal's variance.
 
     With weights relative to a pixel's own, a = f var I / (f var I + var Δ) <= 1, what a neighbour says beyond the
     pixel's value e is weighted by a: u += Σ a e / (1 + Σ a).
     """
     r, scale = equations.scaled_residual()
-    if isinstance(r, np.ndarray):
-        return equations.image(jacobi(r, primal_var, difference_var, factors), scale)
-    u = equations.xp.zeros_like(r[0])
-    for factor in factors:
-        u = _swept(u, r, factor * primal_var, difference_var)
-    return equations.image(u, scale)
-
-
-def _swept(u: Array, r: Array, own: Array, difference_var: Array) -> Array:
-    """The correction after one more sweep; ``own`` (1, H, W) is f var I. ``jacobi`` does the same on NumPy arrays."""
-    vx, vy = difference_var
-    dx, dy = differences(u, 0, u.shape[1])
-    ex, ey = dx - r[0], dy - r[1]
-    right, below = own / (own + vx), own / (own + vy)
-    left, above = own[..., 1:] / (own[..., 1:] + vx[..., :-1]), own[:, 1:] / (own[:, 1:] + vy[:, :-1])
-    weight = 1 + right + below
-    weight[..., 1:] += left
-    weight[:, 1:] += above
-    change = right * ex + below * ey
-    change[..., 1:] -= left * ex[..., :-1]
-    change[:, 1:] -= above * ey[:, :-1]
-    return u + change / weight
+    return equations.image(jacobi(r, primal_var, difference_var, factors), scale)

@@ -6,7 +6,9 @@ before and after, an image keeps the energy of the primal, which is unbiased; da
 of it.
 """
 
-from ngpt.classical.arrays import Array, by_rows, cast, empty, module, over_colours
+import numpy as np
+
+from ngpt.classical.arrays import by_rows, empty, over_colours
 from ngpt.classical.arrays import image as as_image
 from ngpt.classical.leastsquares import solve
 
@@ -17,23 +19,22 @@ REACH = 32
 MOST = 4.0
 
 
-def keep_energy(image: Array, primal: Array) -> Array:
+def keep_energy(image: np.ndarray, primal: np.ndarray) -> np.ndarray:
     """The reconstruction with the local brightness of ``primal``; both are (H, W, C), and so is the result.
 
     The factor is one for all colours, smooth, and 1 where the two agree. f(k image, k primal) = k f(image, primal).
     """
-    xp = module(image)
-    double = empty(image[..., 0], 2, dtype=xp.float64)
-    brightness, _ = by_rows(lambda i, j: (xp.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
+    double = empty(image[..., 0], 2, dtype=np.float64)
+    brightness, _ = by_rows(lambda i, j: (np.stack([over_colours(x[i:j]) for x in (primal, image)]),), double)
     # Averaged over REACH pixels but for a factor, which the ratio does not know; sums stay.
     local = solve(brightness, 1 / REACH**2)
 
     def rows(first: int, last: int) -> tuple:
         before, after = local[:, first:last]
         lit = (before > 0) & (after > 0)
-        factor = xp.where(lit, before / xp.where(lit, after, 1), 1).clip(1 / MOST, MOST)
-        factor = cast(factor, image.dtype)
-        return (xp.stack([factor * image[first:last, :, channel] for channel in range(image.shape[-1])]),)
+        factor = np.where(lit, before / np.where(lit, after, 1), 1).clip(1 / MOST, MOST)
+        factor = factor.astype(image.dtype, copy=False)
+        return (np.stack([factor * image[first:last, :, channel] for channel in range(image.shape[-1])]),)
 
     out = empty(image[..., 0], image.shape[-1], channels_last=True, dtype=image.dtype)
     return as_image(by_rows(rows, out)[0])

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from ngpt.classical.arrays import Array, by_rows
+from ngpt.classical.arrays import by_rows
 
 
 def forward_differences(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -28,7 +28,7 @@ def adjoint_differences(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
     return np.moveaxis(adjoint(x, y), (-2, -1), (0, 1))
 
 
-def differences(planes: Array, first: int, last: int) -> tuple[Array, Array]:
+def differences(planes: np.ndarray, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
     """dx and dy of rows first .. last - 1 of (..., H, W) planes."""
     here, below = planes[..., first:last, :], planes[..., first + 1 : last + 1, :]
     dx, dy = -here, -here
@@ -40,7 +40,7 @@ def differences(planes: Array, first: int, last: int) -> tuple[Array, Array]:
     return dx, dy
 
 
-def adjoint(dx: Array, dy: Array) -> Array:
+def adjoint(dx: np.ndarray, dy: np.ndarray) -> np.ndarray:
     """The adjoint of ``differences``, (..., rows, W); the unused column of dx and row of dy must be 0."""
     total = -dx
     total -= dy
@@ -49,7 +49,7 @@ def adjoint(dx: Array, dy: Array) -> Array:
     return total
 
 
-def adjoint_by_rows(function: Callable[[int, int], tuple], *out: Array) -> tuple:
+def adjoint_by_rows(function: Callable[[int, int], tuple], *out: np.ndarray) -> tuple:
     """As ``by_rows``, but the function's first three values are v, dx, dy, of which v + adjoint(dx, dy) is made.
 
     v may be None for 0.

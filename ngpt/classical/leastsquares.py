@@ -8,21 +8,8 @@ import math
 
 import numpy as np
 
-from ngpt.classical.arrays import (
-    Array,
-    by_rows,
-    cast,
-    dct2,
-    detach,
-    empty,
-    idct2,
-    image,
-    like,
-    map_rows,
-    module,
-    planes,
-)
-from ngpt.classical.gradients import adjoint, adjoint_by_rows, differences
+from ngpt.classical.arrays import by_rows, dct2, empty, idct2, image, map_rows, planes
+from ngpt.classical.gradients import adjoint_by_rows, differences
 from ngpt.errors import NgptError
 
 # Ratio of the largest value to a typical one beyond which float32 transforms would spread their rounding of the one
@@ -36,22 +23,23 @@ CLIP = 100
 class Equations:
     """The right-hand sides as planes (C, H, W), in double precision where their range asks for it.
 
-    ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, NumPy or torch, finite
+    ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite
     ``trusted``  for dx and dy, (H, W) booleans: a difference marked False has no equation; None trusts all
     """
 
-    def __init__(self, primal: Array, dx: Array, dy: Array, trusted: tuple[Array, Array] | None = None):
+    def __init__(
+        self, primal: np.ndarray, dx: np.ndarray, dy: np.ndarray, trusted: tuple[np.ndarray, np.ndarray] | None = None
+    ):
         if primal.ndim != 3 or not primal.shape == dx.shape == dy.shape:
             shapes = ", ".join(str(tuple(a.shape)) for a in (primal, dx, dy))
             raise NgptError(f"primal, dx and dy have shapes {shapes}; they must all be of one shape (H, W, C)")
         self.dtype = primal.dtype
-        self.xp = module(primal)
         self.trusted = trusted
         self.primal, self.dx, self.dy = map(planes, (primal, dx, dy))
-        sample = abs(detach(primal[::4, ::4]))
+        sample = abs(primal[::4, ::4])
         self.typical = float((sample**0.5).sum() / max(int((sample > 0).sum()), 1)) ** 2
 
-    def residual(self, first: int, last: int) -> tuple[Array, Array]:
+    def residual(self, first: int, last: int) -> tuple[np.ndarray, np.ndarray]:
         """r = G - ∇P of rows first .. last - 1, (C, rows, W) for dx and dy, 0 where there is no equation."""
         x, y = differences(self.primal, first, last)
         x, y = self.dx[:, first:last] - x, self.dy[:, first:last] - y
@@ -59,10 +47,10 @@ class Equations:
         if last == self.primal.shape[1]:
             y[..., -1, :] = 0
         if self.trusted is not None:
-            x, y = (self.xp.where(t[first:last], v, 0) for t, v in zip(self.trusted, (x, y), strict=True))
+            x, y = (np.where(t[first:last], v, 0) for t, v in zip(self.trusted, (x, y), strict=True))
         return x, y
 
-    def divergence(self) -> Array:
+    def divergence(self) -> np.ndarray:
         """∇ᵀ r as (C, H, W), the right-hand side of least squares with equal weights."""
 
         def rows(first, last):
@@ -72,12 +60,12 @@ class Equations:
         b, peaks = adjoint_by_rows(rows, empty(self.primal, len(self.primal), channels_last=True))
         return b if self._holds(peaks) else self.divergence()
 
-    def scaled_residual(self) -> tuple[Array, float]:
+    def scaled_residual(self) -> tuple[np.ndarray, float]:
         """(r / scale, scale), r as (2, C, H, W); scale is a power of two (exact) of about the mean of |r|, or 0."""
 
         def rows(first, last):
-            r = self.xp.stack(self.residual(first, last))
-            return r, _peak(r), sum_of(abs(detach(r)))
+            r = np.stack(self.residual(first, last))
+            return r, _peak(r), sum_of(abs(r))
 
         r, bands = by_rows(rows, empty(self.primal, 2, len(self.primal)))
         if not self._holds([peak for peak, _ in bands]):
@@ -93,12 +81,12 @@ class Equations:
         peak = float(np.max(peaks))
         if not math.isfinite(peak):
             raise NgptError("primal, dx or dy holds values that are not finite; ngpt.reconstruct() repairs them first")
-        if peak <= FLOAT32_RANGE * self.typical or self.primal.dtype == self.xp.float64:
+        if peak <= FLOAT32_RANGE * self.typical or self.primal.dtype == np.float64:
             return True
-        self.primal, self.dx, self.dy = (cast(a, self.xp.float64) for a in (self.primal, self.dx, self.dy))
+        self.primal, self.dx, self.dy = (a.astype(np.float64, copy=False) for a in (self.primal, self.dx, self.dy))
         return False
 
-    def image(self, u: Array, scale: float = 1.0, out: Array | None = None) -> Array:
+    def image(self, u: np.ndarray, scale: float = 1.0, out: np.ndarray | None = None) -> np.ndarray:
         """P + scale · u as (H, W, C) in the precision of the input; ``out`` (C, H, W) is memory that may be reused."""
         out = empty(u, len(u), channels_last=True) if out is None else out
 
@@ -106,25 +94,25 @@ class Equations:
             part = u[:, first:last] if scale == 1 else scale * u[:, first:last]
             return (self.primal[:, first:last] + part,)
 
-        return cast(image(by_rows(rows, out)[0]), self.dtype)
+        return image(by_rows(rows, out)[0]).astype(self.dtype, copy=False)
 
 
-def _peak(*arrays: Array) -> float:
+def _peak(*arrays: np.ndarray) -> float:
     """The largest absolute value, which is not finite if one is not; 0 without any."""
-    extremes = [abs(float(v)) for a in map(detach, arrays) if math.prod(a.shape) for v in (a.min(), a.max())]
+    extremes = [abs(float(v)) for a in arrays if math.prod(a.shape) for v in (a.min(), a.max())]
     return float(np.max(extremes, initial=0))
 
 
-def solve(b: Array, screen: float, mean: Array | float | None = None) -> Array:
+def solve(b: np.ndarray, screen: float, mean: np.ndarray | float | None = None) -> np.ndarray:
     """The planes u (C, H, W) with (screen + ∇ᵀ∇) u = b; b is overwritten.
 
     The cosine transform of type II diagonalises ∇ᵀ∇ under Neumann boundaries [Bhat et al. 2008]. ``mean`` (C) is that
     of u where the caller knows it: differences have none, and what rounding leaves of it is divided by ``screen``.
     """
     height, width = b.shape[-2:]
-    λy, λx = (like(4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2, b) for n in (height, width))
+    λy, λx = ((4 * np.sin(np.pi / 2 * np.arange(n) / n) ** 2).astype(b.dtype) for n in (height, width))
     # With all channels and in their layout: NumPy is slow where the axes of arrays lie in different order in memory.
-    screened = module(b).zeros_like(b[:, :1]) + screen
+    screened = np.zeros_like(b[:, :1]) + screen
     screened += λx
     coefficients = dct2(b)
     coefficients, _ = by_rows(lambda i, j: (coefficients[:, i:j] / (λy[i:j, None] + screened),), coefficients)
@@ -134,30 +122,18 @@ def solve(b: Array, screen: float, mean: Array | float | None = None) -> Array:
 
 
 def solve_weighted(
-    r: Array, screen: Array | float, weights: Array, tolerance: float, max_iterations: int = 200
-) -> tuple[Array, int]:
+    r: np.ndarray, screen: np.ndarray | float, weights: np.ndarray, tolerance: float, max_iterations: int = 200
+) -> tuple[np.ndarray, int]:
     """The u (C, H, W) that minimises Σ screen |u|² + Σ weights |∇u - r|², and the number of iterations it took.
 
     ``r`` (2, C, H, W), 0 in the unused column and row; ``weights`` (2, 1, H, W) >= 0; ``screen`` > 0, (1, H, W), or a
     number for one that is the same everywhere.
 
     Conjugate gradients until the residual in the norm of the preconditioner is ``tolerance`` of the first.
-
-    On tensors that require it the result is differentiable in all arguments: a residual that is zero but for its
-    derivative is added, and that is sent through the same solver on the way back, for the system is symmetric.
     """
-    constants = detach(r), detach(screen), detach(weights)
-    system = Weighted(*constants[1:])
-    flux = constants[2] * constants[0]
+    flux = weights * r
     b, _ = adjoint_by_rows(lambda i, j: (None, *flux[..., i:j, :]), empty(r, len(r[0])))
-    u, iterations = system.solve(b, tolerance, max_iterations)
-    if any(getattr(a, "requires_grad", False) for a in (r, screen, weights)):
-        flux = weights * (r - module(r).stack(differences(u, 0, u.shape[1])))
-        zero = adjoint(*flux) - screen * u
-        if zero.requires_grad:
-            zero.register_hook(lambda g: system.solve(g, tolerance, max_iterations)[0])
-            u = u + (zero - zero.detach())
-    return u, iterations
+    return Weighted(screen, weights).solve(b, tolerance, max_iterations)
 
 
 class Weighted:
@@ -168,22 +144,22 @@ class Weighted:
     the mean of the solution is 0, as that of the right-hand side.
     """
 
-    def __init__(self, screen: Array | float, weights: Array):
+    def __init__(self, screen: np.ndarray | float, weights: np.ndarray):
         self.weights = weights
         self.mean: float | None = None
         if isinstance(screen, float):
-            self.screen = module(weights).full_like(weights[0], screen)
-            self.scaling = module(weights).ones_like(weights[0])
+            self.screen = np.full_like(weights[0], screen)
+            self.scaling = np.ones_like(weights[0])
             self.σ = screen
             self.mean = 0.0
             return
         self.screen = screen
-        mean = _around(weights) / _around(unused_zeroed(module(weights).ones_like(weights))).clip(1, None)
+        mean = _around(weights) / _around(unused_zeroed(np.ones_like(weights))).clip(1, None)
         self.scaling = (mean + screen) ** -0.5
         self.σ = float((screen * self.scaling**2).mean())
 
-    def solve(self, b: Array, tolerance: float, max_iterations: int) -> tuple[Array, int]:
-        zeros = module(b).zeros_like
+    def solve(self, b: np.ndarray, tolerance: float, max_iterations: int) -> tuple[np.ndarray, int]:
+        zeros = np.zeros_like
         u, p, residual, q, z = zeros(b), zeros(b), b, empty(b, len(b)), empty(b, len(b))
         z, gain = self._precondition(residual, z)
         goal, previous = tolerance**2 * gain, math.inf
@@ -197,7 +173,7 @@ class Weighted:
             z, gain = self._precondition(residual, z)
         return u, max_iterations
 
-    def _precondition(self, residual: Array, out: Array) -> tuple[Array, float]:
+    def _precondition(self, residual: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, float]:
         """z = D^-1/2 (σ + ∇ᵀ∇)⁻¹ D^-1/2 residual, and the product of the two."""
         out, _ = by_rows(lambda i, j: (self.scaling[:, i:j] * residual[:, i:j],), out)
         out = solve(out, self.σ, self.mean)
@@ -209,7 +185,7 @@ class Weighted:
         z, products = by_rows(finish, out)
         return z, total_of(products)
 
-    def _apply(self, p: Array, out: Array) -> tuple[Array, list]:
+    def _apply(self, p: np.ndarray, out: np.ndarray) -> tuple[np.ndarray, list]:
         """(screen + ∇ᵀ weights ∇) p, and its product with p in parts."""
 
         def rows(i, j):
@@ -221,19 +197,19 @@ class Weighted:
         return result, energies
 
 
-def _plus(a: Array, factor: float, b: Array, out: Array) -> Array:
+def _plus(a: np.ndarray, factor: float, b: np.ndarray, out: np.ndarray) -> np.ndarray:
     """a + factor b"""
     return by_rows(lambda i, j: (a[:, i:j] + factor * b[:, i:j],), out)[0]
 
 
-def unused_zeroed(differences: Array) -> Array:
+def unused_zeroed(differences: np.ndarray) -> np.ndarray:
     """(2, C, H, W) values of differences with the unused column of dx and row of dy set to 0, in place."""
     differences[0, ..., -1] = 0
     differences[1, ..., -1, :] = 0
     return differences
 
 
-def _around(weights: Array) -> Array:
+def _around(weights: np.ndarray) -> np.ndarray:
     """Sum of the weights of a pixel's differences, (1, H, W)."""
     total = weights[0, ..., :] + weights[1]
     total[..., 1:] += weights[0, ..., :-1]
@@ -241,9 +217,9 @@ def _around(weights: Array) -> Array:
     return total
 
 
-def sum_of(values: Array) -> float:
+def sum_of(values: np.ndarray) -> float:
     """The sum, accumulated in double precision."""
-    return float(values.sum(dtype=module(values).float64))
+    return float(values.sum(dtype=np.float64))
 
 
 def total_of(bands: list) -> float:
@@ -251,7 +227,7 @@ def total_of(bands: list) -> float:
     return float(sum(value for (value,) in bands))
 
 
-def robust_mean(*layers: Array) -> float:
+def robust_mean(*layers: np.ndarray) -> float:
     """The mean of values >= 0, in arrays of any shape, when none counts as more than ``CLIP`` times this mean.
 
     Of ordinary data it is nearly the mean; a few pixels of 1e12 do not move it.
@@ -266,5 +242,5 @@ def robust_mean(*layers: Array) -> float:
         mean = clipped
 
 
-def _clipped_sum(values: Array, most: float) -> float:
+def _clipped_sum(values: np.ndarray, most: float) -> float:
     return sum(map_rows(lambda first, last: sum_of(values[first:last].clip(None, most)), values))

@@ -10,7 +10,6 @@ crosses the border. α multiplies the residual, as in the reference implementati
 Both solve for the correction u = I - P, whose right-hand side ∇ᵀ(G - ∇P) has mean zero: exact gradients return the
 primal as it is for every α, and the mean of the image is kept exactly by l2 even where α² vanishes beside rounding.
 
-Arrays are NumPy's or torch's (CPU or CUDA); on tensors l2 is differentiable in all its inputs, l1 by unrolling.
 Memory in bytes per pixel of three float32 channels, beyond the 36 of the input and with the 12 of the output: l2 16
 (and 10 MB for bands of rows), l1 165; ``tests/classical/test_classical.py`` holds them to it.
 Twice as much where the range of the input asks for double precision (``ngpt.classical.leastsquares.FLOAT32_RANGE``).
@@ -21,7 +20,7 @@ the 2D Screened Poisson Equation for Gradient Domain Problems"]
 
 import numpy as np
 
-from ngpt.classical.arrays import Array, by_rows, cast, detach, empty, module
+from ngpt.classical.arrays import by_rows, empty
 from ngpt.classical.gradients import adjoint_by_rows, differences
 from ngpt.classical.leastsquares import Equations, robust_mean, solve, solve_weighted, sum_of
 from ngpt.errors import NgptError
@@ -40,8 +39,12 @@ WINDOW = 5
 
 
 def l2(
-    primal: Array, dx: Array, dy: Array, alpha: float = DEFAULT_ALPHA, trusted: tuple[Array, Array] | None = None
-) -> Array:
+    primal: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    alpha: float = DEFAULT_ALPHA,
+    trusted: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """The exact minimiser of the squared energy, (H, W, C) in the units of ``primal``.
 
     ``primal``, ``dx``, ``dy``  (H, W, C) float32 or float64, finite; last column of dx and row of dy are ignored
@@ -57,20 +60,20 @@ def l2(
         u = solve(equations.divergence(), float(alpha) ** 2, mean=0.0)
         return equations.image(u, out=u)
     r, scale = equations.scaled_residual()
-    weights = cast(equations.xp.stack(trusted), r.dtype)[:, None]
+    weights = np.stack(trusted).astype(r.dtype)[:, None]
     u, _ = solve_weighted(r, float(alpha) ** 2, weights, tolerance=1e-8)
     return equations.image(u, scale)
 
 
 def l1(
-    primal: Array,
-    dx: Array,
-    dy: Array,
+    primal: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
     alpha: float = DEFAULT_ALPHA,
-    trusted: tuple[Array, Array] | None = None,
+    trusted: tuple[np.ndarray, np.ndarray] | None = None,
     tolerance: float = 7e-4,
     max_iterations: int = 300,
-) -> Array:
+) -> np.ndarray:
     """The minimiser of the sum of norms, (H, W, C); arguments as of ``l2``.
 
     Stops when five iterations lower the energy by less than ``tolerance`` of it, which leaves it within 0.5 % of the
@@ -85,7 +88,9 @@ def l1(
     return equations.image(u, scale)
 
 
-def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iterations: int) -> tuple[Array, list[float]]:
+def least_norms(
+    r: np.ndarray, alpha: float, trusted, tolerance: float, max_iterations: int
+) -> tuple[np.ndarray, list[float]]:
     """The correction u (C, H, W) that minimises Σ ‖K u - (0, r)‖, K = (α, ∂x, ∂y), and the energies on the way.
 
     (These begin once the strides are short; a norm beyond a thousand times the mean of the first counts as a thousand.)
@@ -96,18 +101,18 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
     e = K u - r, whose inner problem KᵀK u = Kᵀ(...) is again the one the transforms solve. In the form of Douglas and
     Rachford, s = e + scaled dual variable is all the state: shrink(s) = factor · s is the residual to aim at.
     """
-    xp, channels = module(r), len(r[0])
+    channels = len(r[0])
     # 1 for every equation that counts; the unused column and row have residual 0 and count for nothing.
-    counts = xp.ones_like(r[:1, :1]) if trusted is None else _counts(r, trusted)
+    counts = np.ones_like(r[:1, :1]) if trusted is None else _counts(r, trusted)
 
     def residual(u, first, last):
-        e = xp.stack([alpha * u[:, first:last], *differences(u, first, last)])
+        e = np.stack([alpha * u[:, first:last], *differences(u, first, last)])
         e[1:] -= r[..., first:last, :]
         return e
 
     def norm(e):
         # The tiny number keeps the derivative of the square root finite.
-        return xp.sqrt((e * e).sum(1, keepdims=True) + 1e-30)
+        return np.sqrt((e * e).sum(1, keepdims=True) + 1e-30)
 
     def start(first, last):
         e = residual(u, first, last)
@@ -115,7 +120,7 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
 
     def iterate(first, last):
         e, previous = residual(u, first, last), s[:, :, first:last]
-        energy = sum_of(norm(detach(e)).clip(None, limit) * counts[:, :, first:last]) if settled else 0.0
+        energy = sum_of(norm(e).clip(None, limit) * counts[:, :, first:last]) if settled else 0.0
         # shrunk + fall (previous - shrunk) + RELAXATION (e - shrunk), where shrunk = factor previous. The dual
         # variable, previous - shrunk, is scaled by the threshold and falls with it.
         new = (fall + (1 - fall - RELAXATION) * factor[:, :, first:last]) * previous
@@ -123,7 +128,7 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
         # The proximal operator of the norm shortens each colour by the threshold; what does not count stays.
         shorter = (1 - threshold * counts[:, :, first:last] / norm(new)).clip(0, None)
         v = (2 * shorter - 1) * new
-        total = v[0].sum((1, 2), dtype=xp.float64)
+        total = v[0].sum((1, 2), dtype=np.float64)
         v[1:] += r[..., first:last, :]
         return alpha * v[0], v[1], v[2], new, shorter, energy, total
 
@@ -132,10 +137,10 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
     s, norms, _ = by_rows(start, empty(r, 3, channels), empty(r, 3, 1))
     # In units of the mean residual, the iteration follows the exposure of the image. Outliers must neither set this
     # unit nor, by an energy beside which the rest of the image is nothing, decide when to stop.
-    mean = robust_mean(detach(norms))
-    limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(detach(norms).max()) / 10)
+    mean = robust_mean(norms)
+    limit, stride = 1000 * mean, max(FIRST_STRIDE * mean, float(norms.max()) / 10)
     threshold = mean + stride
-    factor = xp.ones_like(norms)
+    factor = np.ones_like(norms)
     energies: list[float] = []
     best = u
     for _ in range(max_iterations if mean > 0 else 0):
@@ -154,9 +159,9 @@ def least_norms(r: Array, alpha: float, trusted, tolerance: float, max_iteration
     return best, energies
 
 
-def _counts(r: Array, trusted) -> Array:
+def _counts(r: np.ndarray, trusted) -> np.ndarray:
     """(3, 1, H, W): 1 for the equations that count, 0 for the others; those of the primal all do."""
-    return cast(module(r).stack([module(r).ones_like(trusted[0]), *trusted]), r.dtype)[:, None]
+    return np.stack([np.ones_like(trusted[0]), *trusted]).astype(r.dtype)[:, None]
 
 
 def check_alpha(alpha: float) -> None:

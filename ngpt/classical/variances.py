@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from ngpt.classical.arrays import Array, by_rows, cast, detach, empty, module, to_numpy
+from ngpt.classical.arrays import by_rows, empty
 from ngpt.classical.leastsquares import robust_mean, sum_of
 
 # What is added to every variance, as a share of the mean over primal and differences.
@@ -47,7 +47,7 @@ FEW = 1e-9
 OUTLIERS = 1e-4
 
 
-def auto_alpha(primal_var: Array, dx_var: Array, dy_var: Array, norm: int = 2) -> float:
+def auto_alpha(primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, norm: int = 2) -> float:
     """The α that weights the primal against the gradients as their noise does; variances are (H, W, C).
 
     ``norm`` 2: the square root of mean gradient variance over mean primal variance, which weights the two terms of l2
@@ -59,7 +59,7 @@ def auto_alpha(primal_var: Array, dx_var: Array, dy_var: Array, norm: int = 2) -
     worst 1.08 times). l1 is within 2 % on average at either.
     """
 
-    def mean(*layers: Array) -> float:
+    def mean(*layers: np.ndarray) -> float:
         values = np.concatenate([_positive_values(layer) for layer in layers]) ** (norm / 2)
         if not values.size:
             return 0.0
@@ -74,8 +74,8 @@ def auto_alpha(primal_var: Array, dx_var: Array, dy_var: Array, norm: int = 2) -
 
 
 def smooth_variances(
-    primal_var: Array, dx_var: Array, dy_var: Array, trusted: tuple[Array, Array] | None = None
-) -> tuple[Array, Array]:
+    primal_var: np.ndarray, dx_var: np.ndarray, dy_var: np.ndarray, trusted: tuple[np.ndarray, np.ndarray] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """Variances of the primal (1, H, W) and of the differences (2, 1, H, W), summed over colours, relative, positive.
 
     Those of the primal are averaged twice over 3 x 3 pixels, over the values that are there: those that are not finite
@@ -84,58 +84,55 @@ def smooth_variances(
     ``FLOOR`` is added; without any noise it is 1 everywhere. Then those of differences count ``SHARED`` of the
     primal's. Differences that are not ``trusted``, and those that do not exist, have infinite variance.
     """
-    xp = module(primal_var)
     layers = [smoothed(primal_var), *(smoothed(layer, True) for layer in (dx_var[:, :-1], dy_var[:-1]))]
     mean = robust_mean(*layers)
     p, x, y = (_relative(layer, mean, primal_var.dtype) for layer in layers)
-    differences = xp.stack([p, p])
+    differences = np.stack([p, p])
     differences[0, :, :-1], differences[1, :-1] = x, y
     return (p / SHARED)[None], without_missing(differences, trusted)
 
 
-def _relative(layer: Array, mean: float, dtype: Any) -> Array:
+def _relative(layer: np.ndarray, mean: float, dtype: Any) -> np.ndarray:
     """Variances over their mean, with ``FLOOR``."""
 
     def rows(first: int, last: int) -> tuple:
         part = layer[first:last]
-        return (cast(part / mean + FLOOR if mean > 0 else module(part).ones_like(part), dtype),)
+        return ((part / mean + FLOOR if mean > 0 else np.ones_like(part)).astype(dtype, copy=False),)
 
     return by_rows(rows, empty(layer, dtype=dtype))[0]
 
 
-def without_missing(variances: Array, trusted: tuple[Array, Array] | None) -> Array:
+def without_missing(variances: np.ndarray, trusted: tuple[np.ndarray, np.ndarray] | None) -> np.ndarray:
     """Variances (2, H, W) of differences as (2, 1, H, W), infinite where there is none or it is not ``trusted``."""
-    xp = module(variances)
     variances[0, :, -1] = math.inf
     variances[1, -1] = math.inf
     if trusted is not None:
-        variances = xp.where(xp.stack(trusted), variances, math.inf)
+        variances = np.where(np.stack(trusted), variances, math.inf)
     return variances[:, None]
 
 
-def _positive_values(variance: Array) -> np.ndarray:
+def _positive_values(variance: np.ndarray) -> np.ndarray:
     """The sums over colours that are usable, as a list."""
-    total, good = _over_colours(detach(variance))
-    return to_numpy(total[good])
+    total, good = _over_colours(variance)
+    return total[good]
 
 
-def _over_colours(variance: Array) -> tuple[Array, Array]:
+def _over_colours(variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(H, W, C) -> sum over C in double precision (squares of large radiances add up), and where it is usable."""
-    xp = module(variance)
     channels = [variance[..., i] for i in range(variance.shape[-1])]
-    total, good = cast(channels[0], xp.float64), channels[0] >= 0
+    total, good = channels[0].astype(np.float64, copy=False), channels[0] >= 0
     for channel in channels[1:]:
         total, good = total + channel, good & (channel >= 0)
-    good = good & xp.isfinite(total)
-    return xp.where(good, total, 0), good
+    good = good & np.isfinite(total)
+    return np.where(good, total, 0), good
 
 
-def smoothed(variance: Array, outliers: bool = False) -> Array:
+def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
     """(H, W, C) -> (H, W): twice the mean over 3 x 3 sums that are good, and the mean of all where there are none.
 
     With ``outliers``, means of fourth roots, and a sum that is larger than what comes of them stays as it is.
     """
-    xp, height = module(variance), len(variance)
+    height = len(variance)
 
     def rows(first: int, last: int) -> tuple:
         top, bottom = max(first - 2, 0), min(last + 2, height)
@@ -143,29 +140,29 @@ def smoothed(variance: Array, outliers: bool = False) -> Array:
         own = slice(first - top, last - top)
         raw, sums = total, (sum_of(total[own]), int(good[own].sum()))
         if outliers:
-            total = xp.sqrt(xp.sqrt(total.clip(_NONE, None)))
+            total = np.sqrt(np.sqrt(total.clip(_NONE, None)))
             # Roots of single precision are within it.
-            total = cast(total if good.all() else xp.where(good, total, 0), variance.dtype)
+            total = (total if good.all() else np.where(good, total, 0)).astype(variance.dtype, copy=False)
         total = _box(_box(total))
         if good.all():
             # The counts of rows times those of columns.
-            ones = xp.ones_like(total)
+            ones = np.ones_like(total)
             count = _box(_box(ones[:, :1])) * _box(_box(ones[:1]))
         else:
-            count = _box(_box(cast(good, variance.dtype)))
+            count = _box(_box(good.astype(variance.dtype, copy=False)))
         smooth = total / count.clip(FEW, None)
         if outliers:
-            smooth = xp.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
+            smooth = np.maximum(TYPICAL * (smooth * smooth) ** 2, raw)
         # No variance is negative: what is missing.
-        return xp.where(count > 0, smooth, -1)[own], *sums
+        return np.where(count > 0, smooth, -1)[own], *sums
 
-    smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=xp.float64))
+    smooth, bands = by_rows(rows, empty(variance[..., 0], dtype=np.float64))
     mean = sum(total for total, _ in bands) / max(sum(count for _, count in bands), 1)
     missing = smooth < 0
-    return xp.where(missing, mean, smooth) if missing.any() else smooth
+    return np.where(missing, mean, smooth) if missing.any() else smooth
 
 
-def _box(values: Array) -> Array:
+def _box(values: np.ndarray) -> np.ndarray:
     """Sums over 3 x 3 values, (H, W)."""
     rows = values + 0
     rows[1:] += values[:-1]

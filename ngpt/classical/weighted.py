@@ -10,7 +10,8 @@ iterations, 46 at the median, on thirty stacks of ten scenes. Memory in bytes pe
 beyond the 72 of the input: 165 with the output.
 """
 
-from ngpt.classical.arrays import Array, cast
+import numpy as np
+
 from ngpt.classical.leastsquares import Equations, solve_weighted
 from ngpt.classical.variances import smooth_variances
 
@@ -19,14 +20,14 @@ TOLERANCE = 1e-4
 
 
 def wl2(
-    primal: Array,
-    dx: Array,
-    dy: Array,
-    primal_var: Array,
-    dx_var: Array,
-    dy_var: Array,
-    trusted: tuple[Array, Array] | None = None,
-) -> Array:
+    primal: np.ndarray,
+    dx: np.ndarray,
+    dy: np.ndarray,
+    primal_var: np.ndarray,
+    dx_var: np.ndarray,
+    dy_var: np.ndarray,
+    trusted: tuple[np.ndarray, np.ndarray] | None = None,
+) -> np.ndarray:
     """The variance-weighted least-squares image, (H, W, C) in the units of ``primal``.
 
     ``*_var`` (H, W, C) are variances of the pixel means; missing values may be NaN. Other arguments as of
@@ -35,6 +36,6 @@ def wl2(
     equations = Equations(primal, dx, dy, trusted)
     r, scale = equations.scaled_residual()
     variances = smooth_variances(primal_var, dx_var, dy_var, trusted)
-    screen, weights = (1 / cast(variance, r.dtype) for variance in variances)
+    screen, weights = (1 / variance.astype(r.dtype, copy=False) for variance in variances)
     u, _ = solve_weighted(r, screen, weights, TOLERANCE)
     return equations.image(u, scale)
