@@ -315,8 +315,3 @@ def _known(stack: GradientStack, estimates: tuple[str, ...]) -> GradientStack:
     unknown = [name for name in estimates if name in stack and not np.isfinite(stack[name]).any()]
     layers = {name: stack[name] for name in stack.names if name not in unknown}
     return replace(stack, layers=layers) if unknown else stack
-
-
-def denoise(stack: GradientStack, method: str = "auto", **options) -> np.ndarray:
-    """The reconstruction of a stack, (H, W, 3) float32, scene-linear: ``reconstruct(stack, method).image``."""
-    return reconstruct(stack, method, **options).image

@@ -17,7 +17,7 @@ from data_gen.dataset.config import Config, Job
 from data_gen.dataset.kept import Again, Kept
 from ngpt.errors import NgptError, stop_if_interrupted
 from ngpt.merging import merge
-from ngpt.methods import denoise
+from ngpt.methods import reconstruct
 from ngpt.repair import repair
 from ngpt.stack import GradientStack
 from ngpt.training.shards import CropData, write_shard
@@ -253,11 +253,12 @@ def _crop(
 
 def references(converged: GradientStack, method: str) -> tuple[np.ndarray, np.ndarray | None]:
     """The clean image without the light of the layer ``caustic``, and that light; None where there is no such layer."""
-    image = denoise(converged, method=method)
+    image = reconstruct(converged, method=method).image
     if "caustic" not in converged:
         return image, None
     none = np.zeros_like(image)
-    rest = denoise(converged.replace(primal=converged["primal"] - converged["caustic"], caustic=none), method=method)
+    without = converged.replace(primal=converged["primal"] - converged["caustic"], caustic=none)
+    rest = reconstruct(without, method=method).image
     return rest, image - rest
 
 

@@ -9,6 +9,7 @@ from ngpt.errors import NgptError, WrongUse
 from ngpt.system import configs
 from ngpt.system.console import Console
 from ngpt.system.files import atomic_output, exclusive, make_folder
+from ngpt.training.run_summary import SETTINGS, WEIGHTS
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -73,7 +74,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
             else:
                 say(f"continuing {out} at step {trainer.step} of {settings.run.steps}")
         if processes.rank == 0:
-            with atomic_output(out / "settings.json", overwrite=True) as temporary:
+            with atomic_output(out / SETTINGS, overwrite=True) as temporary:
                 temporary.write_text(json.dumps(settings.to_dict(), indent=2) + "\n")
             write_record(out, settings, config, trainer.model, trainer.device)
         # Of several processes one is enough to listen to.
@@ -81,7 +82,7 @@ def run(args: argparse.Namespace, console: Console) -> int:
         with listener.progress("train", "steps", rate=True) as progress:
             finished = trainer.run(progress)
     processes.close()
-    say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / 'weights.safetensors'}")
+    say(f"{'finished' if finished else 'stopped'} at step {trainer.step}: {out / WEIGHTS}")
     if processes.rank == 0:
         say(f"{out / PAGE}: open it in a browser")
     return 0 if finished or not trainer.signal else 128 + trainer.signal

@@ -32,6 +32,7 @@ from ngpt.training.distributed import Processes
 from ngpt.training.examples import JITTER, OTHER, Examples, collated
 from ngpt.training.loggers import Logger, Meter, loggers
 from ngpt.training.run_page import write_run
+from ngpt.training.run_summary import CHECKPOINT, LOG, WEIGHTS
 from ngpt.training.schedule import learning_rate, update_average, warmup_of
 from ngpt.training.settings import Settings, changed, from_dict, published
 from ngpt.training.validation import validate, views
@@ -112,7 +113,7 @@ class Trainer:
 
     @property
     def checkpoint(self) -> Path:
-        return self.out / "checkpoint.safetensors"
+        return self.out / CHECKPOINT
 
     def resume(self) -> None:
         """Continues from the checkpoint in ``out``, and says which settings have changed since; raises NgptError if it
@@ -141,7 +142,7 @@ class Trainer:
         for change in changed(before, self.settings):
             self.say(f"changed since the checkpoint: {change}")
         # What was logged after the checkpoint will be logged again.
-        log = _keep_lines(self.out / "log.jsonl", self.step)
+        log = _keep_lines(self.out / LOG, self.step)
         self.best = min((entry["relMSE"] for entry in log if "relMSE" in entry), default=math.inf)
 
     def run(self, progress: Callable[[int, int], None] = lambda done, total: None) -> bool:
@@ -206,7 +207,7 @@ class Trainer:
         files.save(
             self.checkpoint, lambda path, over: weights.write_tensors(path, tensors, header, over), overwrite=True
         )
-        self._save_weights("weights.safetensors")
+        self._save_weights(WEIGHTS)
         write_run(self.out)
 
     def _save_weights(self, name: str) -> None:
@@ -311,7 +312,7 @@ class Trainer:
             return
         # NaN is not JSON; what is not there is left out.
         values = {"step": self.step} | {k: v for k, v in values.items() if not math.isnan(v)}
-        path = self.out / "log.jsonl"
+        path = self.out / LOG
         try:
             with open(path, "a", encoding="utf-8") as file:
                 file.write(json.dumps(values) + "\n")

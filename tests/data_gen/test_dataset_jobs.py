@@ -17,7 +17,7 @@ import pytest
 from full_stack import full_stack
 
 from ngpt.errors import NgptError
-from ngpt.methods import denoise
+from ngpt.methods import reconstruct
 from ngpt.stack import GradientStack
 from ngpt.training.dataset import Dataset, problems, read_manifest
 
@@ -309,7 +309,7 @@ def test_crops_keep_light_that_gradients_lack_apart():
         assert np.allclose(stack[name][same], given[name][same], rtol=1e-5)
     rest, light = crops.references(stack, "wcv")
     assert light.sum(dtype=np.float64) == pytest.approx(stack["caustic"].sum(dtype=np.float64), rel=1e-3)
-    assert np.allclose(rest + light, denoise(stack, "wcv"), rtol=1e-5, atol=1e-5)
+    assert np.allclose(rest + light, reconstruct(stack, "wcv").image, rtol=1e-5, atol=1e-5)
     plain = full_stack(20, 24)
     assert crops.references(plain, "wcv")[1] is None
 
