@@ -11,7 +11,8 @@ from torch import Tensor
 
 from ngpt.errors import NgptError
 from ngpt.network import features, inputs, padding, tiles
-from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.config import ModelConfig
+from ngpt.network.model import Reconstructor
 from ngpt.network.transfer import signed_exp
 from ngpt.network.weights import load_weights
 from ngpt.repair import Repaired

@@ -12,7 +12,8 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ngpt.errors import NgptError
-from ngpt.network.model import ModelConfig, Reconstructor
+from ngpt.network.config import ModelConfig
+from ngpt.network.model import Reconstructor
 from ngpt.system.files import atomic_output
 from ngpt.system.records import parse_json
 

@@ -11,7 +11,7 @@ from torch.utils.data import Dataset as TorchDataset
 
 from ngpt.errors import NgptError
 from ngpt.network import features, padding
-from ngpt.network.model import ModelConfig
+from ngpt.network.config import ModelConfig
 from ngpt.network.run_torch import layers_of
 from ngpt.repair import Repaired, repair
 from ngpt.stack import GradientStack

@@ -9,7 +9,8 @@ from dataclasses import MISSING, Field, fields
 from inspect import cleandoc
 from typing import get_type_hints
 
-from ngpt.network.model import ModelConfig, Reconstructor, parameters
+from ngpt.network.config import ModelConfig
+from ngpt.network.model import Reconstructor, parameters
 from ngpt.system import configs
 from ngpt.system.records import described
 from ngpt.system.templates import entries, template, toml

@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from ngpt.errors import NgptError, WrongUse
+from ngpt.network.config import ModelConfig
 from ngpt.network.features import PARTS
-from ngpt.network.model import ModelConfig
 from ngpt.system.records import from_table, read_toml
 from ngpt.training.augment import Augmentation
 from ngpt.training.settings_text import difference, flat

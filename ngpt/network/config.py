@@ -1,0 +1,283 @@
+"""The configuration of a network: the table [model] of a TOML file, which is also in the header of its weights.
+
+``ModelConfig`` is the record, with what holds for all. Each kind of network has a class below it, which knows what such
+a network takes and how it is made.
+"""
+
+import math
+from abc import ABC, abstractmethod
+from dataclasses import MISSING, asdict, dataclass, fields
+from typing import Any
+
+from torch import nn
+
+from ngpt.classical.bases import BASES
+from ngpt.errors import NgptError
+from ngpt.network import features, inputs, kpcn, oidnet, padding, poisson
+from ngpt.network.heads import Head, head_of
+from ngpt.network.unet import POOLING, DenseUNet, PlainUNet
+
+# What a file may ask for: far more than networks have, far less than takes down a machine.
+MAX_LEVELS, MAX_CHANNELS, MAX_UNITS = 8, 1024, 32
+# Kernels reach no further than the padding.
+MAX_KERNEL = 2 * padding.MARGIN + 1
+MAX_SWEEPS = 64
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """What a reconstruction is made of.
+
+    ``network``   "dense" or "plain", see ``ngpt.network.unet``, "kpcn", see ``ngpt.network.kpcn``, or "oidn", see
+                  ``ngpt.network.oidnet``
+    ``channels``  for each level, finest first: what each unit adds (dense), the width (plain, and kpcn, of one level),
+                  those of OIDN's small or default network (oidn)
+    ``units``     for each level, units on the way down and again on the way up (dense), or 5x5 convolutions (kpcn);
+                  none for plain and oidn
+    ``inputs``    the layers it reads, in order; names of ``ngpt.network.features.CHANNELS``
+    ``base``      the classical method whose result is its layer "base"; "" for none
+    ``start``     the images among its inputs that it starts from: it predicts a weight for each of them in each pixel,
+                  and corrects their mean in the logarithm. By default the base; without any it predicts the image
+                  itself, as NGPT does
+    ``quiet``     the relative standard error of the primal, over 15x15 pixels, below which the result goes over to the
+                  base, in proportion and in the logarithm: as noise vanishes it converges with the base, whatever the
+                  network says. Where the variance is 0, or not known, it does not. 0: nowhere
+    ``kernel``    the side, in pixels, of the kernels by which it averages those images instead, see
+                  ``ngpt.network.heads``; odd. 0: it weighs and corrects them pixel by pixel. Of
+                  kpcn those of both parts of the light
+    ``scales``    at how many resolutions there are kernels, each half as fine as the last; from 2 on of the
+                  weighted mean of these images
+    ``demodulate``  whether these average the image over the albedo, and multiply by it again; needs the input albedo,
+                  and ``scales``
+    ``sweeps``    at each of several resolutions, steps that draw the image toward the gradients, by weights that the
+                  network predicts, see ``ngpt.network.poisson``; needs the inputs dx_noise and dy_noise. 0: none
+    ``pooling``   how the network halves and doubles sizes: "convolution", as NGPT does, or by 1x1 convolutions and
+                  "average", "maximum" or "bilinear", see ``ngpt.network.unet``
+    """
+
+    network: str
+    channels: tuple[int, ...]
+    units: tuple[int, ...]
+    inputs: tuple[str, ...]
+    base: str = ""
+    start: tuple[str, ...] = ()
+    quiet: float = 0.0
+    kernel: int = 0
+    scales: int = 1
+    demodulate: bool = False
+    sweeps: int = 0
+    pooling: str = "convolution"
+
+    def __post_init__(self) -> None:
+        if self.network not in KINDS:
+            raise NgptError(f"network '{self.network}': choose one of: {', '.join(KINDS)}")
+        if self.pooling not in POOLING:
+            raise NgptError(f"pooling '{self.pooling}': choose one of: {', '.join(POOLING)}")
+        if self.base and not self.start:
+            object.__setattr__(self, "start", ("base",))
+        for name in ("channels", "units", "inputs", "start"):
+            object.__setattr__(self, name, tuple(getattr(self, name)))
+        for name in self.inputs:
+            if name not in features.CHANNELS:
+                raise NgptError(f"input '{name}' is unknown; inputs are: {', '.join(features.CHANNELS)}")
+        if self.base not in ("", *BASES):
+            raise NgptError(f"base '{self.base}': choose one of: {', '.join(BASES)}")
+        self.kind.check(self)
+        defaults = {field.name: field.default for field in fields(self) if field.default is not MISSING}
+        others = [name for name in self.kind.goes_without if getattr(self, name) != defaults[name]]
+        if others:
+            raise NgptError(f"network '{self.network}' goes without {', '.join(others)}: leave it out")
+
+    @property
+    def kind(self) -> "Kind":
+        """What knows about networks of this kind."""
+        return KINDS[self.network]
+
+    @property
+    def head(self) -> Head:
+        """What makes an image of the network's prediction."""
+        return self.kind.head(self)
+
+    @property
+    def layers(self) -> tuple[str, ...]:
+        """The layers its inputs are, or are computed of: of a stack, or made of one (``ngpt.network.inputs``)."""
+        names = features.sources(self.inputs)
+        # Exposure is that of the primal.
+        return names if "primal" in names else ("primal", *names)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The layers a stack must hold, by the names of the contract."""
+        return inputs.needs(self.layers, self.base)
+
+    @property
+    def reads_gradients(self) -> bool:
+        """Whether it works on the light that gradients are the differences of; see ``ngpt.repair``."""
+        return "dx" in self.needs
+
+    def to_dict(self) -> dict[str, Any]:
+        """The fields as TOML and JSON have them."""
+        return asdict(self)
+
+
+class Kind(ABC):
+    """A kind of network. ``goes_without``: the fields of ``ModelConfig`` that must be left out."""
+
+    goes_without: tuple[str, ...] = ()
+
+    @abstractmethod
+    def check(self, config: ModelConfig) -> None:
+        """Raises NgptError for what such a network cannot be."""
+
+    @abstractmethod
+    def head(self, config: ModelConfig) -> Head:
+        """See ``ModelConfig.head``."""
+
+    @abstractmethod
+    def network(self, config: ModelConfig) -> nn.Module:
+        """The network, untrained."""
+
+
+class Plain(Kind):
+    """``ngpt.network.unet.PlainUNet``, and all heads."""
+
+    has_units = False
+
+    def check(self, config: ModelConfig) -> None:
+        check_layers(config, self.has_units)
+        levels = len(config.channels)
+        if type(config.kernel) is not int or config.kernel not in (0, *range(1, MAX_KERNEL + 1, 2)):
+            raise NgptError(f"kernel = {config.kernel!r}: must be an odd number of pixels up to {MAX_KERNEL}, or 0")
+        if config.kernel and not config.start:
+            raise NgptError(f"kernel = {config.kernel}: there is no image to average; give a base, or start")
+        if type(config.scales) is not int or not 1 <= config.scales <= levels:
+            raise NgptError(f"scales = {config.scales!r}: must be from 1 to the {levels} levels of the network")
+        if config.scales > 1 and config.kernel < 3:
+            raise NgptError(f"scales = {config.scales}: needs kernels of 3 pixels or more")
+        pyramid = config.scales > 1 and "albedo" in config.inputs
+        if type(config.demodulate) is not bool or (config.demodulate and not pyramid):
+            raise NgptError(f"demodulate = {config.demodulate!r}: true or false; needs scales and the input albedo")
+        self._check_sweeps(config)
+        if (
+            not isinstance(config.quiet, int | float)
+            or isinstance(config.quiet, bool)
+            or not 0 <= config.quiet < math.inf
+        ):
+            raise NgptError(f"quiet = {config.quiet!r}: must be a finite relative standard error, 0 for none")
+        if config.quiet and not {"base", "primal_se"} <= set(config.layers):
+            raise NgptError(
+                f"quiet = {config.quiet}: goes over to the base by the noise of the primal; give a base, and inputs "
+                "that are made of it and of primal_se"
+            )
+
+    @staticmethod
+    def _check_sweeps(config: ModelConfig) -> None:
+        sweeps, levels = config.sweeps, len(config.channels)
+        if type(sweeps) is not int or not 0 <= sweeps <= MAX_SWEEPS:
+            raise NgptError(f"sweeps = {sweeps!r}: must be a whole number up to {MAX_SWEEPS}, 0 for none")
+        if sweeps and not {"dx", *poisson.GRADIENTS[2:]} <= {*config.layers, *config.inputs}:
+            raise NgptError(
+                f"sweeps = {sweeps}: draw the image toward the gradients by their noise; needs the inputs "
+                "dx_noise and dy_noise, and dx and dy or inputs that are made of them"
+            )
+        if sweeps and levels < poisson.SCALES:
+            raise NgptError(f"sweeps = {sweeps}: are at {poisson.SCALES} resolutions; the network has {levels} levels")
+
+    def head(self, config: ModelConfig) -> Head:
+        head = head_of(config.start, config.kernel, config.scales, config.demodulate)
+        return poisson.Poisson(config.start, head, config.sweeps) if config.sweeps else head
+
+    def network(self, config: ModelConfig) -> nn.Module:
+        channels = features.channels(config.inputs)
+        return PlainUNet(channels, config.channels, **_last(config), pooling=config.pooling)
+
+
+class Dense(Plain):
+    """``ngpt.network.unet.DenseUNet``."""
+
+    has_units = True
+
+    def network(self, config: ModelConfig) -> nn.Module:
+        channels = features.channels(config.inputs)
+        return DenseUNet(channels, config.channels, config.units, **_last(config), pooling=config.pooling)
+
+
+class Kpcn(Kind):
+    """``ngpt.network.kpcn.KPCN``."""
+
+    goes_without = ("base", "start", "quiet", "scales", "demodulate", "sweeps", "pooling")
+
+    def check(self, config: ModelConfig) -> None:
+        check_layers(config, units=True)
+        if missing := [name for name in kpcn.NEEDED if name not in config.inputs]:
+            raise NgptError(f"network 'kpcn' needs the inputs {', '.join(kpcn.NEEDED)}; lacks {', '.join(missing)}")
+        if type(config.kernel) is not int or config.kernel not in range(3, kpcn.MAX_KERNEL + 1, 2):
+            most = kpcn.MAX_KERNEL
+            raise NgptError(f"kernel = {config.kernel!r}: of 'kpcn' it must be an odd number from 3 to {most}")
+        if len(config.channels) > 1:
+            raise NgptError(f"channels {list(config.channels)}: 'kpcn' has one level; give one number")
+
+    def head(self, config: ModelConfig) -> Head:
+        return kpcn.SplitKernels(size=config.kernel)
+
+    def network(self, config: ModelConfig) -> nn.Module:
+        return kpcn.KPCN(config.inputs, config.channels[0], config.units[0], **_last(config))
+
+
+class Oidn(Kind):
+    """``ngpt.network.oidnet.OidnUNet``, which has what OIDN does around it instead of a head."""
+
+    goes_without = ("quiet", "kernel", "scales", "demodulate", "sweeps", "pooling")
+
+    def check(self, config: ModelConfig) -> None:
+        colour = "base" if config.base else "primal"
+        if config.inputs != (colour, *oidnet.FEATURES):
+            raise NgptError(f"inputs {', '.join(config.inputs)}: of 'oidn' they must be {colour}, albedo, normal")
+        if config.channels not in oidnet.SHAPES:
+            shapes = " or ".join(str(list(shape)) for shape in oidnet.SHAPES)
+            raise NgptError(f"channels {list(config.channels)}: of 'oidn' they must be {shapes}")
+        if config.units:
+            raise NgptError(f"units {list(config.units)}: 'oidn' has none; give []")
+
+    def head(self, config: ModelConfig) -> Head:
+        return head_of(config.start, 0, 1, False)
+
+    def network(self, config: ModelConfig) -> nn.Module:
+        return oidnet.OidnUNet(config.channels)
+
+
+KINDS: dict[str, Kind] = {"dense": Dense(), "plain": Plain(), "kpcn": Kpcn(), "oidn": Oidn()}
+
+
+def check_layers(config: ModelConfig, units: bool) -> None:
+    """Raises NgptError unless inputs, levels, base and start are those of a network of ours, with ``units`` or not."""
+    names, levels = ", ".join(config.inputs), len(config.channels)
+    if "primal" not in config.inputs or len(set(config.inputs)) < len(config.inputs):
+        raise NgptError(f"inputs {names}: each once, and 'primal' among them")
+    if not 1 <= levels <= MAX_LEVELS or not _whole(config.channels, MAX_CHANNELS):
+        raise NgptError(
+            f"channels {list(config.channels)}: give a positive number for each level, "
+            f"up to {MAX_CHANNELS}, and at most {MAX_LEVELS} levels"
+        )
+    if units and (len(config.units) != levels or not _whole(config.units, MAX_UNITS)):
+        raise NgptError(
+            f"units {list(config.units)}: give a positive number, up to {MAX_UNITS}, for each of {levels} levels"
+        )
+    if bool(config.base) != ("base" in config.layers):
+        raise NgptError(f"base is '{config.base}' while inputs are {names}: give both or none")
+    if "denoised_base" in config.layers and not config.base:
+        raise NgptError("input 'denoised_base' is the denoised base, and there is no base; set base")
+    for name in config.start:
+        if name not in features.IMAGES or name not in config.layers:
+            raise NgptError(
+                f"start '{name}': must be one of {', '.join(features.IMAGES)}, and an input or what one is made of"
+            )
+
+
+def _last(config: ModelConfig) -> dict[str, Any]:
+    """The last convolution of a network, by its head."""
+    return {"outputs": config.head.outputs, "zero": config.head.neutral, "normalise": config.head.normalise}
+
+
+def _whole(numbers: tuple[Any, ...], most: int) -> bool:
+    return all(type(number) is int and 1 <= number <= most for number in numbers)
