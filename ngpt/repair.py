@@ -131,14 +131,16 @@ def _parts(stack: GradientStack, good: np.ndarray) -> dict[str, np.ndarray]:
 def variance_of_primal(stack: GradientStack, gradients: bool = False) -> np.ndarray:
     """The variance of the primal, (H, W, 3): with ``gradients`` of what they are the differences of, else of all of it.
 
-    All of it is not known, and NaN, where there is light in ``caustic`` and no ``caustic_var``.
+    All of it is not known, and NaN, where there is light in ``caustic`` whose variance is not.
     """
     variance = stack["primal_var"]
-    if gradients or "caustic" not in stack or not stack["caustic"].any():
+    if gradients or "caustic" not in stack:
         return variance
-    if "caustic_var" in stack:
-        return variance + stack["caustic_var"]
-    return np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
+    alone = np.where(stack["caustic"].any(axis=-1, keepdims=True), np.float32(np.nan), variance)
+    if "caustic_var" not in stack:
+        return alone
+    further = stack["caustic_var"]
+    return np.where(np.isfinite(further) & (further >= 0) & (variance >= 0), variance + further, alone)
 
 
 def finite_pixels(layer: np.ndarray) -> np.ndarray:

@@ -25,8 +25,8 @@ from ngpt.repair import Repaired
 # OIDN's image becomes brighter by at most this factor, to hold the light that there was. A larger one would make
 # blotches of the little that OIDN has not taken for outliers.
 MOST = 4.0
-_LOUDEST = np.float32(1e30)  # variances of light of at most 1 are less, or as good as that
-_FARTHEST = 1e-6  # depths below this share of the largest one are alike
+LOUDEST = 1e30  # variances of light of at most 1 are less, or as good as that
+FARTHEST = 1e-6  # depths below this share of the largest one are alike
 
 
 def denoised(data: Repaired, by_oidn: bool = False) -> np.ndarray:
@@ -36,19 +36,22 @@ def denoised(data: Repaired, by_oidn: bool = False) -> np.ndarray:
     """
     assert data.caustic is not None
     if by_oidn:
-        return _by_oidn(data)
+        height, width = data.caustic.shape[:2]
+        return doubled(of_half_size(data))[:height, :width]
     scale = float(np.abs(data.caustic).max())
     light = _planes(data.caustic) / np.float32(scale)
     # What is not known of a variance is that of an estimate that is all noise.
     noise = light**2
     if data.caustic_var is not None:
         variance = _planes(data.caustic_var) / np.float32(scale) / np.float32(scale)
-        noise = np.where(np.isfinite(variance), np.clip(variance, 0, _LOUDEST), noise)
+        known = np.isfinite(variance) & (variance >= 0)
+        noise = np.where(known, np.minimum(variance, np.float32(LOUDEST)), noise)
     light = diffused(light, noise.mean(axis=0), _surfaces(data.features, light.shape[1:]))
     return np.ascontiguousarray(np.moveaxis(light, 0, -1)) * np.float32(scale)
 
 
-def _by_oidn(data: Repaired) -> np.ndarray:
+def of_half_size(data: Repaired) -> np.ndarray:
+    """OIDN's image of ``data.caustic``, (⌈H / 2⌉, ⌈W / 2⌉, 3), with as much light, see ``MOST``."""
     assert data.caustic is not None
     small = {name: halved(layer) for name, layer in data.features.items() if name != "depth"}
     given = halved(data.caustic)
@@ -58,8 +61,7 @@ def _by_oidn(data: Repaired) -> np.ndarray:
     before, after = given.sum(dtype=np.float64), light.sum(dtype=np.float64)
     if before > 0 and after > 0:
         light *= np.float32(min(before / after, MOST))
-    height, width = data.caustic.shape[:2]
-    return doubled(light)[:height, :width]
+    return light
 
 
 def halved(layer: np.ndarray) -> np.ndarray:
@@ -84,7 +86,7 @@ def _surfaces(features: dict[str, np.ndarray], size: tuple[int, int]) -> np.ndar
     planes = [_planes(features[name]) for name in ("albedo", "normal") if name in features]
     if "depth" in features and features["depth"].max() > 0:
         depth = _planes(features["depth"])
-        planes.append(np.log(np.maximum(depth, np.float32(_FARTHEST) * depth.max())))
+        planes.append(np.log(np.maximum(depth, np.float32(FARTHEST) * depth.max())))
     return np.concatenate(planes) if planes else np.zeros((0, *size), np.float32)
 
 

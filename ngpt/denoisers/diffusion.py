@@ -18,14 +18,14 @@ DISTANCES = (1, 2, 4, 8, 16, 32, 1, 2)
 # Two pixels that differ by so many standard deviations of their noise, beyond it, exchange 1/e of their light.
 SIGNIFICANT = 3.0
 # The neighbours of one half plane at distance 1, and their weights in the binomial filter of 3x3 pixels.
-_NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
+NEIGHBOURS = ((0, 1, 1 / 8), (1, 0, 1 / 8), (1, 1, 1 / 16), (1, -1, 1 / 16))
 # Pixels that are worked on at a time: fewer make more calls, more leave the cache.
 _PIXELS = 16384
 # What gaps hold for a surface.
 _FAR = float(np.finfo(np.float32).max)
 # The largest negative logarithm of a share, and the share beside it.
-_SMALLEST = np.float32(20)
-_LEAST = np.exp(np.full(1, -_SMALLEST))
+SMALLEST = np.float32(20)
+_LEAST = np.exp(np.full(1, -SMALLEST))
 
 
 def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> np.ndarray:
@@ -43,14 +43,14 @@ def diffused(light: np.ndarray, variance: np.ndarray, surfaces: np.ndarray) -> n
     for distance in DISTANCES:
         around = [layout.around(layer, distance) for layer in (*now, surface)]
         inner = [layer[:, layout.margin :] for layer in after]
-        for down, right, _ in _NEIGHBOURS:
+        for down, right, _ in NEIGHBOURS:
             # What an earlier, smaller distance wrote there.
             shares[1 - down, 1 - right, : layout.offset(down, right, distance)] = 0
 
         def share(first: int, distance: int = distance, around: list = around) -> None:
             light, variance, surface = (layer[..., first : first + _PIXELS] for layer in around)
             found_shares = _shares(light, variance, surface, floor)
-            for (down, right, _), found in zip(_NEIGHBOURS, found_shares, strict=True):
+            for (down, right, _), found in zip(NEIGHBOURS, found_shares, strict=True):
                 other = first + layout.offset(down, right, distance)
                 shares[1 + down, 1 + right, first : first + len(found)] = found
                 shares[1 - down, 1 - right, other : other + len(found)] = found
@@ -93,11 +93,11 @@ class _Layout:
 
 
 def _shares(light: np.ndarray, variance: np.ndarray, surface: np.ndarray, floor: np.float32):
-    """For each of ``_NEIGHBOURS``, the share (pixels) that is exchanged with it; arrays (3, 3, ..., pixels)."""
+    """For each of ``NEIGHBOURS``, the share (pixels) that is exchanged with it; arrays (3, 3, ..., pixels)."""
     steps = np.empty(surface.shape[2:], np.float32)
     change = np.empty(light.shape[2:], np.float32)
     apart, noise = np.empty((2, light.shape[-1]), np.float32)
-    for down, right, weight in _NEIGHBOURS:
+    for down, right, weight in NEIGHBOURS:
         there = 1 + down, 1 + right
         np.subtract(light[there], light[1, 1], out=change)
         np.einsum("np,np->p", change, change, out=apart)
@@ -111,7 +111,7 @@ def _shares(light: np.ndarray, variance: np.ndarray, surface: np.ndarray, floor:
         np.subtract(surface[there], surface[1, 1], out=steps)
         apart += np.einsum("np,np->p", steps, steps, out=noise)
         np.negative(apart, out=apart)
-        np.maximum(apart, -_SMALLEST, out=apart)
+        np.maximum(apart, -SMALLEST, out=apart)
         np.exp(apart, out=apart)
         apart -= _LEAST
         apart *= np.float32(weight)

@@ -12,8 +12,9 @@ import torch
 from ngpt.classical.controlvariates import SWEEPS
 from ngpt.errors import NgptError
 from ngpt.export.builder import IR_VERSION, OPSET
+from ngpt.export.graphs.caustic import REACH
 from ngpt.export.graphs.exposure import STATISTICS
-from ngpt.export.graphs.model import layers, reconstruction, statistics
+from ngpt.export.graphs.model import layers, optional, reconstruction, statistics
 from ngpt.export.reach import reach
 from ngpt.network import features
 from ngpt.network.model import Reconstructor
@@ -46,7 +47,13 @@ def statistics_model(weights: str | Path, name: str) -> onnx.ModelProto:
 
 def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
     """What a host may want to know, by key; CONTRACT.md explains them."""
-    seen = reach(model)
+    seen, light = reach(model), REACH if model.config.reads_gradients else 0
+    # Of every second pixel another denoiser's image of ``caustic`` is made: tiles begin at even ones.
+    step = max(model.alignment, 2)
+
+    def overlap(*pixels: int) -> str:
+        return str(-(-max(pixels) // step) * step)
+
     return {
         "version": __version__,
         "method": name,
@@ -54,15 +61,15 @@ def metadata(model: Reconstructor, name: str, precision: str) -> dict[str, str]:
         "layout": "NCHW, float32, row 0 on top, scene-linear",
         "gradient": "forward: dx[y, x] = I[y, x + 1] - I[y, x], last column 0; dy alike",
         "normal": "camera space, +x right, +y up, +z toward the viewer",
-        "alignment": str(model.alignment),
-        "overlap": str(seen + _base_reach(model)),
-        "overlap with base": str(seen),
+        "alignment": str(step),
+        "overlap": overlap(seen + _base_reach(model), light),
+        "overlap with base": overlap(seen, light),
         "bytes per pixel": str(bytes_per_pixel(model)),
         "statistics": ", ".join(STATISTICS),
         "precision": precision,
         "base": model.config.base,
         # Layers that may be zeros everywhere
-        "optional": "direct",
+        "optional": ", ".join(optional(model.config)),
     }
 
 

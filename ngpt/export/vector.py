@@ -31,8 +31,9 @@ def quiet() -> Any:
 def example_layers() -> dict[str, np.ndarray]:
     """Layers (1, C, height, width) of a noisy picture, the same on every machine.
 
-    A bright disk on a gradient; a lamp above, which a mirror below shows again, darker; and what renderers get wrong:
-    values that are not finite, in every kind of layer, alone and in a hole of 7x7 pixels, and variances of -1.
+    A bright disk on a gradient; a lamp above, which a mirror below shows again, darker; rare bright light that
+    gradients hold nothing of; and what renderers get wrong: values that are not finite, in every kind of layer, alone
+    and in a hole of 7x7 pixels, and variances of -1.
     """
     width, height = SIZE
     rng = np.random.default_rng(7)
@@ -52,6 +53,11 @@ def example_layers() -> dict[str, np.ndarray]:
     layers["normal"] /= np.linalg.norm(layers["normal"], axis=0)
     layers["depth"] = np.where(disk, 2.0, 3 + 0.05 * y)[None]
     _light(layers, np.s_[:, 1:4, 4:10], np.s_[:, 17:22, 2:14])
+    spark = np.random.default_rng(8).gamma(0.5, 4, clean.shape) * (
+        np.random.default_rng(9).random((height, width)) > 0.9
+    )
+    layers["caustic"], layers["caustic_var"] = spark, spark**2 / 2
+    layers["primal"] += spark
     others = {"denoised": 1.02 * clean + layers["direct"], "denoised_base": 0.99 * clean + layers["direct"]}
     _damage(layers)
     return {name: np.ascontiguousarray(layer[None], np.float32) for name, layer in (others | layers).items()}
@@ -74,5 +80,6 @@ def _damage(layers: dict[str, np.ndarray]) -> None:
     layers["primal"][0, 12, 24], layers["direct"][2, 20, 22] = np.inf, np.nan
     layers["primal"][:, 13:20, 18:25] = np.nan
     layers["dx"][0, 9, 11], layers["dy"][:, 5, 20] = np.nan, -np.inf
+    layers["caustic"][2, 21, 5], layers["caustic_var"][:, 19:23, 16:24] = np.nan, -1
     layers["primal_var"][:, 8, 8], layers["dx_var"][:, 4, 25], layers["dy_var"][2, 10, 13] = -1, -1, np.inf
     layers["albedo"][1, 6, 6], layers["normal"][:, 15, 3], layers["depth"][0, 1, 20] = np.nan, np.nan, np.inf

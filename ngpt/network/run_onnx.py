@@ -36,6 +36,9 @@ DEVICES = {
 # As ONNX Runtime calls them.
 _FLOATS = {"tensor(float)": np.float32, "tensor(float16)": np.float16, "tensor(double)": np.float64}
 
+# Layers that are taken out before a network sees the others.
+_APART = ("direct", "caustic", "caustic_var")
+
 Progress = Callable[[int, int], None]
 
 
@@ -71,11 +74,12 @@ class Network:
             raise NgptError(
                 f"{path}: lacks the metadata {error} of an ngpt network; write it anew: ngpt export"
             ) from error
-        # Direct emission is taken out, and pixels are repaired, before layers come here: the graph, which does so for
-        # other hosts, is told that there is none. Graphs of earlier versions do not ask.
-        self.asks_for_direct = "direct" in names
-        self.inputs = tuple(name for name in names if name != "direct")
-        if metadata.get("ngpt.emission") == "true" or metadata.get("ngpt.optional", "direct") != "direct":
+        # Light that is apart is taken out, and pixels are repaired, before layers come here: the graph, which does so
+        # for other hosts, is told that there is none. Graphs of earlier versions ask for less of it.
+        self.apart = tuple(name for name in names if name in _APART)
+        self.inputs = tuple(name for name in names if name not in _APART)
+        optional = metadata.get("ngpt.optional", "direct").split(", ")
+        if metadata.get("ngpt.emission") == "true" or not set(optional) <= set(_APART):
             raise NgptError(f"{path}: a network of colour alone, as earlier versions had; use one of today")
         self._check()
 
@@ -91,8 +95,7 @@ class Network:
                 raise NgptError(f"{self.path}: its {name} is {value}; it must be at most {most}: export it anew")
         if self.bytes < 1 or self.base not in ("", *BASES):
             raise NgptError(f"{self.path}: {self.bytes} bytes per pixel, base '{self.base}': export it anew")
-        own = {*self.inputs, "statistics"} | ({"base"} if self.base else set())
-        own |= {"direct"} if self.asks_for_direct else set()
+        own = {*self.inputs, *self.apart, "statistics"} | ({"base"} if self.base else set())
         graph = {given.name for given in self.session.get_inputs()}
         # Those that a host may leave out have a value in the graph.
         optional = {given.name for given in self.session.get_overridable_initializers()}
@@ -169,8 +172,7 @@ class Network:
             group = pieces[first : first + batch]
             windows = [np.s_[y : y + rows, x : x + columns] for _, _, y, x in group]
             feed = {name: np.stack([planes(layers[name][window]) for window in windows]) for name in names}
-            if self.asks_for_direct:
-                feed["direct"] = np.zeros_like(feed["primal"])
+            feed |= dict.fromkeys(self.apart, np.zeros_like(feed["primal"]))
             results = self._run(session, feed | {"statistics": shared})
             for (inner_y, inner_x, y, x), result in zip(group, results, strict=True):
                 part = result[:, inner_y.start - y : inner_y.stop - y, inner_x.start - x : inner_x.stop - x]

@@ -20,6 +20,7 @@ from capi import (
 )
 from hosts import VECTOR, read_layers
 
+from ngpt.denoisers import caustic
 from ngpt.methods import reconstruct
 from ngpt.network.inputs import DENOISED, Oidn, base_image, denoised
 from ngpt.repair import repair
@@ -71,6 +72,7 @@ def test_a_network_that_corrects_another_denoiser(library):
     made = base_image(data, "wcv")
     expected = {"oidn_primal": data.image + data.direct, "oidn_base": made + data.direct}
     expected |= {"oidn_albedo": data.features["albedo"], "oidn_normal": data.features["normal"]}
+    expected["oidn_caustic"] = caustic.halved(data.caustic).repeat(2, 0).repeat(2, 1)
     job = Job(network, those(network, layers))
     images = {name: np.zeros_like(image) for name, image in expected.items()}
     for name, image in images.items():
@@ -80,7 +82,9 @@ def test_a_network_that_corrects_another_denoiser(library):
     for name, image in images.items():
         agree(image, expected[name])
     other = {name: image + data.direct for name, image in denoised(Oidn(data), made, DENOISED).items()}
-    for name, image in (other | {"base": images["oidn_base"]}).items():
+    other |= {"base": images["oidn_base"], "denoised_caustic": np.zeros_like(data.caustic)}
+    other["denoised_caustic"][::2, ::2] = caustic.of_half_size(data)
+    for name, image in other.items():
         assert library.ngpt_set_layer(job.handle, name.encode(), *place(image)) == OK, job.message()
     expected_image = reconstruct(stack_of(layers), "ngpt-combine").image
     for memory in (0, 60):

@@ -15,8 +15,9 @@ from onnx.reference.op_run import OpRun
 
 from ngpt.classical import controlvariates as numpy_controlvariates
 from ngpt.classical.leastsquares import robust_mean
+from ngpt.denoisers import caustic as numpy_caustic
 from ngpt.export.builder import FLOAT, Graph, choose, op, repeat
-from ngpt.export.graphs import controlvariates, exposure, features, padding, transfer, variances
+from ngpt.export.graphs import caustic, controlvariates, exposure, features, padding, transfer, variances
 from ngpt.export.graphs.model import _OperatorsOfHeads
 from ngpt.export.graphs.repair import clean, repaired
 from ngpt.network import features as torch_features
@@ -75,14 +76,28 @@ def damaged(height, width):
     return layers
 
 
+def lit(layers, variance=True):
+    """The layers with rare bright light that gradients do not hold."""
+    rng, shape = np.random.default_rng(5), layers["primal"].shape
+    light = np.where(rng.random((*shape[:2], 1)) > 0.9, rng.gamma(0.3, 20, shape), 0).astype(np.float32)
+    noise = np.where(light > 4, light**2, 0.1).astype(np.float32)
+    noise[rng.random(shape) < (0.1 if variance else 2)] = -1
+    return layers | {"primal": layers["primal"] + light, "caustic": light, "caustic_var": noise}
+
+
+@pytest.mark.parametrize("gradients", [True, False])
 @pytest.mark.parametrize("size", [(1, 1), (1, 9), (24, 31), (90, 75)])
-def test_repair_is_that_of_numpy(size):
-    layers = damaged(*size)
-    data = numpy_repair(GradientStack.from_arrays(**layers))
+def test_repair_is_that_of_numpy(size, gradients):
+    layers = lit(damaged(*size))
+    if min(size) > 1:
+        layers["caustic"][size[0] // 3, size[1] // 5] = np.nan
+    data = numpy_repair(GradientStack.from_arrays(**layers), gradients)
     expected = {"primal": data.image, "dx": data.dx, "dy": data.dy, **data.features, **data.known_variances()}
+    if data.caustic is not None:
+        expected |= {"caustic": data.caustic, "caustic_var": data.caustic_var}
 
     def graph(*values):
-        ours = repaired(dict(zip(layers, values, strict=True)))
+        ours = repaired(dict(zip(layers, values, strict=True)), gradients)
         return (ours.direct, *(ours.layers[name] for name in expected))
 
     direct, *others = evaluate(graph, *(planes(layer) for layer in layers.values()))
@@ -93,8 +108,38 @@ def test_repair_is_that_of_numpy(size):
             last = np.s_[..., :-1] if name.startswith("dx") else np.s_[..., :-1, :]
             ours, theirs = ours[last], theirs[last]
         if name.endswith("_var"):  # what is not known is so in any colour
-            ours, theirs = (np.where(np.isfinite(v).all(1, keepdims=True), v, -1) for v in (ours, theirs))
+            ours, theirs = (np.where((np.isfinite(v) & (v >= 0)).all(1, keepdims=True), v, -1) for v in (ours, theirs))
         assert np.allclose(ours, theirs, rtol=1e-5, atol=1e-6), name
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 40), (37, 2), (37, 70)])
+@pytest.mark.parametrize("variance", [True, False])
+@pytest.mark.parametrize("scale", [0.0, 1e-12, 1.0, 1e12])
+def test_light_that_gradients_do_not_hold_is_spread_as_by_numpy(size, variance, scale):
+    layers = lit(full_layers(*size), variance)
+    layers |= {name: 0.3 * layers[name] for name in ("albedo", "normal")}
+    layers |= {name: layers[name] * np.float32(scale) for name in ("primal", "caustic")}
+    layers["caustic_var"] *= np.float32(scale) * np.float32(scale)
+    data = numpy_repair(GradientStack.from_arrays(**layers))
+    expected = data.image * 0 if data.caustic is None else numpy_caustic.denoised(data)
+    names = ("caustic", "caustic_var", "albedo", "normal", "depth")
+
+    def graph(*values):
+        given = dict(zip(names, values, strict=True))
+        return caustic.spread(given, op.ReduceMax(given["depth"], keepdims=0))
+
+    ours = evaluate(graph, *(planes(layers[name]) for name in names))
+    assert np.abs(ours - planes(expected)).max() <= 1e-6 * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("size", [(1, 1), (2, 3), (7, 6), (8, 10)])
+def test_half_the_size_and_back_as_by_numpy(size):
+    image = np.random.default_rng(0).random((*size, 3), np.float32)
+    half, whole = evaluate(lambda x: (caustic.halved(x), caustic.doubled(caustic.halved(x))), planes(image))
+    assert half.shape == whole.shape == planes(image).shape
+    expected = numpy_caustic.halved(image)
+    assert np.allclose(half[..., ::2, ::2], planes(expected), rtol=1e-6)
+    assert np.allclose(whole, planes(numpy_caustic.doubled(expected)[: size[0], : size[1]]), rtol=1e-5)
 
 
 @pytest.mark.parametrize("values", [[0.0], [1, 2, 3], [1] * 500 + [1e12], [1e30, 1e30, 0], [0] * 300 + [5]])

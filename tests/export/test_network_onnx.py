@@ -56,7 +56,8 @@ def weights(tmp_path_factory):
 def noisy(height, width, scale=1.0, seed=0):
     """All layers of a stack, (1, C, H, W)."""
     layers = full_layers(height, width, scale, seed)
-    layers["direct"] = np.zeros_like(layers["primal"])
+    layers["direct"] = layers["caustic"] = np.zeros_like(layers["primal"])
+    layers["caustic_var"] = layers["direct"] - 1
     return {name: np.ascontiguousarray(layer.transpose(2, 0, 1)[None]) for name, layer in layers.items()}
 
 
@@ -246,7 +247,7 @@ def test_command(tmp_path, weights, capsys):
     # Hosts look for it there.
     assert onnxruntime.InferenceSession(tmp_path / "m.statistics.onnx", quiet()).get_outputs()[0].shape == [5]
     listing = json.loads((tmp_path / "vector/layers.json").read_text())
-    assert set(listing) == {*ALL, "direct", "image"}
+    assert set(listing) == {*ALL, "direct", "caustic", "caustic_var", "image"}
     assert main(command) == 1 and "m.onnx" in capsys.readouterr().err
     output.unlink()
     assert main(command) == 1 and "m.statistics.onnx: exists already" in capsys.readouterr().err

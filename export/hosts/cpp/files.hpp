@@ -1,65 +1,53 @@
 // Layers in files, as `ngpt unpack` and export/vector have them, and images as portable float maps.
 #pragma once
 
-#include "network.hpp"
-
 #include <algorithm>
 #include <fstream>
 #include <iterator>
-#include <map>
 #include <sstream>
+#include <stdexcept>
+#include <string>
+#include <vector>
 
-using Layers = std::map<std::string, Layer>;
+class Folder {
+public:
+    int height = 0, width = 0;  // of "primal", and so of all layers
 
-inline std::string slurp(const std::string &path) {
-    std::ifstream file(path, std::ios::binary);
-    if (!file) throw std::runtime_error(path + ": cannot be read");
-    return {std::istreambuf_iterator<char>(file), {}};
-}
+    explicit Folder(const std::string &path) : path_(path), listing_(bytes("layers.json")) {
+        std::string shape = listing_.substr(listing_.find('[', listing_.find("\"primal\"")) + 1);
+        std::replace(shape.begin(), shape.end(), ',', ' ');
+        int one = 0, channels = 0;
+        std::istringstream(shape) >> one >> channels >> height >> width;
+        if (!has("primal") || one != 1 || channels != 3 || std::min(height, width) < 1)
+            throw std::runtime_error(path + "/layers.json: the shape of primal must be [1, 3, height, width]");
+    }
+    bool has(const std::string &name) const { return listing_.find("\"" + name + "\"") != std::string::npos; }
 
-// The layer called `name`, float32 in the order (1, C, height, width), its shape taken from layers.json.
-inline Layer read_layer(const std::string &folder, const std::string &listing, const std::string &name) {
-    std::string shape = listing.substr(listing.find('[', listing.find("\"" + name + "\"")) + 1);
-    shape = shape.substr(0, shape.find(']'));
-    std::replace(shape.begin(), shape.end(), ',', ' ');
-    std::istringstream numbers(shape);
-    int one, channels, height, width;
-    if (!(numbers >> one >> channels >> height >> width) || one != 1 || std::min({channels, height, width}) < 1)
-        throw std::runtime_error(folder + "/layers.json: the shape of " + name + " must be [1, C, height, width]");
-    Layer layer(channels, height, width);
-    const std::string path = folder + "/" + name + ".f32", data = slurp(path);
-    if (data.size() != layer.pixels.size() * sizeof(float))
-        throw std::runtime_error(path + ": has " + std::to_string(data.size()) + " bytes, not those of its shape");
-    std::copy(data.begin(), data.end(), reinterpret_cast<char *>(layer.pixels.data()));
-    return layer;
-}
+    // The layer of that name, channel by channel, row by row.
+    std::vector<float> layer(const std::string &name, int channels) const {
+        std::vector<float> pixels(size_t(channels) * height * width);
+        const std::string data = bytes(name + ".f32");
+        if (data.size() != pixels.size() * sizeof(float))
+            throw std::runtime_error(path_ + "/" + name + ".f32: is not of the size of primal");
+        std::copy(data.begin(), data.end(), reinterpret_cast<char *>(pixels.data()));
+        return pixels;
+    }
 
-// All that the network reads and the folder holds, but for other denoisers' images.
-inline Layers read_layers(const std::string &folder, const Network &network) {
-    const std::string listing = slurp(folder + "/layers.json");
-    Layers layers;
-    for (const std::string &name : network.inputs)
-        if (name.rfind("denoised", 0) != 0 && listing.find("\"" + name + "\"") != std::string::npos)
-            layers[name] = read_layer(folder, listing, name);
-    for (const std::string &name : network.required)
-        if (name.rfind("denoised", 0) != 0 && !layers.count(name))
-            throw std::runtime_error(folder + "/layers.json: the model needs \"" + name + "\"");
-    const Layer &primal = layers.at("primal");
-    for (auto &[name, layer] : layers)
-        if (layer.height != primal.height || layer.width != primal.width)
-            throw std::runtime_error(name + " is not of the size of primal");
-    return layers;
-}
+private:
+    std::string path_, listing_;
 
-// A portable float map: pixel by pixel, the last row first, little-endian.
-inline void write_pfm(const std::string &path, const Layer &image) {
+    std::string bytes(const std::string &name) const {
+        std::ifstream file(path_ + "/" + name, std::ios::binary);
+        if (!file) throw std::runtime_error(path_ + "/" + name + ": cannot be read");
+        return {std::istreambuf_iterator<char>(file), {}};
+    }
+};
+
+// A portable float map of pixels of three floats: the last row first, little-endian.
+inline void write_pfm(const std::string &path, const std::vector<float> &image, int width, int height) {
     std::ofstream file(path, std::ios::binary);
-    file << "PF\n" << image.width << " " << image.height << "\n-1.0\n";
-    for (int y = image.height - 1; y >= 0; y--)
-        for (int x = 0; x < image.width; x++)
-            for (int c = 0; c < 3; c++) {
-                const float *value = &image.pixels[c * image.plane() + ptrdiff_t(y) * image.width + x];
-                file.write(reinterpret_cast<const char *>(value), sizeof *value);
-            }
+    file << "PF\n" << width << " " << height << "\n-1.0\n";
+    for (int y = height - 1; y >= 0; y--)
+        file.write(reinterpret_cast<const char *>(&image[size_t(3) * y * width]), size_t(12) * width);
     if (!file.flush()) throw std::runtime_error(path + ": cannot be written");
 }

@@ -5,17 +5,22 @@
 // FOLDER is as `ngpt unpack STACK.exr FOLDER` makes it. MEMORY is what the network's tiles may take, in MiB, 0 for
 // 2048; OIDN makes its own. Needs OIDN 2.
 
-#include "caustic.hpp"
+#include "files.hpp"
 
 #include <OpenImageDenoise/oidn.h>
 
-#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
+#include <list>
+#include <map>
+#include <ngpt.h>
+
+using Image = std::vector<float>;  // pixels of three floats
+using Images = std::map<std::string, Image>;
 
 class Oidn {
 public:
-    Oidn() : device_(oidnNewDevice(OIDN_DEVICE_TYPE_CPU)) {
+    Oidn(int width, int height) : device_(oidnNewDevice(OIDN_DEVICE_TYPE_CPU)), width_(width), height_(height) {
         oidnCommitDevice(device_);
         check();
     }
@@ -23,30 +28,21 @@ public:
 
     // A feature, "albedo" or "normal", denoised by OIDN's own model for it. "High" takes more than twice as long, and
     // gains nothing.
-    Layer prefiltered(const char *name, const Layer &feature) {
-        const bool empty = std::all_of(feature.pixels.begin(), feature.pixels.end(), [](float x) { return x == 0; });
-        return empty ? feature : filtered({{name, &feature}}, false, OIDN_QUALITY_BALANCED);
+    Image prefiltered(const char *name, const Image &feature) {
+        const bool empty = std::all_of(feature.begin(), feature.end(), [](float x) { return x == 0; });
+        return empty ? feature : filtered({{name, feature}}, false, OIDN_QUALITY_BALANCED);
     }
 
-    // An image with emission seen directly, by features that count as clean, or do not.
-    Layer denoised(const Layer &color, const Layer &albedo, const Layer &normal, OIDNQuality quality, bool clean = true) {
-        return filtered({{"color", &color}, {"albedo", &albedo}, {"normal", &normal}}, clean, quality);
-    }
-
-private:
-    OIDNDevice device_;
-
-    Layer filtered(const std::map<std::string, const Layer *> &images, bool clean, OIDNQuality quality) {
-        const Layer &first = *images.begin()->second;
-        const size_t height = first.height, width = first.width;
+    // An image, "color", with features that count as clean, or do not: of all pixels, or of every `step`th of both axes.
+    Image filtered(Images images, bool clean, OIDNQuality quality, int step = 1) {
         OIDNFilter filter = oidnNewFilter(device_, "RT");
-        std::vector<std::vector<float>> buffers;
-        for (auto &[name, image] : images) {
-            buffers.push_back(interleaved(*image));
-            oidnSetSharedFilterImage(filter, name.c_str(), buffers.back().data(), OIDN_FORMAT_FLOAT3, width, height, 0, 0, 0);
-        }
-        std::vector<float> output(3 * height * width);
-        oidnSetSharedFilterImage(filter, "output", output.data(), OIDN_FORMAT_FLOAT3, width, height, 0, 0, 0);
+        Image output(images.begin()->second.size());
+        const auto set = [&](const char *name, Image &image) {
+            oidnSetSharedFilterImage(filter, name, image.data(), OIDN_FORMAT_FLOAT3, (width_ + step - 1) / step,
+                                     (height_ + step - 1) / step, 0, 12 * step, 12 * step * width_);
+        };
+        for (auto &[name, image] : images) set(name.c_str(), image);
+        set("output", output);
         oidnSetFilterBool(filter, "hdr", images.count("color") > 0);
         oidnSetFilterBool(filter, "cleanAux", clean);
         oidnSetFilterInt(filter, "quality", quality);
@@ -54,115 +50,86 @@ private:
         oidnExecuteFilter(filter);
         oidnReleaseFilter(filter);
         check();
-        return planar(output, height, width);
+        return output;
     }
+
+private:
+    OIDNDevice device_;
+    size_t width_, height_;
 
     void check() {
         const char *message = nullptr;
         if (oidnGetDeviceError(device_, &message) != OIDN_ERROR_NONE) throw std::runtime_error(std::string("OIDN: ") + message);
     }
-
-    static std::vector<float> interleaved(const Layer &layer) {
-        const size_t pixels = layer.height * layer.width;
-        std::vector<float> values(3 * pixels);
-        for (size_t c = 0; c < 3; c++)
-            for (size_t i = 0; i < pixels; i++) values[3 * i + c] = layer.pixels[c * pixels + i];
-        return values;
-    }
-
-    static Layer planar(const std::vector<float> &values, size_t height, size_t width) {
-        Layer layer(3, height, width);
-        for (size_t c = 0; c < 3; c++)
-            for (size_t i = 0; i < height * width; i++) layer.pixels[c * height * width + i] = values[3 * i + c];
-        return layer;
-    }
 };
 
-float at(const Layer &layer, int c, int y, int x) {
-    return layer.pixels[(size_t(c) * layer.height + y) * layer.width + x];
-}
-
-// The means of 2x2 pixels; sides of odd length have their last pixels twice.
-Layer halved(const Layer &layer) {
-    Layer half(layer.channels, (layer.height + 1) / 2, (layer.width + 1) / 2);
-    float *pixel = half.pixels.data();
-    for (int c = 0; c < half.channels; c++)
-        for (int y = 0; y < layer.height; y += 2)
-            for (int x = 0; x < layer.width; x += 2) {
-                const int below = std::min(y + 1, layer.height - 1), right = std::min(x + 1, layer.width - 1);
-                *pixel++ = (at(layer, c, y, x) + at(layer, c, y, right) + at(layer, c, below, x) +
-                            at(layer, c, below, right)) / 4;
-            }
-    return half;
-}
-
-// Bilinear at twice the size, of which that many rows and columns are wanted.
-Layer doubled(const Layer &half, int height, int width) {
-    Layer layer(half.channels, height, width);
-    float *pixel = layer.pixels.data();
-    for (int c = 0; c < half.channels; c++)
-        for (int y = 0; y < height; y++)
-            for (int x = 0; x < width; x++) {
-                const int v = std::clamp(y / 2 + (y % 2 ? 1 : -1), 0, half.height - 1);
-                const int u = std::clamp(x / 2 + (x % 2 ? 1 : -1), 0, half.width - 1);
-                *pixel++ = 0.75f * (0.75f * at(half, c, y / 2, x / 2) + 0.25f * at(half, c, y / 2, u)) +
-                           0.25f * (0.75f * at(half, c, v, x / 2) + 0.25f * at(half, c, v, u));
-            }
-    return layer;
-}
-
-double sum(const Layer &layer) {
-    double total = 0;
-    for (const float value : layer.pixels) total += value;
-    return total;
+// The light at even pixels, of which there is none below 0.
+double light(const Image &image, int width) {
+    double sum = 0;
+    for (size_t i = 0; i < image.size(); i++)
+        if (i / 3 % width % 2 == 0 && i / 3 / width % 2 == 0) sum += std::max(image[i], 0.0f);
+    return sum;
 }
 
 int main(int count, char **arguments) try {
-    if (count < 4 || count > 5 || (count == 5 && std::string(arguments[4]).find_first_not_of("0123456789") != std::string::npos)) {
-        std::fprintf(stderr, "usage: ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [MEMORY]\n");
-        return 2;
-    }
-    Network network(arguments[1]);
-    const auto reads = [&](const char *name) {
-        return std::find(network.inputs.begin(), network.inputs.end(), name) != network.inputs.end();
+    if (count < 4 || count > 5 || (count == 5 && std::string(arguments[4]).find_first_not_of("0123456789") != std::string::npos))
+        throw std::invalid_argument("usage: ngpt-oidn-host MODEL.onnx FOLDER OUTPUT.pfm [MEMORY]");
+    char message[512];
+    ngpt_network *network = ngpt_open(arguments[1], 0, message, sizeof message);
+    if (!network) throw std::runtime_error(message);
+    ngpt_job *job = ngpt_job_new(network);
+    const auto check = [&](ngpt_status status) {
+        if (status != NGPT_OK) throw std::runtime_error(ngpt_message(job));
     };
-    if (!reads("denoised")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
-    Layers layers = read_layers(arguments[2], network);
-    const Layers light = take_out_caustic(arguments[2], network.inputs, layers);
-    for (const auto &[name, layer] : layers) network.give(name, layer);
-    const int height = layers.at("primal").height, width = layers.at("primal").width;
-    Layer primal(3, height, width), albedo = primal, normal = primal, base = primal;
-    network.take("oidn_primal", primal);
-    network.take("oidn_albedo", albedo);
-    network.take("oidn_normal", normal);
-    if (reads("denoised_base")) network.take("oidn_base", base);
-    network.prepare(width, height);
+    const Folder folder(arguments[2]);
+    const int width = folder.width, height = folder.height;
+    const ptrdiff_t plane = ptrdiff_t(4) * width * height;  // bytes of a channel
+    std::list<Image> layers;
+    for (int i = 0; i < ngpt_layer_count(network); i++) {
+        const char *name = ngpt_layer_name(network, i);
+        const int channels = ngpt_layer_channels(network, i);
+        if (!folder.has(name)) continue;
+        layers.push_back(folder.layer(name, channels));
+        check(ngpt_set_layer(job, name, layers.back().data(), NGPT_FLOAT, channels, plane, 4, 4 * width));
+    }
+    Images made;
+    for (const char *name : {"primal", "albedo", "normal", "base", "caustic", "caustic_albedo", "caustic_normal"}) {
+        Image image(size_t(3) * width * height);
+        if (ngpt_set_output(job, (std::string("oidn_") + name).c_str(), image.data(), NGPT_FLOAT, 3, 0, 0, 0) == NGPT_OK)
+            made[name] = std::move(image);
+    }
+    if (!made.count("primal")) throw std::runtime_error("the model reads no images of OIDN: use ngpt-host");
+    check(ngpt_prepare(job, width, height, nullptr, nullptr));
 
-    Oidn oidn;
-    const Layer clean_albedo = oidn.prefiltered("albedo", albedo), clean_normal = oidn.prefiltered("normal", normal);
-    const Layer denoised = oidn.denoised(primal, clean_albedo, clean_normal, OIDN_QUALITY_HIGH);
-    network.give("denoised", denoised);
-    Layer denoised_base;
-    if (reads("denoised_base")) {
-        denoised_base = oidn.denoised(base, clean_albedo, clean_normal, OIDN_QUALITY_FAST);
-        network.give("denoised_base", denoised_base);
-        network.give("base", base);
+    Oidn oidn(width, height);
+    const Image albedo = oidn.prefiltered("albedo", made["albedo"]), normal = oidn.prefiltered("normal", made["normal"]);
+    const auto give = [&](const char *name, const Image &image) {
+        layers.push_back(image);
+        check(ngpt_set_layer(job, name, layers.back().data(), NGPT_FLOAT, 3, 0, 0, 0));
+    };
+    const auto denoised = [&](const char *name, OIDNQuality quality) {
+        return oidn.filtered({{"color", made[name]}, {"albedo", albedo}, {"normal", normal}}, true, quality);
+    };
+    give("denoised", denoised("primal", OIDN_QUALITY_HIGH));
+    if (made.count("base")) {
+        give("denoised_base", denoised("base", OIDN_QUALITY_FAST));
+        give("base", made["base"]);
     }
-    Layer image(3, height, width);
-    network.take("image", image);
-    network.run(width, height, count > 4 ? std::atoi(arguments[4]) : 0);
-    if (!light.empty()) {
-        const Layer given = halved(light.at("caustic"));
-        Layer made = oidn.denoised(given, halved(albedo), halved(normal), OIDN_QUALITY_HIGH, false);
-        for (float &value : made.pixels) value = std::max(value, 0.0f);
+    if (const double before = light(made["caustic"], width); before > 0) {
+        Image found = oidn.filtered({{"color", made["caustic"]}, {"albedo", made["caustic_albedo"]},
+                                     {"normal", made["caustic_normal"]}}, false, OIDN_QUALITY_HIGH, 2);
         // What OIDN took for noise is given back.
-        const double before = sum(given), after = sum(made);
-        if (before > 0 && after > 0)
-            for (float &value : made.pixels) value *= float(std::min(before / after, 4.0));
-        add(image, doubled(made, height, width));
+        const double after = light(found, width);
+        for (float &value : found) value *= after > 0 ? float(std::min(before / after, 4.0)) : 1;
+        give("denoised_caustic", found);
     }
-    write_pfm(arguments[3], image);
+    Image image(size_t(3) * width * height);
+    check(ngpt_set_output(job, "image", image.data(), NGPT_FLOAT, 3, 0, 0, 0));
+    check(ngpt_run(job, width, height, count > 4 ? std::atoi(arguments[4]) : 0, nullptr, nullptr));
+    write_pfm(arguments[3], image, width, height);
+    ngpt_job_free(job);
+    ngpt_close(network);
 } catch (const std::exception &error) {
     std::fprintf(stderr, "ngpt-oidn-host: %s\n", error.what());
-    return 1;
+    return dynamic_cast<const std::invalid_argument *>(&error) ? 2 : 1;
 }

@@ -35,7 +35,9 @@ export class Model {
     layers = {...layers};
     for (const name of this.inputs) {
       const expected = width * height * (name === "depth" ? 1 : 3);
-      if (!layers[name] && this.optional.includes(name)) layers[name] = new Float32Array(expected);
+      // A variance of -1 is not known.
+      if (!layers[name] && this.optional.includes(name))
+        layers[name] = new Float32Array(expected).fill(name.endsWith("_var") ? -1 : 0);
       const length = layers[name]?.length;
       if (length === undefined) throw new Error(`the model needs the layer ${name}`);
       if (length !== expected) throw new Error(`${name} has ${length} numbers; ${width}x${height} needs ${expected}`);

@@ -35,8 +35,7 @@ def build(output: Path, runtime: Path, example: Path, model: Path = MODEL, overw
     Raises NgptError for files that cannot be read, or where ``output`` exists and may not be overwritten.
     """
     script, glue, wasm = (_read(runtime / name) for name in RUNTIME)
-    shared = "".join(_body(HERE.parent / "javascript" / name) for name in ("caustic.mjs", "model.mjs"))
-    worker = script + b"\n" + (shared + _body(HERE / "worker.mjs")).encode()
+    worker = script + b"\n" + (_body(HERE.parent / "javascript" / "model.mjs") + _body(HERE / "worker.mjs")).encode()
     data = {
         "worker": worker,
         "glue": glue,

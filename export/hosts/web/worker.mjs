@@ -1,6 +1,5 @@
-/** Runs the model beside the page, which stays alive meanwhile. Behind ONNX Runtime's own script and the shared modules. */
+/** Runs the model beside the page, which stays alive meanwhile. Behind ONNX Runtime's own script and the shared module. */
 
-import {withAdded, withoutCaustic} from "../javascript/caustic.mjs";
 import {Model} from "../javascript/model.mjs";
 
 let open, loaded, last = Promise.resolve();
@@ -20,9 +19,7 @@ async function answer(data) {
     const {turn, width, height, tile} = data, start = performance.now();
     loaded ??= await open();
     const begun = performance.now();
-    const {layers, added} = withoutCaustic(data.layers, loaded.inputs, width, height);
-    const made = await loaded.run(layers, width, height, tile, (done, all) => postMessage({turn, done, all}));
-    const image = withAdded(made, added);
+    const image = await loaded.run(data.layers, width, height, tile, (done, all) => postMessage({turn, done, all}));
     postMessage({turn, image, loading: begun - start, milliseconds: performance.now() - begun});
   } catch (error) {
     postMessage({turn: data.turn, error: String(error?.message ?? error)});

@@ -1,25 +1,32 @@
 """After ``ngpt.network.model`` (and ``heads``): the whole graph from a renderer's buffers to the image.
 
     buffers -> repaired -> statistics -> normalised -> base -> completed -> encoded -> padded -> [network]
-            -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> emission -> image
+            -> cropped -> head -> (goes over to the base) -> bounds -> exponential -> exposure -> emission -> caustic
+            -> image
 
-All of it is float32, whatever the network is in. Images come and go with the emission that the camera sees directly.
+All of it is float32, whatever the network is in. Images come and go with the emission that the camera sees directly,
+and with the light that gradients hold nothing of.
 """
+
+from functools import partial
 
 import numpy as np
 import onnx
 
 from ngpt.export.builder import Graph, Operators, Value, channels, choose, op
-from ngpt.export.graphs import controlvariates, exposure, features
+from ngpt.export.graphs import caustic, controlvariates, exposure, features
 from ngpt.export.graphs.controlvariates import IMAGE
 from ngpt.export.graphs.padding import Mirror
 from ngpt.export.graphs.repair import Repaired, clean, repaired
 from ngpt.export.graphs.transfer import signed_exp, signed_log
+from ngpt.network.config import ModelConfig
 from ngpt.network.features import CHANNELS
 from ngpt.network.inputs import DENOISED, LAYERS
-from ngpt.network.model import DARK, HUGE, WINDOW, ModelConfig
+from ngpt.network.model import DARK, HUGE, WINDOW
 
 _VARIANCES = ("primal_var", "dx_var", "dy_var")
+# Light that may be apart, and its variance.
+_APART = ("caustic", "caustic_var")
 
 
 class _OperatorsOfHeads(Operators):
@@ -40,14 +47,26 @@ class _OperatorsOfHeads(Operators):
 def layers(config: ModelConfig) -> tuple[str, ...]:
     """The inputs of the graph of such a model, in order."""
     needed = ("direct", *config.needs, *config.layers)
-    return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *DENOISED) if name in needed)
+    if config.reads_gradients or "primal_var" in needed:
+        needed += _APART
+    return tuple(name for name in (LAYERS[0], "direct", *LAYERS[1:], *_APART, *DENOISED) if name in needed)
+
+
+def optional(config: ModelConfig) -> tuple[str, ...]:
+    """Those that may be zeros everywhere."""
+    return tuple(name for name in layers(config) if name in ("direct", *_APART))
+
+
+def by_denoiser(config: ModelConfig) -> bool:
+    """Whether another denoiser's image of ``caustic`` may take the place of the diffusion."""
+    return config.reads_gradients and any(name in config.layers for name in DENOISED)
 
 
 def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto) -> Graph:
     """The graph around a network of that configuration, ``channels`` to ``prediction``."""
     graph = Graph("reconstruction")
     raw = _buffers(graph, layers(config))
-    data = _repaired(raw)
+    data = _repaired(raw, config)
     given = graph.input("statistics", (5,), np.zeros(5))
     is_given = op.Greater(op.ReduceMax(op.Slice(given, [0], [1]), keepdims=0), 0.0)
     shared = choose(is_given, lambda: op.Identity(given), lambda: _statistics(config, data), (5,))
@@ -79,25 +98,37 @@ def reconstruction(config: ModelConfig, alignment: int, network: onnx.ModelProto
         share = mirror.crop(_share(mirror, scaled["primal_se"], scaled["base"], config.quiet))
         logarithm = base + (logarithm - base) * share
     bounded = op.Min(op.Max(logarithm, signed_log(low / scale)), signed_log(high / scale))
-    image = signed_exp(bounded) * scale
-    graph.output("image", image + data.direct, IMAGE)
+    image = signed_exp(bounded) * scale + data.direct
+    if config.reads_gradients:
+        light = partial(caustic.spread, data.layers, depth)
+        if by_denoiser(config):
+            found = graph.input("denoised_caustic", ("tiles", 3, "light_height", "light_width"), np.zeros((1, 3, 0, 0)))
+            image += choose(op.Equal(op.Size(found), 0), light, lambda: caustic.doubled(found), IMAGE)
+        else:
+            image += light()
+    graph.output("image", image, IMAGE)
     return graph
 
 
 def statistics(config: ModelConfig) -> Graph:
     """The graph that tells what the tiles of an image share, and makes what another denoiser is to be given."""
     graph = Graph("statistics_of")
-    used = {"primal", "direct", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
+    used = {"primal", "direct", "caustic", "depth", *(("dx", "dy", *_VARIANCES) if config.base else ())}
     denoised = [name for name in DENOISED if name in config.layers]
     if denoised:
         used |= {"albedo", "normal"}
-    data = _repaired(_buffers(graph, tuple(name for name in layers(config) if name in used)))
+    data = _repaired(_buffers(graph, tuple(name for name in layers(config) if name in used)), config)
     shared = _statistics(config, data)
     graph.output("statistics", shared, (5,))
     if denoised:
         graph.output("oidn_primal", data.layers["primal"] + data.direct, IMAGE)
         graph.output("oidn_albedo", op.Clip(data.layers["albedo"], 0.0, 1.0), IMAGE)
         graph.output("oidn_normal", op.Identity(data.layers["normal"]), IMAGE)
+    if by_denoiser(config):
+        albedo = op.Clip(caustic.halved(data.layers["albedo"]), 0.0, 1.0)
+        graph.output("oidn_caustic", caustic.halved(data.layers["caustic"]), IMAGE)
+        graph.output("oidn_caustic_albedo", albedo, IMAGE)
+        graph.output("oidn_caustic_normal", caustic.halved(data.layers["normal"]), IMAGE)
     if "denoised_base" in denoised:
         scale, _, _, _, mean = _numbers(shared)
         graph.output("oidn_base", _base(data, scale, mean) * scale + data.direct, IMAGE)
@@ -108,9 +139,9 @@ def _buffers(graph: Graph, names: tuple[str, ...]) -> dict[str, Value]:
     return {name: graph.input(name, ("tiles", CHANNELS.get(name, 3), "height", "width")) for name in names}
 
 
-def _repaired(raw: dict[str, Value]) -> Repaired:
+def _repaired(raw: dict[str, Value], config: ModelConfig) -> Repaired:
     """The layers as the network sees them: without emission seen directly."""
-    data = repaired(raw)
+    data = repaired(raw, config.reads_gradients)
     for name in DENOISED:
         if name in data.layers:
             data.layers[name] = clean(raw[name] - data.direct)

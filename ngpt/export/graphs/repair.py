@@ -18,7 +18,8 @@ _LEVELS = 5
 class Repaired:
     """What the rest of a graph works on; (N, C, H, W).
 
-    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances NaN where unknown
+    ``layers``   all of them by name: without direct emission, finite, 0 where not trusted; variances NaN where unknown.
+                 "caustic" is no part of "primal" where gradients are read
     ``direct``   direct emission, finite, to be added back
     ``trusted``  of dx and dy, where there are any: (N, 1, H, W), true where they are
     """
@@ -38,15 +39,24 @@ def clean(x: Value) -> Value:
     return op.Where(finite(x), x, 0.0)
 
 
-def repaired(raw: Mapping[str, Value]) -> Repaired:
-    """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them."""
+def repaired(raw: Mapping[str, Value], gradients: bool) -> Repaired:
+    """The layers that a renderer gives, ``primal`` and ``direct`` among them, as ``ngpt.repair`` leaves them.
+
+    ``gradients``  whether they are for a network that reads gradients, which works on light without ``caustic``
+    """
     light = raw["primal"] - raw["direct"]
-    good = _everywhere(finite(light), 1)
+    rest = light - raw["caustic"] if "caustic" in raw else light
+    good = _everywhere(finite(rest), 1)
     whole = op.Greater(op.ReduceMin(op.Cast(good, to=FLOAT), keepdims=0), 0.5)
-    image = choose(whole, lambda: op.Identity(light), lambda: _filled(light, good), _IMAGE)
+
+    def filled(image: Value) -> Value:
+        return choose(whole, lambda: op.Identity(image), lambda: _filled(image, good), _IMAGE)
+
     direct = op.Where(good, raw["direct"], 0.0)
     layers = {name: clean(layer) for name, layer in raw.items() if name != "direct" and not name.endswith("_var")}
-    layers["primal"] = image
+    layers["primal"] = filled(rest if gradients else light)
+    if gradients and "caustic" in raw:
+        layers["caustic"] = filled(raw["caustic"])
     # Where the camera sees an emitter, the primal's variance is that of primal and direct emission together.
     known = {"primal_var": op.And(good, _everywhere(op.Equal(direct, 0.0), 1))}
     trusted = {}
@@ -56,10 +66,23 @@ def repaired(raw: Mapping[str, Value]) -> Repaired:
             both = op.And(good, op.Greater(following, 0.5))
             trusted[name] = known[f"{name}_var"] = op.And(both, _everywhere(finite(raw[name]), 1))
             layers[name] = op.Where(trusted[name], layers[name], 0.0)
+    if "caustic_var" in raw:
+        known["caustic_var"] = good
     for name, flags in known.items():
         if name in raw:
-            layers[name] = op.Where(flags, raw[name], _UNKNOWN)
+            variance = _of_all_light(raw) if name == "primal_var" and not gradients else raw[name]
+            layers[name] = op.Where(flags, variance, _UNKNOWN)
     return Repaired(layers, direct, trusted)
+
+
+def _of_all_light(raw: Mapping[str, Value]) -> Value:
+    """The variance of the primal with ``caustic``, NaN where it is not known."""
+    if "caustic" not in raw:
+        return raw["primal_var"]
+    variance, further = raw["primal_var"], raw["caustic_var"]
+    dark = _everywhere(op.Equal(raw["caustic"], 0.0), 1)
+    known = op.And(finite(further), op.GreaterOrEqual(op.Min(variance, further), 0.0))
+    return op.Where(known, variance + further, op.Where(dark, variance, _UNKNOWN))
 
 
 def _everywhere(flags: Value, axis: int) -> Value:
