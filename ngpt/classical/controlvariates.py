@@ -39,7 +39,7 @@ def cv(
     equations = Equations(primal, dx, dy, trusted)
     # Equal weights are those of exact differences.
     one = np.ones_like(equations.primal[:1])
-    exact = without_missing(np.zeros_like(np.stack([one[0], one[0]])), trusted)
+    exact = without_missing(np.zeros((2, *one.shape[1:]), one.dtype), trusted)
     return _sweep(equations, one, exact, [1.0] * sweeps)
 
 

@@ -111,7 +111,7 @@ def least_norms(
         return e
 
     def norm(e):
-        # The tiny number keeps the derivative of the square root finite.
+        # The tiny number keeps thresholds over norms finite.
         return np.sqrt((e * e).sum(1, keepdims=True) + 1e-30)
 
     def start(first, last):

@@ -37,9 +37,6 @@ TYPICAL = 3
 # .35, wcv and wl2 have the least error with .7 at 4 samples and with .35 to .5 from 16 on (docs/lab/log).
 SHARED = 0.6
 
-# What counts as no variance, so that derivatives of roots are finite.
-_NONE = 1e-200
-
 # What a count of values that are there, a mean, is divided by at least.
 FEW = 1e-9
 
@@ -140,7 +137,7 @@ def smoothed(variance: np.ndarray, outliers: bool = False) -> np.ndarray:
         own = slice(first - top, last - top)
         raw, sums = total, (sum_of(total[own]), int(good[own].sum()))
         if outliers:
-            total = np.sqrt(np.sqrt(total.clip(_NONE, None)))
+            total = np.sqrt(np.sqrt(total))
             # Roots of single precision are within it.
             total = (total if good.all() else np.where(good, total, 0)).astype(variance.dtype, copy=False)
         total = _box(_box(total))

@@ -79,8 +79,9 @@ def test_a_network_that_corrects_another_denoiser(library):
         assert library.ngpt_set_output(job.handle, name.encode(), *place(image)) == OK, job.message()
     assert job.run() == MISSING_LAYER and "denoised, denoised_base" in job.message()
     assert library.ngpt_prepare(job.handle, 150, 60, PROGRESS(), None) == OK, job.message()
-    for name, image in images.items():
-        agree(image, expected[name])
+    assert np.allclose(images["oidn_caustic"], expected.pop("oidn_caustic"), rtol=1e-5, atol=1e-6)
+    for name, image in expected.items():
+        agree(images[name], image)
     other = {name: image + data.direct for name, image in denoised(Oidn(data), made, DENOISED).items()}
     other |= {"base": images["oidn_base"], "denoised_caustic": np.zeros_like(data.caustic)}
     other["denoised_caustic"][::2, ::2] = caustic.of_half_size(data)
