@@ -81,6 +81,8 @@ def assert_close(ours, theirs, tolerance=1e-4):
     assert (np.abs(ours - theirs) <= tolerance * (np.abs(theirs) + 1e-2 * np.abs(theirs).max())).all()
 
 
+# Weights at random make rounding grow where a pyramid is drawn to gradients.
+TOLERANCE = {"a pyramid drawn to gradients": 1e-3}
 # Of what others have parts of
 MORE = ("with a choice", "relative to its base", "converging", "halved by maxima", "halved by lines")
 
@@ -109,7 +111,9 @@ def other_denoiser(monkeypatch):
 def test_the_same_as_in_torch(pair, size, other_denoiser):
     path, onnx_session = pair
     layers = noisy(*size)
-    assert_close(run(onnx_session, layers | other_denoiser(layers)), in_torch(layers, path))
+    assert_close(
+        run(onnx_session, layers | other_denoiser(layers)), in_torch(layers, path), TOLERANCE.get(path.stem, 1e-4)
+    )
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 16), (37, 53), (64, 48)])
