@@ -74,7 +74,7 @@ def test_the_tutorial_runs(renderer, tmp_path, monkeypatch, capsys):
 def test_the_first_five_cells_lead_to_a_clean_image(renderer, tmp_path, monkeypatch):
     """The notebook for Colab has no others; its wheel is the one that `make wheel` makes."""
     colab = DOCS / "start" / "colab.ipynb"
-    made, shown = run(colab, tmp_path, monkeypatch)
+    made, _ = run(colab, tmp_path, monkeypatch)
     cells = [cell for cell in json.loads(colab.read_text())["cells"] if cell["cell_type"] == "code"]
     assert len(cells) == 5 and f"ngpt_recon-{ngpt.__version__}-py3" in cells[0]["source"][0]
     assert made["image"].shape == (160, 240, 3) and (tmp_path / "clean.png").stat().st_size > 10_000
