@@ -10,7 +10,7 @@ import numpy as np
 import OpenEXR
 import pytest
 from exr_files import comparable, same_bits, window, write_raw
-from fuzz.exr_structure import Attribute, parse
+from exr_structure import Attribute, parse
 
 import ngpt
 import ngpt.cli
