@@ -1,7 +1,7 @@
 """Every sampler has the means of Mitsuba's integrators: of the image, and of differences over one and eight pixels.
 
-Wrong densities and weights of neighbours drown in the noise; over eight pixels they stand out of it. Each case
-is tested at a level of 1 % as a whole, with fixed seeds. In media pixels are wide, and the sum of all z² is tested, too.
+Wrong densities and weights of neighbours drown in the noise; over eight pixels they stand out of it. A case as a whole
+has a level of 1 %, with fixed seeds. In media pixels are wide, and the sum of all z² is tested, too.
 """
 
 import os
