@@ -33,7 +33,8 @@ def references(mi, description, size=None, by=None):
 
 def _images(name, found):
     mean, error = found[0].astype(np.float64), found[1].astype(np.float64)
-    noise = np.random.default_rng(int(name[:8], 16)).standard_normal((IMAGES, *mean.shape))
+    # Of a pixel's colours together, as of paths: the mean of colours has no less noise.
+    noise = np.random.default_rng(int(name[:8], 16)).standard_normal((IMAGES, *mean.shape[:2], 1))
     noise -= noise.mean(axis=0)
     return mean + error * np.sqrt(IMAGES) * noise / noise.std(axis=0, ddof=1)
 
