@@ -136,3 +136,12 @@ def test_connectable_materials(renderer):
     frosted = renderer.BSDFPtr(scene.shapes()[list(materials).index("frosted")].bsdf())
     assert classes.connectable(frosted)[0] and not with_media.connectable(frosted)[0]
     assert with_media.connectable(renderer.BSDFPtr(scene.shapes()[1].bsdf()))[0]
+
+
+def test_less_noise_than_replay_alone(renderer):
+    from data_gen.render import render_stack
+
+    scene = load(renderer, "diffuse", (64, 64))
+    ours, theirs = (render_stack(scene, 16, 0, sampler) for sampler in ("gpt", "gpt-basic"))
+    for name in ("dx_var", "dy_var"):
+        assert ours[name].mean() < 0.75 * theirs[name].mean()

@@ -40,7 +40,7 @@ def render(mi, name, scene, batches=1):
     return render_stack(load(mi, scene, (8, 8)), batches * (SAMPLERS[name].batch or 4), 0, name)
 
 
-@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("name", [name if name in NAMES else slow(name) for name in SAMPLERS])
 def test_scenes_without_lamps_are_black(renderer, name):
     """Splats and maps of light paths have nowhere to begin, too."""
     scene = haze() if in_media(name) else diffuse()

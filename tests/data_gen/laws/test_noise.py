@@ -40,6 +40,10 @@ def test_variances_are_those_over_seeds(renderer, name, full):
             ratio = told.ravel()[most].mean() / over_seeds.ravel()[most].mean()
             # Passes of a biased sampler drift, which counts as noise.
             assert low < ratio < high + 0.2 * entry.biased, (layer, ratio)
+    if not entry.batch and entry.standing != "study":
+        # If pixels shared their numbers, the mean of the image would vary more; colours do go together.
+        images, told = (np.stack([stack[name] for stack in stacks]) for name in ("primal", "primal_var"))
+        assert images.mean(axis=(1, 2, 3)).var(ddof=1) < 3 * 3 * told.mean() / images[0].size
 
 
 @pytest.mark.slow
