@@ -4,13 +4,13 @@ from functools import cache
 
 import numpy as np
 import pytest
+from restir_shots import CHAINS, FRAMES, SIZE, layers_of, noise_left, rendered_by_gpt
 from unbiased import load
 
 from data_gen.samplers.restir.footprint import pair_motions
 from data_gen.samplers.restir.reservoir import confidence_after
 from ngpt.testing import z_test
 
-SIZE, CHAINS, FRAMES = 24, 48, 3
 STEPS = ((0, 0), (1, 0), (0, 1))
 
 
@@ -58,12 +58,7 @@ class Room:
             now = type(now)(() if before is None else before.shapes, now.film, now.place)
             motion = None if before is None else motion_vectors(self.scene, now, before)
             values, before = history.next_frame(motion), now
-            yield history, {n: images(getattr(values, n), chains) for n in ("path", "primal", "dx", "dy")}
-
-
-def images(values, chains):
-    """(chains, H, W, 3) of a value of each lane."""
-    return np.moveaxis(np.array(values, np.float64).T.reshape(SIZE, SIZE, chains, 3), 2, 0)
+            yield history, layers_of(values, chains)
 
 
 @pytest.fixture(scope="module")
@@ -74,15 +69,11 @@ def rooms(renderer):
 @pytest.fixture(scope="module")
 def references(rooms):
     """(scene, frame) -> layers of independent renders of gpt, (renders, H, W, 3)."""
-    from data_gen.render import render_stack
 
     @cache
     def rendered(name, frame):
         rooms[name].at(frame)
-        stacks = [render_stack(rooms[name].scene, 48, seed, "gpt", caustic=False).layers for seed in range(900, 908)]
-        layers = {n: np.stack([stack[n] for stack in stacks]) for n in ("primal", "direct", "dx", "dy")}
-        layers["primal"] = layers["path"] = layers["primal"] - layers.pop("direct")
-        return layers
+        return rendered_by_gpt(rooms[name].scene)
 
     return rendered
 
@@ -106,10 +97,7 @@ def test_the_third_frame_of_a_moving_camera_is_unbiased(shots, references, scene
 @pytest.mark.parametrize("scene", SCENES)
 @pytest.mark.parametrize("name", ["primal", "dx", "dy"])
 def test_history_is_worth_it(shots, scene, name):
-    """The variance of the third frame beside that of the first, each beside that of its candidates."""
-    variances = [np.sort(frame[name].var(axis=0).mean(axis=-1).ravel())[:-10].mean() for frame in shots(scene)]
-    paths = [np.sort(frame["path"].var(axis=0).mean(axis=-1).ravel())[:-10].mean() for frame in shots(scene)]
-    assert variances[-1] / paths[-1] < 0.75 * variances[0] / paths[0]
+    assert noise_left(shots(scene), name) < 0.75
 
 
 def test_differences_end_at_the_film(shots):
