@@ -1,6 +1,7 @@
 """What references are kept: (variant, name, description, size, sampler of ours or None), for all tests together."""
 
 from functools import partial
+from itertools import product
 
 import bdpt_scenes
 import camera_cases
@@ -10,7 +11,8 @@ import media_scenes
 import split_scenes
 import stress_scenes
 
-RGB, LARGE, SMALL = "llvm_ad_rgb", (32, 32), (16, 16)
+RGB, SPECTRAL, MONO = "llvm_ad_rgb", "llvm_ad_spectral", "llvm_ad_mono"
+LARGE, SMALL = (32, 32), (16, 16)
 BUILTIN = ["diffuse", "glossy", "environment", "lens"]
 PATHS = [*BUILTIN, "glass", "hidden_lamp", "plenty", "leaf", "fog", "within_fog", "caustics", "under_the_sky"]
 PATHS += ["courtyard"]
@@ -38,42 +40,30 @@ def of(name):
     return next(getattr(room, name) for room in rooms if hasattr(room, name))
 
 
+def in_rgb():
+    """(name, description, size), of Mitsuba's own integrators."""
+    yield from ((name, of(name), LARGE) for name in (*PATHS, "everything", "without_gloss"))
+    yield from ((f"gallery: {kind}", scene, LARGE) for kind, scene in lamps_scenes.GALLERIES.items())
+    yield from ((name, scene, LARGE) for name, scene in bdpt_scenes.SCENES.items())
+    yield from ((name, of(name), SMALL) for name in (*MEDIA, "fog", "within_fog", "lamp_alone", "seen_through"))
+    yield from ((f"{name} by mis", media_scenes.by_mis(of(name)), SMALL) for name in ("colours", "coloured_smoke"))
+    yield from ((f"courtyard to {depth}", scenes.limited(depth), SMALL) for depth in (2, 3))
+    yield from ((f"moved {place}", at_place(*place), (24, 24)) for place in PLACES)
+    yield "panels", scenes.panels, (24, 24)
+    yield from ((name, name, (12, 8)) for name in ("diffuse", "glossy"))
+    yield from ((f"lit by all, fog {fog}", partial(lamps_scenes.lit_by, fog=fog), (48, 32)) for fog in (False, True))
+    for view, media in product(camera_cases.RENDERED, (False, True)):
+        yield f"{view}, media {media}", partial(camera_cases.described, view, media), None
+    yield from ((scene.__name__, scene, (24, 16)) for scene in stress_scenes.SCENES)
+
+
 def listed():
-    for name in PATHS:
-        yield RGB, name, of(name), LARGE, None
-    for kind, scene in lamps_scenes.GALLERIES.items():
-        yield RGB, f"gallery: {kind}", scene, LARGE, None
-    for name in ("diffuse", "glossy"):
-        yield RGB, name, name, (12, 8), None
-    for name in ("lamp_alone", "seen_through"):
-        yield RGB, name, of(name), SMALL, None
-    yield RGB, "without_gloss", split_scenes.without_gloss, LARGE, None
-    yield RGB, "everything", split_scenes.everything, LARGE, None
-    yield RGB, "panels", scenes.panels, (24, 24), None
-    for depth in (2, 3):
-        yield RGB, f"courtyard to {depth}", scenes.limited(depth), SMALL, None
-    for place in PLACES:
-        yield RGB, f"moved {place}", at_place(*place), (24, 24), None
-    for name in (*MEDIA, "fog", "within_fog"):
-        yield RGB, name, of(name), SMALL, None
-    for name in ("colours", "coloured_smoke"):
-        yield RGB, f"{name} by mis", media_scenes.by_mis(of(name)), SMALL, None
-    for fog in (False, True):
-        yield RGB, f"lit by all, fog {fog}", partial(lamps_scenes.lit_by, fog=fog), (48, 32), None
-    for view in camera_cases.RENDERED:
-        for media in (False, True):
-            yield RGB, f"{view}, media {media}", partial(camera_cases.described, view, media), None, None
-    yield "llvm_ad_spectral", "diffuse", "diffuse", (24, 24), None
-    yield "llvm_ad_spectral", "colours", media_scenes.colours, SMALL, None
-    yield "llvm_ad_mono", "coloured_smoke", media_scenes.coloured_smoke, SMALL, None
-    for variant in ("llvm_ad_spectral", "llvm_ad_mono"):
-        yield variant, "lens", "lens", (24, 24), None
-    for name, scene in bdpt_scenes.SCENES.items():
-        yield RGB, name, scene, LARGE, None
-    for name in BENT:
-        yield RGB, name, of(name), LARGE, "bdpt"
-    for scene in stress_scenes.SCENES:
-        yield RGB, scene.__name__, scene, (24, 16), None
+    yield from ((RGB, *row, None) for row in in_rgb())
+    yield from ((RGB, name, of(name), LARGE, "bdpt") for name in BENT)
+    yield SPECTRAL, "colours", media_scenes.colours, SMALL, None
+    yield MONO, "coloured_smoke", media_scenes.coloured_smoke, SMALL, None
+    yield SPECTRAL, "diffuse", "diffuse", (24, 24), None
+    yield from ((variant, "lens", "lens", (24, 24), None) for variant in (SPECTRAL, MONO))
 
 
 def quick_first(row):
